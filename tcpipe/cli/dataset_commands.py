@@ -49,8 +49,7 @@ def add_map(options: AddMapOptions, *, strays: tuple[str, ...], dry_run: bool, a
     A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. For a raster of many tiles, give a pattern in quotes, --height 'dem/*.tif', or
     repeat the option; where tiles overlap, tcpipe uses the last one.
 
-    With --stac tcpipe takes the newest rasters of a catalogue of open data around the tracks of runs, and only that part of them. --dry-run
-    then lists the rasters, their licence and the bytes to read; it reads the catalogue and the heads of the rasters.
+    With --stac tcpipe takes the newest rasters of a catalogue of open data around tracks; --dry-run lists them, with licence and bytes.
     """
     from tcpipe.pipeline.maps import run_add_map
     from tcpipe.pipeline.open_data import plan_open_data

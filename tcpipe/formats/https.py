@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable
 from http.client import HTTPException, HTTPMessage
 from typing import IO, Any
-from urllib.error import HTTPError
+from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
@@ -54,26 +54,24 @@ class HttpsClient:
         ------
         MapError : it may not be asked, is not there, or is larger, slower or shorter than it may be.
         """
-        self.check_url(url)
         headers = {"User-Agent": f"tcpipe/{__version__}"} | ({"Range": f"bytes={span[0]}-{span[1]}"} if span else {})
         for pause_s in _PAUSES_S:
             try:
+                self.check_url(url)
                 with self._opener.open(Request(url, headers=headers), timeout=_SILENT_S) as reply:  # noqa: S310  checked
                     if span and reply.status != 206:
-                        raise MapError(
-                            f"{url}: its server ignores ranges and sends the whole file; download it and give it with --height or --ortho"
-                        )
+                        remedy = "download it and give it with --height or --ortho"
+                        raise MapError(f"{url}: its server ignores ranges and sends the whole file; {remedy}")
                     return self._read(reply, url, most), reply.headers
-            except (OSError, HTTPException) as error:
+            except (OSError, HTTPException, ValueError) as error:
+                reason = error
                 if isinstance(error, HTTPError):
                     error.close()
-                busy = not isinstance(error, HTTPError) or error.code in _TRY_AGAIN
-                if (
-                    pause_s is None
-                    or not busy
-                    or isinstance(getattr(error, "reason", None), ssl.SSLCertVerificationError)
-                ):
-                    raise MapError(f"{url}: cannot be read ({_describe(error)})") from None
+                elif isinstance(error, URLError):
+                    reason = error.reason
+                is_lasting = isinstance(error, HTTPError) and error.code not in _TRY_AGAIN
+                if pause_s is None or is_lasting or isinstance(reason, ssl.SSLCertVerificationError | ValueError):
+                    raise MapError(f"{url}: cannot be read ({reason or type(reason).__name__})") from None
                 time.sleep(pause_s)
         raise AssertionError
 
@@ -107,13 +105,3 @@ class _CheckedRedirects(HTTPRedirectHandler):
             fp.close()
             raise
         return super().redirect_request(req, fp, code, msg, headers, newurl)
-
-
-def _describe(error: Exception) -> str:
-    if isinstance(error, HTTPError):
-        meant = {401: ": it wants credentials, which tcpipe does not send", 404: ": it is not there (any more)"}
-        return f"HTTP {error.code}{meant.get(error.code, '')}"
-    reason = getattr(error, "reason", error)
-    if isinstance(reason, TimeoutError) and not str(reason)[:1].isdigit():
-        return f"no answer for {_SILENT_S:g} s"
-    return str(reason) or type(reason).__name__

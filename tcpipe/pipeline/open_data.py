@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -27,21 +26,16 @@ _WHOLE_FRACTION = 0.9995
 
 @dataclass(frozen=True, slots=True)
 class MapPlan:
-    """What ``tcpipe add-map --stac`` takes; ``str`` of it is what ``--dry-run`` prints."""
+    """What a catalogue of open data gives for a map; ``str`` of it is what ``--dry-run`` prints."""
 
     kind: Literal["plan"]
     name: str
     origins: tuple[RasterOrigin, ...]
-    covered: Mapping[str, float]
-    """Share of the ground around the tracks that the rasters of each layer cover."""
 
     def __str__(self) -> str:
         """Return the rasters, their licence and what is to be read, as plain lines."""
-        covered = [
-            f"{layer} covers {share:.1%} of the ground around the tracks" for layer, share in self.covered.items()
-        ]
-        read = f"{sum(of.to_read_bytes for of in self.origins) / 1e6:.2f} MB to read, less what is in the cache"
-        return clean_lines((*origin_lines(self.origins), *covered, read))
+        read = sum(of.to_read_bytes for of in self.origins) / 1e6
+        return clean_lines((*origin_lines(self.origins), f"{read:.2f} MB to read, less what is in the cache"))
 
 
 def plan_open_data(options: AddMapOptions) -> MapPlan:
@@ -66,11 +60,10 @@ def fetch_open_data(
     client = catalogue.connect()
     origins: list[RasterOrigin] = []
     files: dict[str, list[Path]] = {layer: [] for layer in layers}
-    covered: dict[str, float] = {}
     for layer, collection in layers.items():
-        items, covered[layer] = choose_newest(find_items(client, catalogue, collection, area), area)
-        if covered[layer] < _WHOLE_FRACTION:
-            logger.warning("%s covers %.1f %% of the ground around the tracks", collection, 100.0 * covered[layer])
+        items, covered = choose_newest(find_items(client, catalogue, collection, area), area)
+        if covered < _WHOLE_FRACTION:
+            logger.warning("%s covers %.1f %% of the ground around the tracks", collection, 100.0 * covered)
         for item in items:
             with open_window(client, item.url, area, crs=item.crs) as window:
                 if window is None:
@@ -98,7 +91,7 @@ def fetch_open_data(
             raise MapError(
                 f"{collection}: no raster has a pixel around the tracks, but the catalogue says {len(items)} do"
             )
-    return MapPlan("plan", options.name, tuple(origins), covered), files
+    return MapPlan("plan", options.name, tuple(origins)), files
 
 
 def _choose_collections(options: AddMapOptions, catalogue: Catalogue) -> dict[str, str]:

@@ -127,20 +127,18 @@ class AddMapOptions:
     stac: str | None = option(
         None,
         Option(
-            "Catalogue of open data to take height and orthophoto from: its name (swisstopo), its URL, or a TOML file on it.",
-            metavar="NAME|URL|FILE",
+            "Catalogue of open data to take rasters from: swisstopo, or a TOML file that describes one.",
+            metavar="NAME|FILE",
         ),
     )
     collections: Sequence[str] = option(
         (),
-        Option("Collection of the catalogue; repeatable (default: all that are known).", metavar="ID", repeatable=True),
+        Option("Collection of the catalogue (default: all); repeatable.", metavar="ID", repeatable=True),
     )
     around: Sequence[str] = option(
-        (), Option("Run whose track the map is to cover, with --stac; repeatable.", (), "run", "RUN", repeatable=True)
+        (), Option("Run whose track --stac is to cover; repeatable.", (), "run", "RUN", repeatable=True)
     )
-    margin_m: float = option(
-        50.0, Option("Ground around the track that is taken, with --stac.", ("--margin",), Range(1.0, 5000.0), "M")
-    )
+    margin_m: float = option(50.0, Option("Ground around the track [m].", ("--margin",), Range(1.0, 5000.0), "M"))
     crs: str | None = option(
         None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
     )

@@ -16,6 +16,7 @@ from urllib.parse import urlencode, urljoin, urlsplit
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely import Geometry
 from shapely.geometry import shape
 
 from tcpipe.errors import MapError, StoreError, UsageError
@@ -72,7 +73,7 @@ class Item:
     """When it was surveyed, ISO 8601; of a span its end; empty where it is not told."""
     crs: str | None
     checksum: str | None
-    footprint: Any = field(repr=False)
+    footprint: Geometry = field(repr=False)
     """In longitude and latitude [deg]."""
 
 
@@ -105,7 +106,7 @@ def find_catalogue(stac: str) -> Catalogue:
     )
 
 
-def make_area(tracks: Sequence[NDArray[np.float64]], margin_m: float) -> Any:
+def make_area(tracks: Sequence[NDArray[np.float64]], margin_m: float) -> Geometry:
     """Return the ground around tracks, each (N, 2) longitude and latitude [deg], in these; the margin is right to 1 %."""
     parts = []
     for lonlat in tracks:
@@ -116,7 +117,7 @@ def make_area(tracks: Sequence[NDArray[np.float64]], margin_m: float) -> Any:
     return shapely.union_all(parts)
 
 
-def find_items(client: HttpsClient, catalogue: Catalogue, collection: str, area: Any) -> list[Item]:
+def find_items(client: HttpsClient, catalogue: Catalogue, collection: str, area: Geometry) -> list[Item]:
     """Return the items of a collection with a GeoTIFF that touch an area.
 
     Raises
@@ -180,7 +181,7 @@ def _is_geotiff(asset: Mapping[str, Any]) -> bool:
     return is_tiff and not {"thumbnail", "overview"} & {*asset.get("roles", ())}
 
 
-def choose_newest(items: Sequence[Item], area: Any) -> tuple[list[Item], float]:
+def choose_newest(items: Sequence[Item], area: Geometry) -> tuple[list[Item], float]:
     """Return the newest items that together cover what there is of an area, the newest last, and the share that they cover."""
     chosen: list[Item] = []
     missing = area

@@ -23,6 +23,7 @@ from pyproj import CRS
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
+from shapely import Geometry
 from shapely.affinity import affine_transform
 
 from tcpipe.errors import MapError
@@ -147,7 +148,7 @@ class RemoteWindow:
 
 
 @contextmanager
-def open_window(client: HttpsClient, url: str, area: Any, *, crs: str | None) -> Iterator[RemoteWindow | None]:
+def open_window(client: HttpsClient, url: str, area: Geometry, *, crs: str | None) -> Iterator[RemoteWindow | None]:
     """Yield what an area [deg] takes of a raster, of which only the head is read; None where they do not meet.
 
     ``crs`` is what the catalogue says.
@@ -173,7 +174,7 @@ def open_window(client: HttpsClient, url: str, area: Any, *, crs: str | None) ->
             raise remote.error or MapError(f"{url}: not a GeoTIFF, or damaged: {describe_error(error)}") from None
 
 
-def _find_window(dataset: Any, url: str, area: Any, said: str | None) -> Window | None:
+def _find_window(dataset: Any, url: str, area: Geometry, said: str | None) -> Window | None:
     """Return the pixels around the part of an area that lies on a raster."""
     if dataset.crs is None or dataset.transform.is_degenerate or dataset.transform.is_identity:
         raise MapError(f"{url}: has no georeference; tcpipe cannot tell which part of it covers the track")
@@ -202,7 +203,7 @@ def _find_window(dataset: Any, url: str, area: Any, said: str | None) -> Window 
     return Window(left, top, right - left, bottom - top)
 
 
-def _project(area: Any, crs: CRS) -> Any:
+def _project(area: Geometry, crs: CRS) -> Geometry:
     return shapely.transform(area, Projection(CRS.from_epsg(4326), crs, area.bounds).forward)
 
 
