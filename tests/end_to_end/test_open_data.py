@@ -194,7 +194,7 @@ def test_a_failed_command_leaves_no_map_and_goes_on_from_the_cache(site):
 def test_ground_without_data_is_told(site):
     site.server.put("/stac/more", {"features": []})
     done = site.run("--dry-run")
-    assert "warning: dem covers " in done.stderr
+    assert "dem covers 50" in done.stderr
     assert "of the ground around the tracks" in done.stderr
 
 
