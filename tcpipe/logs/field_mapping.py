@@ -28,7 +28,8 @@ from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
-Columns = Mapping[str, NDArray[Any]]
+Array = NDArray[Any]
+Columns = Mapping[str, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +166,7 @@ class FieldSource:
     factor: float
     codes: str | None
 
-    def evaluate(self, read: Callable[[str, int | None], NDArray[Any]], rows: int) -> Floats:
+    def evaluate(self, read: Callable[[str, int | None], Array], rows: int) -> Floats:
         """Return the values, shape (rows,); ``read`` as in `Expression.evaluate`."""
         values = np.broadcast_to(self.expression.evaluate(read), rows)
         return self.factor * values if self.codes is None else classify_fixes(values, self.codes)
@@ -223,14 +224,14 @@ _CLEARLY_A_UNIT = 2
 """Characters: what is shorter at the end of a name may be something else."""
 
 
-def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, NDArray[Any]]:
+def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, Array]:
     """Return the fields of the message that a role usually has, by dotted name, from those that are mapped.
 
     What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix, zero elsewhere.
     ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
     """
     zero = np.zeros(rows)
-    made: dict[str, NDArray[Any]] = {}
+    made: dict[str, Array] = {}
     for name, field in MAPPED[role].items():
         if field.std_of is not None:
             if name in values:
@@ -249,7 +250,7 @@ def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> d
     return made | _collect_other_fields(role, values, made, rows)
 
 
-def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, NDArray[Any]]:
+def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, Array]:
     """Return the fields of a role's message that no mapping names."""
     if role == "gnss":
         status = made["status.status"]
@@ -276,7 +277,7 @@ def find_topic(name: str, role: str, columns: Collection[str], power_type: str |
     return f"/{name}" if find_quantity(name) == alone else f"/{name}/{alone}", FLOAT_TYPES[1]
 
 
-def parse_stamps_ns(values: NDArray[Any], unit: str) -> NDArray[np.int64] | str:
+def parse_stamps_ns(values: Array, unit: str) -> NDArray[np.int64] | str:
     """Return finite numbers, shape (N,), as [ns], or what is in the way of that in words.
 
     ``unit`` is s, ms, us or ns; auto tells it by their size, since 1979.
@@ -303,7 +304,7 @@ def utc_from_gps_ns(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, NDArray[Any]] | list[str]:
+def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, Array] | list[str]:
     """Return a custom message's columns as those of the message that a role usually has, or what is wrong with the mapping.
 
     Parameters
@@ -335,7 +336,7 @@ def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) 
     return own | stamps | make_message_fields(role, values, rows)
 
 
-def _find_misfit(values: NDArray[Any], name: str, index: int | None, *, may_be_text: bool) -> str | None:
+def _find_misfit(values: Array, name: str, index: int | None, *, may_be_text: bool) -> str | None:
     """Return why a field of a message is no number a message."""
     if not may_be_text and not np.issubdtype(values.dtype, np.number):
         return f"{name} is text; expected numbers"

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Columns = Mapping[str, NDArray[Any]]
+Array = NDArray[Any]
+Columns = Mapping[str, Array]
 Floats = NDArray[np.float64]
 
 NO_HEIGHT_M2 = 1e6
@@ -62,7 +63,7 @@ def split_codes(text: str) -> tuple[str | None, str]:
     return next(named, None), text
 
 
-def classify_fixes(values: NDArray[Any], codes: str) -> Floats:
+def classify_fixes(values: Array, codes: str) -> Floats:
     """Return the quality of each fix by its code or word, shape (N,): NaN where it is not known, negative where there is none."""
     found = np.full(len(values), _NO_FIX)
     if np.issubdtype(values.dtype, np.number):
@@ -85,7 +86,7 @@ def find_status(quality: Floats) -> NDArray[np.int8]:
     return _STATUS[np.where(np.isnan(quality), _FIXED, quality).astype(np.int64)]
 
 
-def convert_gps_fix(columns: Columns) -> dict[str, NDArray[Any]]:
+def convert_gps_fix(columns: Columns) -> dict[str, Array]:
     """Return the fields of gps_common/GPSFix as those of NavSatFix; its errors, at 95 per cent, where it has no covariance."""
     quality = classify_status(columns["status.status"].astype(np.int64), "gps_common")
     made = {**columns, "fix_quality": quality}
@@ -100,7 +101,7 @@ def convert_gps_fix(columns: Columns) -> dict[str, NDArray[Any]]:
     return made
 
 
-def add_quality_std(columns: Columns, std_m: Mapping[str, float]) -> tuple[dict[str, NDArray[Any]], int]:
+def add_quality_std(columns: Columns, std_m: Mapping[str, float]) -> tuple[dict[str, Array], int]:
     """Return fixes with the deviations of their quality where they have none, or one and the same for all, and how many that are.
 
     ``std_m`` [m] goes before `FIX_STD_M`; heights have twice as much.
