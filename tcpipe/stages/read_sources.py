@@ -96,7 +96,8 @@ def read_sources(
     for role, topic in list(arrays):
         columns = arrays.pop((role, topic))
         if role != "power":
-            readings = read_messages(columns, role, _find_type(topics[topic], role, config), fix_std_m=config.fix_std_m)
+            std_m = cast("dict[str, float]", config.fix_std_m)
+            readings = read_messages(columns, role, _find_type(topics[topic], role, config), fix_std_m=std_m)
         elif topic in power.rails:
             readings = select_power_rows(columns, power.rails[topic])
         else:
