@@ -64,7 +64,7 @@ class HttpsClient:
                         raise MapError(f"{url}: its server ignores ranges and sends the whole file; {remedy}")
                     return self._read(reply, url, most), reply.headers
             except (OSError, HTTPException, ValueError) as error:
-                reason: object = error
+                reason: str | BaseException = error
                 if isinstance(error, HTTPError):
                     error.close()
                 elif isinstance(error, URLError):
