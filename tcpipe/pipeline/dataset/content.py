@@ -30,6 +30,7 @@ from tcpipe.formats.dataset_card import (
     Shard,
     SplitResult,
     group_dataset_findings,
+    list_shifts,
 )
 from tcpipe.formats.dataset_files import (
     Drawer,
@@ -62,7 +63,7 @@ from tcpipe.recipe import CovariateConfig, Recipe
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
-from tcpipe.stages.sample import Sampled, sum_losses
+from tcpipe.stages.sample import Sampled, Shifts, sum_losses
 from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
@@ -173,6 +174,8 @@ class SampleTable:
     patch: NDArray[np.int64]
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
+    shifts: Sequence[Shifts] = ()
+    """By map, of the runs that are moved on it."""
     redaction: Redactor | None = None
     """None: names and places are public."""
 
@@ -203,6 +206,11 @@ class SampleTable:
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
         columns |= {name: values[at] for name, values in self.sampled.patches.columns().items()}
+        if any(self.shifts):
+            on_map, run_ids = self.sampled.map_index[at].tolist(), segments.column("run_id").to_pylist()
+            moved = zip(on_map, run_ids, strict=True)
+            shift_std_m = [self.shifts[index].get(run_id, (0.0, 0.0, 0.0))[2] for index, run_id in moved]
+            columns["position_std_m"] = np.hypot(to_floats(segments, "position_std_m"), shift_std_m)
         columns["geometry"] = make_points(centres := self._centres_deg(at))
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
         if not self.has_terrain:
@@ -274,10 +282,19 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     segments, distance_by_reason_m, unusable = _pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
     ranks = _rank_segments(segments, seed=recipe.split.seed)
-    sampled, slot, spool = sample_all_segments(
-        segments, ranks, inputs.maps, recipe.sample, gnss_crs=recipe.read.gnss_crs, workers=workers, directory=directory
-    )
     sources = tuple(open_map(*of) for of in inputs.maps())
+    registered = [register_runs(inputs.runs, source, recipe) for source in sources]
+    shifts = [list_shifts(of) for of, _ in registered]
+    sampled, slot, spool = sample_all_segments(
+        segments,
+        ranks,
+        inputs.maps,
+        recipe.sample,
+        gnss_crs=recipe.read.gnss_crs,
+        shifts=shifts,
+        workers=workers,
+        directory=directory,
+    )
     lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
         raise DatasetError(
@@ -292,10 +309,9 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     split = assigned.split
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
-    registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
-    removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe)
+    removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
     kept = np.flatnonzero(split != EXCLUDED)
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
@@ -314,6 +330,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             sources[0].classes.names(),
             order,
             added,
+            shifts,
         ),
         spool=spool,
         sources=sources,
