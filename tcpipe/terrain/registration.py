@@ -52,10 +52,13 @@ _RIVAL_SIGMAS = 3.0
 _APART_M = 0.75
 """Ground that fits nearly as well somewhere else, this far away, does not tell where the track is [m]."""
 _RIDGE = 1e-12
+_ROUNDS, _REWEIGHTINGS, _LEAST_MISFIT_M = 6, 20, 0.01
 _DRIFT_M = 25.0
 """Stretches of path in which the track's heights may be off by a constant of their own [m]: those of GNSS drift over tens of seconds."""
 _NEAR = 2
 """A paraboloid is fitted to the misfits of shifts that are so many steps each way from the best."""
+_CLIFF_M = 1.0
+"""Ground that varies more among these shifts is steeper than what is driven on [m]."""
 _NORTH_M, _EAST_M = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1) * _STEP_M
 _PARABOLOID = np.linalg.pinv(
     np.stack([np.ones_like(_EAST_M), _EAST_M, _NORTH_M, _EAST_M**2, _EAST_M * _NORTH_M, _NORTH_M**2], axis=1)
@@ -160,16 +163,47 @@ def register_track(
     if whole.sum() < _FEWEST_POINTS:
         return None
     at, ground_m = at[whole], ground_m[whole]
-    if with_tilt:
-        away_m = xy_m[at] - xy_m[at].mean(axis=0)
-        excess_m = ground_m[:, steps, steps] - height_m[at]
-        ground_m -= (excess_m - _remove_tilt(excess_m, away_m))[:, None, None]
     excess_m = ground_m - height_m[at][:, None, None]
-    best = _find_least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
-    left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
-    good = left <= _OUTLIER * estimate_robust_std(left) + 1e-6  # what is not the ground: bridges, trees
+    if with_tilt:
+        good, tilt_m = _find_ground(excess_m, xy_m[at])
+        if good.sum() < _FEWEST_POINTS:
+            return None
+        ground_m -= tilt_m[:, None, None]
+    else:
+        best = _find_least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
+        left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
+        good = left <= _OUTLIER * estimate_robust_std(left) + 1e-6  # what is not the ground: bridges, trees
     scale = _fit_height_scale(ground_m[good], height_m[at][good])
     return _refine_shift(excess_m[good], shift_m, scale, xy_m[at][good] if with_tilt else None)
+
+
+def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Return which points are on the map's ground at the shift that fits these best, (N,), and the tilt there, (N,) [m]."""
+    middle = excess_m.shape[1] // 2
+    flat_m = excess_m - _fit_tilt(xy_m, excess_m[:, middle, middle])[:, None, None]
+    best = _find_least(np.median(np.abs(flat_m - np.median(flat_m, axis=0)), axis=0))
+    for _ in range(_ROUNDS):
+        tilt_m = _fit_tilt(xy_m, excess_m[:, *best])
+        left = excess_m[:, *best] - tilt_m
+        left = np.abs(left - np.median(left))
+        relief_m = np.ptp(_take_near(excess_m, best), axis=(1, 2))
+        # steep ground misfits where the shift is off by a step
+        good = (left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)) & (relief_m < _CLIFF_M)
+        if good.sum() < _FEWEST_POINTS:
+            break
+        before, best = best, _find_least(_flatten(excess_m[good], xy_m[good])[0].var(axis=0))
+        if best == before:
+            break
+    return good, tilt_m
+
+
+def _fit_tilt(xy_m: FloatArray, excess_m: FloatArray) -> FloatArray:
+    """Return the tilt of the plane that leaves the least absolute excess, shape (N,) [m]: a bridge or a tree does not turn it."""
+    columns, weight = np.column_stack([xy_m - xy_m.mean(axis=0), np.ones(len(xy_m))]), np.ones(len(xy_m))
+    for _ in range(_REWEIGHTINGS):
+        fitted = np.linalg.lstsq(columns * weight[:, None], excess_m * weight, rcond=None)[0]
+        weight = 1.0 / np.sqrt(np.abs(excess_m - columns @ fitted) + _LEAST_MISFIT_M)
+    return np.asarray(columns[:, :2] @ fitted[:2])
 
 
 def _thin_points(xy_m: FloatArray) -> NDArray[np.int64]:
@@ -230,9 +264,8 @@ def _refine_shift(
     """Refine the best shift of the lattice, and tell how sure it is by leaving stretches out; with the points a tilt and a drift, too."""
     raw_m, blocks, edge = excess_m, _cut_stretches(len(excess_m)), 1
     if tilted_xy_m is not None:
-        stretches, edge = _cut_drift(tilted_xy_m), _NEAR
-        tilt = _remove_means(tilted_xy_m, stretches)
-        excess_m = _remove_tilt(_remove_means(excess_m, stretches), tilt)
+        edge = _NEAR
+        excess_m, tilt, stretches = _flatten(excess_m, tilted_xy_m)
     best = _find_least(excess_m.var(axis=0))
     last, middle = shift_m.size - 1, shift_m.size // 2
     i, j = (min(max(index, edge), last - edge) for index in best)
@@ -243,8 +276,9 @@ def _refine_shift(
     if tilted_xy_m is None:
         step_m, covariance = _step(slope, left)
     else:
-        near_m = excess_m[:, i - _NEAR : i + _NEAR + 1, j - _NEAR : j + _NEAR + 1]
-        step_m, covariance, blocks = _descend(near_m, tilt, _group_stretches(tilted_xy_m, stretches))
+        step_m, covariance, blocks = _descend(
+            _take_near(excess_m, (i, j)), tilt, _group_stretches(tilted_xy_m, stretches)
+        )
     variances, axes = np.linalg.eigh(covariance)
     known = axes[:, variances < KNOWN_M**2]
     if not _is_distinct(excess_m, (i, j), known, shift_m, blocks):
@@ -269,14 +303,24 @@ def _refine_shift(
     )
 
 
-def _cut_drift(xy_m: FloatArray) -> list[Rows]:
-    """Return the rows of stretches of about `_DRIFT_M` of path, shorter where there would be too few to leave some out."""
+def _take_near(values: FloatArray, best: tuple[int, int]) -> FloatArray:
+    """Return the values of shifts near the best one, shape (N, K, K)."""
+    i, j = (min(max(index, _NEAR), values.shape[1] - 1 - _NEAR) for index in best)
+    return values[:, i - _NEAR : i + _NEAR + 1, j - _NEAR : j + _NEAR + 1]
+
+
+def _flatten(excess_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, list[Rows]]:
+    """Return the excess without drift and tilt, the columns of a tilt, (N, 2), and the rows of stretches whose means are zero.
+
+    Stretches are `_DRIFT_M` long, shorter where there would be too few to leave some out.
+    """
     path_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
-    return np.array_split(np.arange(len(xy_m)), max(_BLOCKS, round(path_m / _DRIFT_M)))
-
-
-def _remove_means(values: FloatArray, stretches: Sequence[Rows]) -> FloatArray:
-    return np.concatenate([values[rows] - values[rows].mean(axis=0) for rows in stretches if rows.size])
+    stretches = np.array_split(np.arange(len(xy_m)), max(_BLOCKS, round(path_m / _DRIFT_M)))
+    stretches = [rows for rows in stretches if rows.size]
+    flat_m, tilt = (
+        np.concatenate([values[rows] - values[rows].mean(axis=0) for rows in stretches]) for values in (excess_m, xy_m)
+    )
+    return _remove_tilt(flat_m, tilt), tilt, stretches
 
 
 def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
@@ -288,7 +332,7 @@ def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
 
 def _group_stretches(xy_m: FloatArray, stretches: Sequence[Rows]) -> list[list[Rows]]:
     """Return stretches in blocks, along the path and by place: errors of GNSS are alike in time, those of the map in place."""
-    centre_m = np.stack([xy_m[rows].mean(axis=0) for rows in stretches if rows.size])
+    centre_m = np.stack([xy_m[rows].mean(axis=0) for rows in stretches])
     east, north = np.floor(centre_m - centre_m.min(axis=0)).astype(np.int64).T
     orders = (np.arange(len(centre_m)), np.argsort(compute_morton(east, north), kind="stable"))
     return [
