@@ -52,6 +52,8 @@ _RIVAL_SIGMAS = 3.0
 _APART_M = 0.75
 """Ground that fits nearly as well somewhere else, this far away, does not tell where the track is [m]."""
 _RIDGE = 1e-12
+_FEW_BLOCKS = 1.26
+"""Factor of a variance from so few blocks, so that two standard deviations cover 95 % (square of the ratio of Student's t and normal)."""
 _ROUNDS, _REWEIGHTINGS, _LEAST_MISFIT_M = 6, 20, 0.01
 _DRIFT_M = 25.0
 """Stretches of path in which the track's heights may be off by a constant of their own [m]: those of GNSS drift over tens of seconds."""
@@ -356,7 +358,7 @@ def _descend(
     most = int(np.argmax([np.trace(covariance) for covariance in found]))
     independent = 2.0 * least / len(excess_m) * np.linalg.inv(curvature)
     is_bottom = bool((np.linalg.eigvalsh(curvature) > _RIDGE).all())
-    return step_m, found[most] + independent if is_bottom else np.eye(2) / _RIDGE, groupings[most]
+    return step_m, _FEW_BLOCKS * found[most] + independent if is_bottom else np.eye(2) / _RIDGE, groupings[most]
 
 
 def _find_bottom(excess_m: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray, float]:
