@@ -35,7 +35,7 @@ from tcpipe.formats.run_documents import Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
-from tcpipe.stages.sample import Sampled, Shifts, find_shifts, sample_segments
+from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import to_integers
@@ -313,16 +313,12 @@ def _map(source: MapFile, sample: _Sample, card: DatasetCard) -> SampleMap:
     )
 
 
-def _find_map_shifts(card: DatasetCard, name: str) -> Shifts:
-    return next((list_shifts(of.registration) for of in card.maps if of.name == name), {})
-
-
 def _sample_segment(segment: Mapping[str, Value], source: MapFile, card: DatasetCard) -> Sampled:
     """Sample one segment, given as a row of values, moved as the dataset's run was."""
     row = {column.name: pa.array([segment[column.name]], column.dtype) for column in PLACED_SEGMENTS.columns}
     table = pa.Table.from_arrays(list(row.values()), schema=PLACED_SEGMENTS.arrow())
-    recipe, shifts = card.recipe, _find_map_shifts(card, source.name)
-    return sample_segments(table, source, recipe.sample, gnss_crs=recipe.read.gnss_crs, shifts=shifts)
+    shifts = list_shifts(entry for of in card.maps if of.name == source.name for entry in of.registration)
+    return sample_segments(table, source, card.recipe.sample, gnss_crs=card.recipe.read.gnss_crs, shifts=shifts)
 
 
 def _sample_again(
@@ -348,9 +344,7 @@ def _sample_again(
     sampled = _sample_segment(segment, source, card)
     if len(sampled.kept) == 0:
         return f"map {source.name} no longer gives a patch for it"
-    shift_m = find_shifts(segments.column("run_id").slice(row, 1), _find_map_shifts(card, source.name))
-    segment["position_std_m"] = float(np.hypot(segment["position_std_m"], shift_m[0, 2]))
-    return segment, sampled.patches
+    return {**segment, "position_std_m": sampled.position_std_m.item()}, sampled.patches
 
 
 def _iterate_differences(

@@ -43,23 +43,18 @@ class Sampled:
 
     ``kept`` are the rows of the segments that have a patch, (N,), rising on each map; all else of N is in that order. ``map_index`` says
     which map each is on. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS 84 lon, lat
-    [deg]. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,). Where pixels wait in files, those of ``patches`` are empty.
+    [deg]. ``position_std_m`` is their DRMS, (N,), with that of the run's shift. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,). Where
+    pixels wait in files, those of ``patches`` are empty.
     """
 
     kept: NDArray[np.int64]
     map_index: NDArray[np.uint8]
     patches: Patches
+    position_std_m: NDArray[np.float64]
     footprint_xy_m: NDArray[np.float64]
     footprint_lonlat_deg: NDArray[np.float64]
     lost_by: NDArray[np.uint32]
     findings: tuple[Finding, ...]
-
-
-def find_shifts(run_ids: pa.ChunkedArray, shifts: Shifts) -> NDArray[np.float64]:
-    """Return the shift of each run, in x and y, and its DRMS [m], shape (N, 3); zeros for runs without one."""
-    if not shifts:
-        return np.zeros((len(run_ids), 3))
-    return np.array([shifts.get(run_id, (0.0, 0.0, 0.0)) for run_id in run_ids.to_pylist()]).reshape(-1, 3)
 
 
 def sample_segments(
@@ -87,7 +82,8 @@ def sample_segments(
     """
     PLACED_SEGMENTS.check(segments, more=True)
     chord_m, projection = to_floats(segments, "chord_m"), find_map_projection(source, gnss_crs)
-    shift_m = find_shifts(segments.column("run_id"), shifts)
+    moved = (shifts.get(run_id, (0.0, 0.0, 0.0)) for run_id in segments.column("run_id").to_pylist())
+    shift_m = np.array(list(moved)).reshape(-1, 3)
     start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m[:, :2] for name in ("start", "end"))
     frames = make_patch_frames(start, end, chord_m)
     corners = compute_footprints(frames, config.patch_m)
@@ -106,6 +102,7 @@ def sample_segments(
         kept=kept,
         map_index=np.zeros(kept.size, np.uint8),
         patches=patches,
+        position_std_m=std_m[kept],
         footprint_xy_m=corners[kept],
         footprint_lonlat_deg=find_map_projection(source, "EPSG:4326").inverse(corners[kept]),
         lost_by=lost_by,
@@ -188,6 +185,7 @@ def sample_on_maps(
         kept=np.concatenate([part.kept for part in parts]),
         map_index=np.concatenate([part.map_index for part in parts]),
         patches=join_patches([part.patches for part in parts]),
+        position_std_m=np.concatenate([part.position_std_m for part in parts]),
         footprint_xy_m=np.concatenate([part.footprint_xy_m for part in parts]),
         footprint_lonlat_deg=np.concatenate([part.footprint_lonlat_deg for part in parts]),
         lost_by=lost_by,

@@ -63,7 +63,7 @@ from tcpipe.recipe import CovariateConfig, Recipe
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
-from tcpipe.stages.sample import Sampled, Shifts, sum_losses
+from tcpipe.stages.sample import Sampled, sum_losses
 from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
@@ -174,8 +174,6 @@ class SampleTable:
     patch: NDArray[np.int64]
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
-    shifts: Sequence[Shifts] = ()
-    """By map, of the runs that are moved on it."""
     redaction: Redactor | None = None
     """None: names and places are public."""
 
@@ -206,11 +204,7 @@ class SampleTable:
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
         columns |= {name: values[at] for name, values in self.sampled.patches.columns().items()}
-        if any(self.shifts):
-            on_map, run_ids = self.sampled.map_index[at].tolist(), segments.column("run_id").to_pylist()
-            moved = zip(on_map, run_ids, strict=True)
-            shift_std_m = [self.shifts[index].get(run_id, (0.0, 0.0, 0.0))[2] for index, run_id in moved]
-            columns["position_std_m"] = np.hypot(to_floats(segments, "position_std_m"), shift_std_m)
+        columns["position_std_m"] = self.sampled.position_std_m[at]
         columns["geometry"] = make_points(centres := self._centres_deg(at))
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
         if not self.has_terrain:
@@ -330,7 +324,6 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             sources[0].classes.names(),
             order,
             added,
-            shifts,
         ),
         spool=spool,
         sources=sources,

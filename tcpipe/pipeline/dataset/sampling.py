@@ -47,7 +47,7 @@ _ROW_MASK = (1 << _ROW_BITS) - 1
 _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that few batches decode a map tile."""
 
-_PLACING = ("map_index", "footprint_xy_m", "footprint_lonlat_deg")
+_PLACING = ("map_index", "position_std_m", "footprint_xy_m", "footprint_lonlat_deg")
 _SAMPLED = ("kept", "lost_by", *_PLACING)
 
 _SIZE_BYTES = 8
