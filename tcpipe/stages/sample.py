@@ -43,8 +43,8 @@ class Sampled:
 
     ``kept`` are the rows of the segments that have a patch, (N,), rising on each map; all else of N is in that order. ``map_index`` says
     which map each is on. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS 84 lon, lat
-    [deg]. ``position_std_m`` is their DRMS, (N,), with that of the run's shift. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,). Where
-    pixels wait in files, those of ``patches`` are empty.
+    [deg]. ``position_std_m`` is their DRMS, (N,), with that of the run's shift. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,).
+    Where pixels wait in files, those of ``patches`` are empty.
     """
 
     kept: NDArray[np.int64]
