@@ -366,13 +366,14 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
         "run": _find_indices(table, "run_id", [run.run_id for run in card.runs]),
     }
     apart_m, nearest = find_nearest_train_m(xy_m, keys["split"])
-    readers = _list_values(card, table) | {"apart": lambda: apart_m}
+    x_m, y_m = xy_m.T
+    readers = _list_values(card, table) | {"apart": lambda: apart_m, "x": lambda: x_m, "y": lambda: y_m}
     if table.num_rows > MOST_SAMPLES:
         values, keys, row_of, cell_m = _average_in_cells(readers, keys, xy_m)
         xy_m = np.column_stack([values["x"], values["y"]])
     else:
         values = {name: read() for name, read in readers.items()}
-        values |= {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
+        values["count"] = np.ones(len(xy_m))
     columns: dict[str, Column] = {"x": ("steps", values["x"]), "y": ("steps", values["y"])}
     columns |= {name: make_shown_column(digits, values[name]) for name, (*_, digits) in LABELS.items()}
     columns |= {name: ("half", part) for name, part in values.items() if name not in {*columns, "count"}}
@@ -442,7 +443,7 @@ def _average_in_cells(
     size, group = len(groups), np.searchsorted(groups, place).astype(np.int32)
     del place
     means = {}
-    for name, read in {**readers, "x": lambda: xy_m[:, 0], "y": lambda: xy_m[:, 1]}.items():
+    for name, read in readers.items():
         part = read()
         known = np.isfinite(part)
         with np.errstate(invalid="ignore"):
