@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tcpipe.power.joints import JointPower
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
@@ -24,7 +25,7 @@ from tcpipe.power.sources import (
     sign_by_mean,
 )
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots import CurrentSign, PowerSource
+from tcpipe.robots import GAIN_STD_FRACTION, TORQUE_GAIN_STD_FRACTION, CurrentSign, PowerSource
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
 
 _LOG_TIME = "log_time_ns"
@@ -80,6 +81,7 @@ def read_power(
     rejected: list[Finding] = []
     scaled: dict[str, list[PowerSource]] = {}
     findings: list[Finding] = []
+    gains: list[float] = []
     for topic, (type_name, columns) in topics.items():
         if too_few := _find_too_few(topic, np.asarray(columns[_LOG_TIME], np.float64)):
             rejected += too_few
@@ -94,6 +96,7 @@ def read_power(
             continue
         sources += found.sources
         findings += found.findings
+        gains += found.gain_std_fractions()
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
     rejected = rejected or _find_incomplete(rails)
@@ -103,7 +106,8 @@ def read_power(
         return PowerReadings(findings=tuple(rejected))
     rails, odd = _exclude_implausible(rails)
     log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
-    sign, of_sign, told_by = _sign(rails, log_times, sources, current_sign)
+    given: CurrentSign = "auto" if any(of.joints for of in sources) else current_sign
+    sign, of_sign, told_by = _sign(rails, log_times, sources, given)
     if sign == 0:
         return PowerReadings(findings=of_sign)
     includes = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
@@ -121,15 +125,8 @@ def read_power(
         tuple(dict.fromkeys(findings)),
         told_by,
         includes,
-        gain_std_fraction=max(
-            float(
-                np.hypot(
-                    of.gain_std_fraction, 0.0 if of.nominal_voltage_volt is None else of.nominal_voltage_std_fraction
-                )
-            )
-            for of in sources
-        ),
-        offset_std_amp=max(of.offset_std_watt if of.lacks_voltage else of.offset_std_amp for of in sources),
+        gain_std_fraction=max(gains),
+        offset_std_amp=max(_find_offset_std(of) for of in sources),
         rest_current_amp=(min(of[0] for of in rest), max(of[1] for of in rest))
         if rest and len(rest) == sum(bool(of.current or of.energy) for of in sources)
         else None,
@@ -155,7 +152,12 @@ class _TopicRails:
     def apply_type_signs(self) -> list[RailReadings]:
         """Return the rails with the sign that their type gives a drawn current."""
         each = zip(self.rails, self.sources, strict=True)
-        return [apply_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in each]
+        return [apply_sign(rail, -1 if of.sign == "drawn_negative" and not of.joints else 1) for rail, of in each]
+
+    def gain_std_fractions(self) -> list[float]:
+        """Return the σ of the gain of each rail."""
+        each = zip(self.rails, self.sources, strict=True)
+        return [_find_gain_std(of, rail.joints) for rail, of in each]
 
 
 def _read_first_valid(
@@ -174,9 +176,30 @@ def _read_first_valid(
             rejected += problems
             continue
         used = " + ".join(rail.name for rail in rails)
+        findings += [_find_joints(rail.joints) for rail in rails if rail.joints]
         findings += [make_finding("power-fallback", why.subject, names={**why.names, "used": used}) for why in rejected]
         return _TopicRails(sources, rails, findings)
     return rejected
+
+
+def _find_gain_std(source: PowerSource, joints: JointPower | None) -> float:
+    std = source.gain_std_fraction
+    if joints is not None:
+        return joints.gain_std_fraction(TORQUE_GAIN_STD_FRACTION if std is None else std)
+    nominal = 0.0 if source.nominal_voltage_volt is None else source.nominal_voltage_std_fraction
+    return float(np.hypot(GAIN_STD_FRACTION if std is None else std, nominal))
+
+
+def _find_offset_std(source: PowerSource) -> float:
+    """Return the σ of the zero of a rail's current, or power; joints that are stationary take none."""
+    return 0.0 if source.joints else source.offset_std_watt if source.lacks_voltage else source.offset_std_amp
+
+
+def _find_joints(joints: JointPower) -> Finding:
+    """Return the finding that power is mechanical."""
+    names, count = {"joints": ", ".join(joints.names)}, len(joints.names)
+    numbers = {"loss_fraction": joints.loss_fraction, "returned_fraction": joints.returned_fraction}
+    return make_finding("power-from-joints", _POWER, names=names, joints_count=count, **numbers)
 
 
 def _convert_thousandths(
@@ -302,7 +325,7 @@ def _sign(
         return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
     time_s, whole = _sum_currents(rails, log_times)
     sign, net = sign_by_mean(whole, _weight_s(time_s))
-    signs = {source.sign for source in sources}
+    signs = {"drawn_positive" if of.joints else of.sign for of in sources}
     if "auto" not in signs:
         told, other = "drawn_positive", "drawn_negative"
         if signs == {other}:
