@@ -168,7 +168,8 @@ def _compact_column(values: NDArray[Any]) -> NDArray[Any]:
     row_bytes = values[:1].nbytes
     if len(values) < 2 or not row_bytes:
         return values.copy()
-    bits = values.reshape(-1).view(np.uint64 if row_bytes % 8 == 0 else np.uint8).reshape(len(values), -1)
+    octets = values.reshape(-1).view(np.uint8)  # of a text of 17 letters no view as numbers of 8 bytes
+    bits = octets.view(np.uint64 if row_bytes % 8 == 0 else np.uint8).reshape(len(values), -1)
     if np.array_equal(bits[0], bits[-1]) and (bits == bits[0]).all():
         return np.broadcast_to(values[0].copy(), values.shape)
     return values.copy()
