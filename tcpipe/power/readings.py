@@ -96,7 +96,7 @@ def read_power(
             continue
         sources += found.sources
         findings += found.findings
-        gains += found.gain_std_fractions()
+        gains += [_find_gain_std(of, rail.joints) for of, rail in zip(found.sources, found.rails, strict=True)]
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
     rejected = rejected or _find_incomplete(rails)
@@ -153,11 +153,6 @@ class _TopicRails:
         """Return the rails with the sign that their type gives a drawn current."""
         each = zip(self.rails, self.sources, strict=True)
         return [apply_sign(rail, -1 if of.sign == "drawn_negative" and not of.joints else 1) for rail, of in each]
-
-    def gain_std_fractions(self) -> list[float]:
-        """Return the σ of the gain of each rail."""
-        each = zip(self.rails, self.sources, strict=True)
-        return [_find_gain_std(of, rail.joints) for rail, of in each]
 
 
 def _read_first_valid(

@@ -38,6 +38,9 @@ TORQUE_GAIN_STD_FRACTION, LOSS_STD_FRACTION = 0.1, 0.3
 """σ of the gain of torques, which most drivers compute from the motor current with a nominal torque constant (data sheets: ± 10 %), and of
 a stated loss: copper's resistance rises by 0.39 % a kelvin."""
 
+TABLE_POWER = "tcpipe/msg/TablePower"
+"""The type of a table of power, where that is neither a voltage nor a current as it stands."""
+
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
 
