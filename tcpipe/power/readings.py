@@ -192,10 +192,8 @@ def _find_offset_std(source: PowerSource) -> float:
 
 def _find_joints(joints: JointPower) -> Finding:
     """Return the finding that power is mechanical."""
-    names, count = {"joints": ", ".join(joints.names)}, len(joints.names)
-    loss, returned = joints.loss_fraction, joints.returned_fraction
-    numbers: dict[str, Any] = {"joints_count": count, "loss_fraction": loss, "returned_fraction": returned}
-    return make_finding("power-from-joints", _POWER, names=names, **numbers)
+    names, loss, returned = {"joints": ", ".join(joints.names)}, joints.loss_fraction, joints.returned_fraction
+    return make_finding("power-from-joints", _POWER, names=names, loss_fraction=loss, returned_fraction=returned)
 
 
 def _convert_thousandths(

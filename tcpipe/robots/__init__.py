@@ -114,7 +114,7 @@ class PowerSource:
     power: str = field(default="", metadata=LEFT_OUT)
     """Field of the power [W], in place of a current; needs no voltage."""
     joints: str = field(default="", metadata={"json": ("",)})
-    """Joints whose torque times speed is the power, in place of other fields: a regular expression of whole names."""
+    """Joints whose torque times speed is the power: a regular expression of whole names."""
     voltage_scale: Scale = 1.0
     """Factor on the voltage: 0.001 if it is in millivolts."""
     current_scale: Scale = 1.0
@@ -122,13 +122,13 @@ class PowerSource:
     energy_scale: Scale = 1.0
     """Factor on the counter: 3600 if it counts watt-hours."""
     torque_scale: Scale = field(default=1.0, metadata={"json": (1.0,)})
-    """Factor on the efforts of joints: to N m, of the shaft whose speed is given."""
+    """Factor on the efforts of joints, to N m."""
     speed_scale: Scale = field(default=1.0, metadata={"json": (1.0,)})
-    """Factor on the velocities of joints: 0.104720 if they are in rpm."""
+    """Factor on the velocities of joints, to rad/s."""
     loss_watt_per_nm2: Annotated[float, Bounds(ge=0, le=1e6)] = field(default=0.0, metadata={"json": (0.0,)})
-    """r of the loss r torque² of each joint (motor resistance / torque constant², at the shaft); 0: none is stated."""
+    """Loss of each joint per squared torque: motor resistance / torque constant², at the joint."""
     recovered: bool = field(default=False, metadata={"json": (False,)})
-    """Whether the power that joints give back counts; otherwise a joint's power is never negative."""
+    """Whether negative power of a joint counts."""
     nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
     """Assumed voltage of a current [V]."""
     nominal_voltage_std_fraction: Share = field(
