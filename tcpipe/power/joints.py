@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from tcpipe.robots import LOSS_STD_FRACTION, PowerSource
 
+Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 
 NAMES, SPEED, TORQUE = "name[]", "velocity", "effort"
@@ -34,12 +35,8 @@ class JointMotion:
     torque_nm: Floats
     speed_radps: Floats
 
-    def mechanical_watt(self) -> Floats:
-        """Return the mechanical power of all joints, shape (N,)."""
-        return np.asarray((self.torque_nm * self.speed_radps).sum(axis=1))
 
-
-def select_joints(columns: Mapping[str, NDArray[Any]], source: PowerSource) -> JointMotion:
+def select_joints(columns: Columns, source: PowerSource) -> JointMotion:
     """Return the joints of a source, which messages may hold in any order; ``columns`` are those of messages that have all three fields."""
     layouts = _find_layouts(columns[NAMES])
     wanted = re.compile(source.joints)

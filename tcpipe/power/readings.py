@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.power.joints import JointPower
+from tcpipe.power.joints import Columns, JointPower
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
     REJECTED,
-    Columns,
     Floats,
     HuskyPower,
     RailReadings,

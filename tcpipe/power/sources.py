@@ -15,12 +15,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.joints import NAMES, SPEED, TORQUE, JointPower, compute_joint_power, select_joints
+from tcpipe.power.joints import NAMES, SPEED, TORQUE, Columns, JointPower, compute_joint_power, select_joints
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
-Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 HuskyPower = Literal["battery", "drivers"]
 
@@ -179,7 +178,7 @@ def _read_joints(columns: Columns, source: PowerSource, topic: str) -> RailReadi
     for reason, values in (("no-effort", motion.torque_nm), ("no-velocity", motion.speed_radps)):
         if lacking := [name for name, of in zip(motion.names, values.T, strict=True) if np.isnan(of).all()]:
             return reject_power(topic, reason, names={"joints": ", ".join(lacking)})
-    watt = motion.mechanical_watt()
+    watt = (motion.torque_nm * motion.speed_radps).sum(axis=1)
     if np.isnan(watt).all():
         return reject_power(topic, "joints-apart", names={"joints": ", ".join(motion.names)})
     told, net = sign_by_mean(watt, np.ones(len(watt)))

@@ -111,7 +111,7 @@ class PowerSource:
     """Field of the current [A]; omit it if the message contains only a voltage, or a counter."""
     energy: str = ""
     """Field of a counter of energy, in place of a current, for example drawn - given_back."""
-    power: str = field(default="", metadata=LEFT_OUT)
+    power: str = field(default="", metadata={"json": ("",)})
     """Field of the power [W], in place of a current; needs no voltage."""
     joints: str = field(default="", metadata={"json": ("",)})
     """Joints whose torque times speed is the power: a regular expression of whole names."""

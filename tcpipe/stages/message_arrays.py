@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +17,9 @@ from tcpipe.power.rails import Rail, make_rail, make_samples
 from tcpipe.tables.arrays import select_rows, to_numbers, to_texts
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import Streams
+
+
+T = TypeVar("T", bound=np.generic)
 
 
 class LogReader(Protocol):
@@ -110,7 +113,7 @@ def _fill_nulls(lengths: NDArray[np.int64], flat: pa.Array) -> NDArray[np.float6
     return _fill_rows(lengths, to_numbers(flat).astype(np.float64, copy=False), np.nan)
 
 
-def _fill_rows(lengths: NDArray[np.int64], values: NDArray[Any], empty: object) -> NDArray[Any]:
+def _fill_rows(lengths: NDArray[np.int64], values: NDArray[T], empty: float | str) -> NDArray[T]:
     """Return values of lists, one after the other, as a row a list, shape (N, k); ``empty`` where one is shorter than the longest."""
     if len(lengths) and lengths.min() == lengths.max():
         return values.reshape(len(lengths), int(lengths[0]))

@@ -100,6 +100,7 @@ def test_energy_is_the_sum_of_torque_times_speed_and_the_loss(drive, tmp_path):
     line = next(line for line in printed.splitlines() if line.endswith("[power-from-joints]"))
     loss, returned = LOSS * np.sum(torque**2) / drawn.sum(), (drawn - each).sum() / drawn.sum()
     assert all(f"{100 * share:.3g} %" in line for share in (loss, returned)), line
+    assert "mechanical power" in line
     assert "not electrical" in line
     sensor = run.manifest.info.report.facts.label.power_sensor
     assert sensor.gain_std_fraction == pytest.approx(np.hypot(0.1 * (1 + loss), 0.3 * loss), rel=1e-6)
