@@ -18,7 +18,6 @@ from tcpipe.tables.arrays import select_rows, to_numbers, to_texts
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import Streams
 
-
 T = TypeVar("T", bound=np.generic)
 
 
