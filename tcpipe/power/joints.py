@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.robots import LOSS_STD_FRACTION, PowerSource
+from tcpipe.robots import PowerSource
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
@@ -51,9 +51,7 @@ def select_joints(columns: Columns, source: PowerSource) -> JointMotion:
 
 
 def _find_layouts(names: NDArray[np.str_]) -> dict[tuple[str, ...], NDArray[np.int64]]:
-    """Return the rows of messages, shape (N, k), by their lists of names."""
-    if not len(names):
-        return {}
+    """Return the rows of at least one message, shape (N, k), by their lists of names."""
     first = np.flatnonzero(np.concatenate(([True], (names[1:] != names[:-1]).any(axis=1))))
     found: dict[tuple[str, ...], list[NDArray[np.int64]]] = {}
     for rows in np.split(np.arange(len(names)), first[1:]):
@@ -69,11 +67,6 @@ class JointPower:
     watt: Floats
     loss_fraction: float
     returned_fraction: float
-
-    def gain_std_fraction(self, torque_std_fraction: float) -> float:
-        """Return the σ of the power's gain by that of the torques: an error of these changes the loss twice as much."""
-        of_torque = torque_std_fraction * (1.0 + self.loss_fraction)
-        return float(np.hypot(of_torque, LOSS_STD_FRACTION * self.loss_fraction))
 
 
 def compute_joint_power(motion: JointMotion, source: PowerSource, *, sign: int) -> JointPower:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -24,7 +25,7 @@ from tcpipe.power.sources import (
     sign_by_mean,
 )
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots import GAIN_STD_FRACTION, TORQUE_GAIN_STD_FRACTION, CurrentSign, PowerSource
+from tcpipe.robots import GAIN_STD_FRACTION, LOSS_STD_FRACTION, TORQUE_GAIN_STD_FRACTION, CurrentSign, PowerSource
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
 
 _LOG_TIME = "log_time_ns"
@@ -125,7 +126,9 @@ def read_power(
         told_by,
         includes,
         gain_std_fraction=max(gains),
-        offset_std_amp=max(_find_offset_std(of) for of in sources),
+        offset_std_amp=max(
+            0.0 if of.joints else of.offset_std_watt if of.lacks_voltage else of.offset_std_amp for of in sources
+        ),
         rest_current_amp=(min(of[0] for of in rest), max(of[1] for of in rest))
         if rest and len(rest) == sum(bool(of.current or of.energy) for of in sources)
         else None,
@@ -177,16 +180,12 @@ def _read_first_valid(
 
 
 def _find_gain_std(source: PowerSource, joints: JointPower | None) -> float:
-    std = source.gain_std_fraction
-    if joints is not None:
-        return joints.gain_std_fraction(TORQUE_GAIN_STD_FRACTION if std is None else std)
+    """Return the σ of a rail's gain; an error of torques changes their loss twice as much."""
+    loss = joints.loss_fraction if joints else 0.0
+    usual = TORQUE_GAIN_STD_FRACTION if joints else GAIN_STD_FRACTION
+    stated = usual if source.gain_std_fraction is None else source.gain_std_fraction
     nominal = 0.0 if source.nominal_voltage_volt is None else source.nominal_voltage_std_fraction
-    return float(np.hypot(GAIN_STD_FRACTION if std is None else std, nominal))
-
-
-def _find_offset_std(source: PowerSource) -> float:
-    """Return the σ of the zero of a rail's current, or power; joints that are stationary take none."""
-    return 0.0 if source.joints else source.offset_std_watt if source.lacks_voltage else source.offset_std_amp
+    return math.hypot(stated * (1.0 + loss), LOSS_STD_FRACTION * loss, nominal)
 
 
 def _find_joints(joints: JointPower) -> Finding:
