@@ -9,7 +9,8 @@ from pathlib import Path
 import polars as pl
 
 from tcpipe.cli import cli
-from tcpipe.formats.logs.table_log import TableLog
+from tcpipe.formats.logs.message_tables import TableLog
+from tcpipe.formats.logs.table_log import open_tables
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, load_recipe
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import Recipe
@@ -57,14 +58,14 @@ def test_fomo_and_drive_map_the_columns_that_their_publishers_write(tmp_path: Pa
     (tmp_path / "gt.txt").write_text(
         "".join(f"{1760456485 + k / 10} 255855.3 5242729.3 643.6 0 0 0 1\n" for k in range(20))
     )
-    assert played(fomo, TableLog(tmp_path, fomo.tables)) == {"pose", "wheel_odometry", "command", "power"}
+    assert played(fomo, open_tables(tmp_path, fomo.tables)) == {"pose", "wheel_odometry", "command", "power"}
     logged = ["cmd_vel_x", "cmd_vel_omega", *(f"icp_pos_{axis}" for axis in "xyz"), *(f"imu_{axis}" for axis in "xyz")]
     logged += [f"imu_acceleration_{axis}" for axis in "xyz"] + [f"{side}_wheel_{what}" for what in VI for side in SIDES]
     times = [str(1721335359000000000 + k * 50_000_000) for k in range(20)]
     frame = pl.DataFrame({"ros_time": times} | {name: ["0.5"] * 20 for name in logged})
     for file in ("icp", "frame"):
         frame.write_parquet(tmp_path / f"{file}.parquet")
-    assert played(drive, TableLog(tmp_path, drive.tables)) == {"pose", "imu", "command", "power"}
+    assert played(drive, open_tables(tmp_path, drive.tables)) == {"pose", "imu", "command", "power"}
 
 
 def test_rellis_plays_its_roles_by_the_topics_of_its_readme() -> None:
@@ -122,5 +123,5 @@ def test_fau_makes_its_tables_of_the_published_columns(tmp_path: Path) -> None:
         path.write_text(f"{head}\n{''.join(rows)}", encoding="utf-8")
     script["main"](tmp_path, tmp_path / "fau")
     recipe, gnss = load_recipe(PIPELINES / "fau.toml"), pl.read_csv(tmp_path / "fau" / "gnss.csv")
-    assert played(recipe, TableLog(tmp_path / "fau", recipe.tables)) == {"gnss", "imu", "power"}
+    assert played(recipe, open_tables(tmp_path / "fau", recipe.tables)) == {"gnss", "imu", "power"}
     assert gnss["std"].to_list()[:3] == [0.02, 0.3, 0.8]

@@ -12,19 +12,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeAlias
+from typing import Self, TypeAlias
 
 import pyarrow as pa
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import Mappings
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
-
-if TYPE_CHECKING:
-    from tcpipe.formats.logs.table_log import TableLog
 
 _PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
 _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
@@ -158,9 +156,9 @@ def open_logs(
 def open_single_log(path: Path | str, *, message_definitions: Path | None, tables: Mappings | None) -> Log | TableLog:
     """Open one log: a folder that is no bag is one of tables, where ``tables`` says what they hold."""
     if tables and isinstance(path, Path) and path.is_dir() and not is_one_bag(path):
-        from tcpipe.formats.logs.table_log import TableLog  # noqa: PLC0415  polars only where a table is read
+        from tcpipe.formats.logs.table_log import open_tables  # noqa: PLC0415  polars only where a table is read
 
-        return TableLog(path, tables)
+        return open_tables(path, tables)
     return open_log(path, message_definitions=message_definitions)
 
 
