@@ -15,7 +15,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.logs.topics import Damage, Topic, find_damage
+from tcpipe.formats.finding_lines import describe_finding
+from tcpipe.logs.topics import Damage, Topic, find_damage, split_notes
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
@@ -68,6 +69,11 @@ class TableLog:
     def close(self) -> None:
         """Remove temporary copies."""
         self._stack.close()
+
+    @property
+    def damage(self) -> list[str]:
+        """The findings but for notes, a line each."""
+        return [describe_finding(finding) for finding in split_notes(self.findings)[0]]
 
     @property
     def size_bytes(self) -> int:
