@@ -20,43 +20,45 @@ from tcpipe.formats.logs.message_tables import TableLog, TopicMessages, make_mes
 from tcpipe.logs.autopilot import (
     CONVERTED,
     Autopilot,
-    AutopilotMessages,
     RoleMessages,
     find_places,
     find_utc_offset_us,
     make_role_messages,
 )
 from tcpipe.logs.roles import ODOMETRY, TRANSFORMS
-from tcpipe.logs.topics import Topic, find_damage
+from tcpipe.logs.topics import AutopilotKind, Topic, find_damage
 from tcpipe.tables.arrays import make_column
 from tcpipe.tables.findings import Subject, make_finding
 
 _OWN_TYPES = {"ulog": "px4", "dataflash": "ardupilot"}
 
 
-def open_autopilot_log(path: Path, kind: str, stack: ExitStack) -> TableLog:
+def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> TableLog:
     """Read a ``ulog`` or ``dataflash`` log; ``stack`` is closed with it. `LogError`: it cannot be read."""
     records = read_records(path, kind)
-    known = {name: of for name, of in records.messages.items() if re.sub(r"_\d+$", "", name) in CONVERTED}
-    messages = {name: AutopilotMessages(of.time_us, of.read_columns(records.data)) for name, of in known.items()}
-    log = Autopilot(messages, records.parameters)
-    converted, findings = make_role_messages(log, kind)
-    offset_us = find_utc_offset_us(log, kind)
-    places = find_places(log.parameters)
+    known = {name: of for name, of in records.messages.items() if _find_base(name) in CONVERTED}
+    messages = {name: (of.time_us, of.read_columns(records.data)) for name, of in known.items()}
+    log = Autopilot(kind, messages, records.parameters)
+    converted, findings = make_role_messages(log)
+    offset_us, places = find_utc_offset_us(log), find_places(log.parameters)
     own = [_make_own(records, name, of, _OWN_TYPES[kind], offset_us) for name, of in records.messages.items()]
     of_roles = [_make_of_role(of, places, offset_us) for of in converted]
     findings += find_damage(records.damage)
     if records.dropouts:
-        lost = make_finding("logger-dropouts", Subject("file", path.name), dropouts_count=records.dropouts)
-        findings.append(lost)
+        findings.append(make_finding("logger-dropouts", Subject("file", path.name), dropouts_count=records.dropouts))
     transforms = [_make_transforms(places, of_roles[0].topic.start_ns or 0)] if places and of_roles else []
     return TableLog(path, kind, [*own, *of_roles, *transforms], [path], findings=findings, stack=stack)
+
+
+def _find_base(name: str) -> str:
+    """Return the name of messages without the number of their instance."""
+    return re.sub(r"_\d+$", "", name)
 
 
 def _make_own(records: AutopilotRecords, name: str, of: Messages, package: str, offset_us: int) -> TopicMessages:
     """Return a topic of the autopilot's own messages."""
     stamp_ns = (of.time_us + offset_us) * 1000
-    type_name = f"{package}/msg/{re.sub(r'_[0-9]+$', '', name)}"
+    type_name = f"{package}/msg/{_find_base(name)}"
     return _make_topic(
         f"/{name}", type_name, stamp_ns, lambda: make_message_table(stamp_ns, of.read_columns(records.data))
     )

@@ -14,7 +14,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import MAX_COLUMNS, MAX_TOPICS
 from tcpipe.formats.logs.log_part import gather_integers
-from tcpipe.logs.topics import Damage
+from tcpipe.logs.topics import AutopilotKind, Damage
 
 _HEAD = b"\xa3\x95"
 _FORMAT, _FORMAT_BYTES = 0x80, 89
@@ -81,12 +81,24 @@ class AutopilotRecords:
     data: bytes
     messages: dict[str, Messages] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
-    damage: list[Damage] = field(default_factory=list)
+    damage: dict[Damage, None] = field(default_factory=dict)
+    skipped: dict[str, Damage] = field(default_factory=dict)
+    """By cause, what could not be read."""
     dropouts: int = 0
 
     def note(self, cause: str, **what: Any) -> None:
-        """Add damage."""
-        self.damage.append(Damage(cause, self.path.name, **what))
+        """Add damage; more than some thousand entries say nothing new."""
+        if len(self.damage) < MAX_TOPICS:
+            self.damage[Damage(cause, self.path.name, **what)] = None
+
+    def skip(self, start: int, end: int) -> int:
+        """Return ``end``, up to where the file cannot be read from ``start``."""
+        cause = "record-damaged" if end < len(self.data) else "file-cut"
+        before = self.skipped.get(cause) or Damage(cause, self.path.name, offset=start, bytes_lost=0, places=0)
+        self.skipped[cause] = replace(
+            before, bytes_lost=(before.bytes_lost or 0) + end - start, places=before.places + 1
+        )
+        return end
 
     def add(
         self, name: str, instance: int, layout: np.dtype[Any], places: Int64, scales: Mapping[str, float] = _UNSCALED
@@ -129,13 +141,14 @@ def _find_stray(time_us: Int64) -> NDArray[np.bool_]:
     return found
 
 
-def read_records(path: Path, kind: str) -> AutopilotRecords:
+def read_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
     """Return what a ``ulog`` or ``dataflash`` log holds; `LogError` where it cannot be read, or was made to take all memory."""
     try:
         records = AutopilotRecords(path, path.read_bytes())
     except OSError as error:
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
     _UlogWalk(records).read() if kind == "ulog" else _read_dataflash(records)
+    records.damage |= dict.fromkeys(records.skipped.values())
     records.note("no-checksum", messages_lost=0)
     records.sort_by_time()
     return records
@@ -154,7 +167,8 @@ _ULOG_FORMAT = re.compile(
 )
 _ULOG_FIELD = re.compile(r"(\w+)(?:\[(\d+)\])? (\w+)")
 _ULOG_KINDS = frozenset(b"FDIMPQARSOLCB")
-_SYNC = b"\x08\x00\x53\x2f\x73\x13\x20\x25\x0c\xbb\x12"
+_ULOG_HEAD = struct.Struct("<HBH")
+"""Size and kind of a message, and what number a message of data begins with."""
 _MOST_BYTES = (1 << 16) - 3
 _DATA = ord("D")
 
@@ -180,30 +194,27 @@ class _UlogWalk:
         self._topics: dict[tuple[str, int], _UlogTopic] = {}
         self._by_id: dict[int, _UlogTopic] = {}
         self._unknown: Counter[int] = Counter()
-        self._heads: re.Pattern[bytes] | None = None
+        self._columns = 0
 
     def read(self) -> None:
         """Read the whole file into the records."""
-        data, at, end_of_data, known = self._data, 16, len(self._data), self._by_id
-        unpack = struct.Struct("<HBH").unpack_from
+        at, end_of_data = 16, len(self._data)
         while at + 5 <= end_of_data:
-            size, kind, number = unpack(data, at)
+            size, kind, number = _ULOG_HEAD.unpack_from(self._data, at)
             end = at + 3 + size
-            if kind == _DATA and (of := known.get(number)) is not None and end <= end_of_data:
-                if of.layout.itemsize <= size - 2 <= of.most_bytes:
-                    of.places.append(at + 5)
-                    at = end
-                    continue
-            elif kind in _ULOG_KINDS and end <= end_of_data and self._is_head(end):
+            of = self._by_id.get(number) if kind == _DATA else None
+            if end > end_of_data or (of is None and not (kind in _ULOG_KINDS and self._is_head(end))):
+                at = self._records.skip(at, self._find_next(at + 1))
+            elif of is None:
                 self._take(kind, at + 3, size)
                 at = end
-                continue
-            after = self._find_next(at + 1)
-            cause = "record-damaged" if after < end_of_data else "file-cut"
-            self._records.note(cause, offset=at, bytes_lost=after - at)
-            at = after
+            elif of.layout.itemsize <= size - 2 <= of.most_bytes:
+                of.places.append(at + 5)
+                at = end
+            else:
+                at = self._records.skip(at, self._find_next(at + 1))
         if at < end_of_data:
-            self._records.note("file-cut", offset=at, bytes_lost=end_of_data - at)
+            self._records.skip(at, end_of_data)
         for number, count in self._unknown.items():
             reason = f"nothing says what messages of number {number} are"
             self._records.note("messages-not-decoded", messages_lost=count, reason=reason)
@@ -216,12 +227,14 @@ class _UlogWalk:
 
     def _find_next(self, start: int) -> int:
         """Return where the next message of a known topic begins; the end of the file where there is none."""
-        if self._heads is None:
-            sizes = {(of.layout.itemsize, of.most_bytes, number) for number, of in self._by_id.items()}
-            heads = {struct.pack("<HBH", size + 2, _DATA, number) for *both, number in sizes for size in both}
-            self._heads = re.compile(b"|".join(map(re.escape, sorted({_SYNC, *heads}))))
-        found = self._heads.search(self._data, start)
-        return found.start() if found else len(self._data)
+        at = self._data.find(_DATA, start + 2)
+        while 0 <= at <= len(self._data) - 3:
+            size, _, number = _ULOG_HEAD.unpack_from(self._data, at - 2)
+            of = self._by_id.get(number)
+            if of is not None and of.layout.itemsize <= size - 2 <= of.most_bytes:
+                return at - 2
+            at = self._data.find(_DATA, at + 1)
+        return len(self._data)
 
     def _take(self, kind: int, at: int, size: int) -> None:
         """Read a message that holds no data of a known topic."""
@@ -243,15 +256,14 @@ class _UlogWalk:
             case "O":
                 self._records.dropouts += 1
             case "F" | "A" | "P":
-                self._records.note("record-damaged", offset=at - 3, bytes_lost=size + 3)
+                self._records.skip(at - 3, at + size)
             case _:  # texts of the log, facts on it, synchronisation
                 pass
 
     def _subscribe(self, instance: int, number: int, name: str) -> None:
         if name not in self._layouts:
             self._layouts[name] = self._lay_out(name)
-            columns = sum(len(of[0].names or ()) for of in self._layouts.values() if not isinstance(of, str))
-            if columns > MAX_COLUMNS:
+            if self._columns > MAX_COLUMNS:
                 raise LogError(f"{self._records.path}: its topics unfold to more than {MAX_COLUMNS} columns")
         found = self._layouts[name]
         self._by_id.pop(number, None)
@@ -259,7 +271,6 @@ class _UlogWalk:
             self._records.note("messages-not-decoded", topic=f"/{name}", reason=found)
             return
         self._by_id[number] = self._topics.setdefault((name, instance), _UlogTopic(name, instance, *found))
-        self._heads = None
 
     def _lay_out(self, name: str) -> tuple[np.dtype[Any], int] | str:
         """Return how messages of a format lie, and their size with what pads them [byte]; or why nobody knows."""
@@ -271,6 +282,7 @@ class _UlogWalk:
                 size += np.dtype(code).itemsize
                 if size > _MOST_BYTES:
                     return f"a message of {name} would be longer than any can be"
+            self._columns += len(fields)
             used = list(fields)
             while used and used[-1][0].startswith("_padding"):
                 used.pop()
@@ -321,11 +333,9 @@ def _read_dataflash(records: AutopilotRecords) -> None:
                 _define_format(data, at + 3, lengths, formats)
             at = end
             continue
-        after = _find_message(data, at + 1, lengths)
-        records.note("record-damaged" if after < end_of_data else "file-cut", offset=at, bytes_lost=after - at)
-        at = after
+        at = records.skip(at, _find_message(data, at + 1, lengths))
     if at < end_of_data:
-        records.note("file-cut", offset=at, bytes_lost=end_of_data - at)
+        records.skip(at, end_of_data)
     for kind, (name, layout, scales) in formats.items():
         of = np.array(places[kind], np.int64)
         if len(of) and not layout.names:
