@@ -62,7 +62,8 @@ class Messages:
 
 def _gather_field(data: bytes, places: Int64, layout: np.dtype[Any], name: str) -> Int64:
     """Return a whole number of each message."""
-    return gather_integers(data, places + (layout.fields or {})[name][1], layout[name].str[1:].replace("u8", "i8"))
+    offset: int = layout.fields[name][1]  # type: ignore[index]  a layout that has the field has fields
+    return gather_integers(data, places + offset, layout[name].str[1:].replace("u8", "i8"))
 
 
 _CLOCKS = {"timestamp": 1, "TimeUS": 1, "T": 1000, "TimeMS": 1000}
