@@ -21,7 +21,7 @@ from tcpipe.formats.logs.log_container import find_autopilot
 from tcpipe.formats.logs.log_file import AUTOPILOT_SUFFIXES, Log, is_log_file, open_log
 from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
-from tcpipe.formats.logs.table_folders import Mappings
+from tcpipe.formats.logs.table_folders import Mappings, find_table_run
 from tcpipe.formats.object_storage import format_path, is_url, lay_out_objects
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -141,9 +141,11 @@ def open_logs(
 
     A folder that is no bag is one of tables, where ``tables`` says what they hold.
     """
+    runs = {path: find_table_run(path, tables or {}) for path in sorted(paths, key=Path)}
+    firsts = {run.files if run else (path,): path for path, run in reversed(runs.items())}
     with ExitStack() as stack:
         logs: list[Log | TableLog] = []
-        for path in sorted(paths, key=Path):
+        for path in reversed(firsts.values()):
             logs.append(open_single_log(path, message_definitions=message_definitions, tables=tables))
             stack.callback(logs[-1].close)
         alone = logs[0] if len(logs) == 1 else None
@@ -158,7 +160,7 @@ def open_logs(
 def open_single_log(
     path: Path | str, *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> Log | TableLog:
-    """Open one log: an autopilot's; a folder that is no bag is one of tables, where ``tables`` says what they hold; else as `open_log`."""
+    """Open one log: an autopilot's; a folder that is no bag, or a table of a run, as ``tables`` say what they hold; else as `open_log`."""
     with ExitStack() as stack:
         here = path
         if is_url(path) and format_path(path).lower().endswith(AUTOPILOT_SUFFIXES):
@@ -167,10 +169,12 @@ def open_single_log(
             from tcpipe.formats.logs.autopilot_log import open_autopilot_log  # noqa: PLC0415  only where one is read
 
             return open_autopilot_log(Path(here), kind, stack.pop_all())
-    if tables and isinstance(path, Path) and path.is_dir() and not is_one_bag(path):
-        from tcpipe.formats.logs.table_log import open_tables  # noqa: PLC0415  polars only where a table is read
+    if tables and isinstance(path, Path):
+        run = find_table_run(path, tables) if path.is_file() else None
+        if run or (path.is_dir() and not is_one_bag(path)):
+            from tcpipe.formats.logs.table_log import open_tables  # noqa: PLC0415  polars only where a table is read
 
-        return open_tables(path, tables)
+            return open_tables(run.folder, run.mappings, run.files) if run else open_tables(path, tables)
     return open_log(path, message_definitions=message_definitions)
 
 
