@@ -21,7 +21,8 @@ from tcpipe.logs.topics import AutopilotKind
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Int64 = NDArray[np.int64]
-Fields = Mapping[str, NDArray[Any]]
+Values = NDArray[Any]
+Fields = Mapping[str, Values]
 Stamped = tuple[Int64, Fields]
 """Times since boot [µs], shape (N,), and fields by name."""
 
@@ -142,14 +143,14 @@ _STATUS = np.array([-1, -1, 0, 0, 1, 2, 2, -1])
 _IN_3D = 3
 
 
-def _make_fix(log: Autopilot, kind: NDArray[Any], sea_m: NDArray[Any]) -> Fields:
+def _make_fix(log: Autopilot, kind: Values, sea_m: Values) -> Fields:
     """Return status and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
     ellipsoidal = _find_ellipsoidal(log)
     height = np.where(kind >= _IN_3D, sea_m if ellipsoidal is None else ellipsoidal, np.nan)
     return {"status": _STATUS[np.minimum(kind, len(_STATUS) - 1)], "altitude": height}
 
 
-def _turn_axes(name: str, forward: Any, right: Any, down: Any) -> dict[str, NDArray[np.float64]]:
+def _turn_axes(name: str, forward: Values, right: Values, down: Values) -> dict[str, NDArray[np.float64]]:
     """Return a vector's components forward, left and up."""
     return {
         f"{name}_x": forward.astype(np.float64),

@@ -13,6 +13,7 @@ from shared_data import shared_data
 
 import tcpipe
 from tcpipe.formats.logs.autopilot_records import read_records
+from tcpipe.logs.topics import split_notes
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots import Profiles
 from tcpipe.stages.read import read_run
@@ -104,7 +105,7 @@ def read_one(log, path, topic):
     """Return the first message of a topic of a log that is written now."""
     path.write_bytes(log.bytes())
     with tcpipe.read_log(path) as opened:
-        assert opened.damage == []
+        assert not split_notes(opened.findings)[0]
         return opened.tables([topic])[topic].to_pylist()[0]
 
 
@@ -246,7 +247,9 @@ def test_wheels_of_px4_need_a_radius(tmp_path):
     (tmp_path / "a.ulg").write_bytes(log.bytes())
     with tcpipe.read_log(tmp_path / "a.ulg") as opened:
         assert list(opened.topics) == ["/wheel_encoders"]
-        assert "a wheel radius" in " ".join(opened.damage)
+        assert [of.names["fields"] for of in opened.findings if of.code == "fields-missing"] == [
+            "a wheel radius (RDD_WHEEL_RADIUS)"
+        ]
     log.parameter("RDD_WHEEL_RADIUS", 0.125)
     assert read_one(log, tmp_path / "a.ulg", "/wheel_encoders/odometry")["twist.twist.linear.x"] == 1.875
 

@@ -10,7 +10,6 @@ of 300 tries); pymavlink decodes row by row. Tests compare the columns with thei
 
 from __future__ import annotations
 
-import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -34,6 +33,7 @@ _LAST_US = 4_000_000_000 * 10**6
 _FEW = 5
 
 Int64 = NDArray[np.int64]
+Layout = np.dtype[Any]
 
 
 @dataclass(slots=True)
@@ -44,7 +44,7 @@ class Messages:
     """
 
     name: str
-    layout: np.dtype[Any]
+    layout: Layout
     offsets: Int64
     time_us: Int64
     scales: Mapping[str, float]
@@ -60,7 +60,7 @@ class Messages:
         }
 
 
-def _gather_field(data: bytes, places: Int64, layout: np.dtype[Any], name: str) -> Int64:
+def _gather_field(data: bytes, places: Int64, layout: Layout, name: str) -> Int64:
     """Return a whole number of each message."""
     offset: int = layout.fields[name][1]  # type: ignore[index]  a layout that has the field has fields
     return gather_integers(data, places + offset, layout[name].str[1:].replace("u8", "i8"))
@@ -102,7 +102,7 @@ class AutopilotRecords:
         return end
 
     def add(
-        self, name: str, instance: int, layout: np.dtype[Any], places: Int64, scales: Mapping[str, float] = _UNSCALED
+        self, name: str, instance: int, layout: Layout, places: Int64, scales: Mapping[str, float] = _UNSCALED
     ) -> None:
         """Add the messages of an instance; without a time they cannot be used."""
         clock = next((of for of in _CLOCKS if of in (layout.names or ()) and layout[of].str in ("<u8", "<u4")), None)
@@ -163,15 +163,20 @@ _ULOG_TYPES = {
     "bool": "<u1",
     "char": "S",
 }
-_ULOG_FORMAT = re.compile(
-    rb"([\w/-]+):((?:[A-Za-z]\w*(?:\[[1-9]\d{0,4}\])? \w+;)*[A-Za-z]\w*(?:\[[1-9]\d{0,4}\])? \w+);?", re.ASCII
-)
-_ULOG_FIELD = re.compile(r"(\w+)(?:\[(\d+)\])? (\w+)")
 _ULOG_KINDS = frozenset(b"FDIMPQARSOLCB")
 _ULOG_HEAD = struct.Struct("<HBH")
 """Size and kind of a message, and what number a message of data begins with."""
 _MOST_BYTES = (1 << 16) - 3
 _DATA = ord("D")
+
+
+def _parse_field(text: str) -> tuple[str, int, str] | None:
+    """Return the type of a field, how many of it there are (0: no list) and its name, from ``float[3] rate``; None where it is no field."""
+    of, _, name = text.partition(" ")
+    kind, opening, count = of.removesuffix("]").partition("[")
+    number = int(count) if count.isdecimal() and len(count) <= _FEW else 0
+    is_field = kind.isidentifier() and name.isidentifier() and bool(number) == bool(opening)
+    return (kind, number, name) if is_field else None
 
 
 @dataclass(slots=True)
@@ -180,7 +185,7 @@ class _UlogTopic:
 
     name: str
     instance: int
-    layout: np.dtype[Any]
+    layout: Layout
     most_bytes: int
     places: list[int] = field(default_factory=list)
 
@@ -191,7 +196,7 @@ class _UlogWalk:
     def __init__(self, records: AutopilotRecords) -> None:
         self._records, self._data = records, records.data
         self._formats: dict[str, list[tuple[str, int, str]]] = {}
-        self._layouts: dict[str, tuple[np.dtype[Any], int] | str] = {}
+        self._layouts: dict[str, tuple[Layout, int] | str] = {}
         self._topics: dict[tuple[str, int], _UlogTopic] = {}
         self._by_id: dict[int, _UlogTopic] = {}
         self._unknown: Counter[int] = Counter()
@@ -243,9 +248,13 @@ class _UlogWalk:
         match chr(kind):
             case "D":
                 self._unknown[int.from_bytes(text[:2], "little")] += 1
-            case "F" if found := _ULOG_FORMAT.fullmatch(text):
-                fields = _ULOG_FIELD.findall(found[2].decode())
-                self._formats.setdefault(found[1].decode(), [(of, int(count or 0), name) for of, count, name in fields])
+            case "F":
+                name, _, fields = text.decode("ascii", "replace").removesuffix(";").partition(":")
+                found = [of for of in map(_parse_field, fields.split(";")) if of]
+                if len(found) > fields.count(";"):
+                    self._formats.setdefault(name, found)
+                else:
+                    self._records.skip(at - 3, at + size)
             case "A" if size > 3:
                 self._subscribe(text[0], int.from_bytes(text[1:3], "little"), text[3:].decode("ascii", "replace"))
             case "P" if size > 5 and len(text) == 5 + text[0]:
@@ -256,7 +265,7 @@ class _UlogWalk:
                 raise LogError(f"{self._records.path}: it uses features of ULog that tcpipe does not know")
             case "O":
                 self._records.dropouts += 1
-            case "F" | "A" | "P":
+            case "A" | "P":
                 self._records.skip(at - 3, at + size)
             case _:  # texts of the log, facts on it, synchronisation
                 pass
@@ -273,7 +282,7 @@ class _UlogWalk:
             return
         self._by_id[number] = self._topics.setdefault((name, instance), _UlogTopic(name, instance, *found))
 
-    def _lay_out(self, name: str) -> tuple[np.dtype[Any], int] | str:
+    def _lay_out(self, name: str) -> tuple[Layout, int] | str:
         """Return how messages of a format lie, and their size with what pads them [byte]; or why nobody knows."""
         fields: list[tuple[str, Any]] = []
         size = 0
@@ -322,7 +331,7 @@ def _read_dataflash(records: AutopilotRecords) -> None:
     """Read a whole DataFlash log into the records."""
     data, end_of_data, at = records.data, len(records.data), 0
     lengths, places = [0] * 256, [list[int]() for _ in range(256)]
-    formats: dict[int, tuple[str, np.dtype[Any], dict[str, float]]] = {}
+    formats: dict[int, tuple[str, Layout, dict[str, float]]] = {}
     lengths[_FORMAT] = _FORMAT_BYTES
     begins = data.startswith
     while at + 3 <= end_of_data:
@@ -367,7 +376,7 @@ def _define_format(
     data: bytes,
     at: int,
     lengths: list[int],
-    formats: dict[int, tuple[str, np.dtype[Any], dict[str, float]]],
+    formats: dict[int, tuple[str, Layout, dict[str, float]]],
 ) -> None:
     """Read a format; the first of a number holds, and of one that contradicts itself only the length of its messages."""
     kind, length, name, letters, labels = struct.unpack_from("<BB4s16s64s", data, at)
@@ -384,7 +393,7 @@ def _define_format(
 
 
 def _add_instances(
-    records: AutopilotRecords, name: str, layout: np.dtype[Any], places: Int64, scales: Mapping[str, float]
+    records: AutopilotRecords, name: str, layout: Layout, places: Int64, scales: Mapping[str, float]
 ) -> None:
     """Add messages, those of each instance of a sensor apart."""
     instance = next((of for of in _INSTANCES if of in (layout.names or ()) and layout[of].str == "|u1"), None)

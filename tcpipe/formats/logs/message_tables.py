@@ -15,12 +15,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.finding_lines import describe_finding
-from tcpipe.logs.topics import Damage, Topic, find_damage, split_notes
+from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
 _HASH_BYTES = 1 << 20
+Values = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +71,6 @@ class TableLog:
         self._stack.close()
 
     @property
-    def damage(self) -> list[str]:
-        """The findings but for notes, a line each."""
-        return [describe_finding(finding) for finding in split_notes(self.findings)[0]]
-
-    @property
     def size_bytes(self) -> int:
         """Size of the files together, also of tables that are not mapped."""
         return sum(file.stat().st_size for file in self._files)
@@ -102,19 +97,19 @@ class TableLog:
             yield {name: self._made[name]()}
 
 
-def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, Values]:
     """Return the fields of a header's stamp."""
     second, rest = np.divmod(stamp_ns, 1_000_000_000)
     return {"header.stamp.sec": second, "header.stamp.nanosec": rest}
 
 
-def make_message_table(stamp_ns: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]) -> pa.Table:
+def make_message_table(stamp_ns: NDArray[np.int64], columns: Mapping[str, Values]) -> pa.Table:
     """Return messages as a table: both log times are the stamps [ns]; columns of shape (N, k) become lists, those of bytes texts."""
     times = {"log_time_ns": number_column(stamp_ns), "publish_time_ns": number_column(stamp_ns)}
     return pa.table({**times, **{name: _make_column(values) for name, values in columns.items()}})
 
 
-def _make_column(values: NDArray[Any]) -> pa.Array:
+def _make_column(values: Values) -> pa.Array:
     if values.dtype.kind == "S":
         return make_text_column(text.decode(errors="replace") for text in values.tolist())
     if values.ndim == 1:
