@@ -9,21 +9,19 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
-from tcpipe.logs.messages import GNSS
+from tcpipe.logs.messages import GNSS, Columns
 from tcpipe.logs.roles import GPS_FIXES
 from tcpipe.logs.topics import AutopilotKind
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Int64 = NDArray[np.int64]
-Values = NDArray[Any]
-Fields = Mapping[str, Values]
-Stamped = tuple[Int64, Fields]
+Floats = NDArray[np.float64]
+Stamped = tuple[Int64, Columns]
 """Times since boot [µs], shape (N,), and fields by name."""
 
 
@@ -39,7 +37,7 @@ class Autopilot:
         """Return the names of all instances, the first first."""
         return sorted(found for found in self.messages if re.fullmatch(rf"{name}(_\d+)?", found))
 
-    def find_last(self, name: str, at_us: Int64, *, within_us: int) -> Fields:
+    def find_last(self, name: str, at_us: Int64, *, within_us: int) -> Columns:
         """Return the numbers of the last message of a name at or before each time, NaN where that is long ago; {} without any."""
         time_us, fields = self.messages.get(name, (None, {}))
         if time_us is None:
@@ -57,7 +55,7 @@ class RoleMessages:
     topic: str
     type_name: str
     time_us: Int64
-    columns: Fields
+    columns: Columns
     frame: str
 
 
@@ -122,13 +120,13 @@ _FIRST_US, _LAST_US = 1_100_000_000 * 10**6, 4_000_000_000 * 10**6
 _RECEIVERS = "vehicle_gps_position sensor_gps GPS"
 
 
-def _find_receiver(log: Autopilot) -> tuple[str, Int64, Fields]:
+def _find_receiver(log: Autopilot) -> tuple[str, Int64, Columns]:
     """Return the name and messages of the first receiver; none are as one at time 0 that tells nothing."""
     names = [found for name in _RECEIVERS.split() for found in log.list_instances(name)]
     return (names[0], *log.messages[names[0]]) if names else ("", np.zeros(1, np.int64), {})
 
 
-def _find_ellipsoidal(log: Autopilot) -> NDArray[np.float64] | None:
+def _find_ellipsoidal(log: Autopilot) -> Floats | None:
     """Return a receiver's heights above the ellipsoid [m], None where they are not logged: 0 throughout, or a number for unknown."""
     name, time_us, fields = _find_receiver(log)
     known = {**fields, **_find_accuracy(log, name, time_us)}
@@ -143,14 +141,14 @@ _STATUS = np.array([-1, -1, 0, 0, 1, 2, 2, -1])
 _IN_3D = 3
 
 
-def _make_fix(log: Autopilot, kind: Values, sea_m: Values) -> Fields:
+def _make_fix(log: Autopilot, kind: Int64, sea_m: Floats) -> Columns:
     """Return status and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
     ellipsoidal = _find_ellipsoidal(log)
     height = np.where(kind >= _IN_3D, sea_m if ellipsoidal is None else ellipsoidal, np.nan)
     return {"status": _STATUS[np.minimum(kind, len(_STATUS) - 1)], "altitude": height}
 
 
-def _turn_axes(name: str, forward: Values, right: Values, down: Values) -> dict[str, NDArray[np.float64]]:
+def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[str, Floats]:
     """Return a vector's components forward, left and up."""
     return {
         f"{name}_x": forward.astype(np.float64),
@@ -160,7 +158,7 @@ def _turn_axes(name: str, forward: Values, right: Values, down: Values) -> dict[
 
 
 # ---------------------------------------------------------------- PX4
-def _convert_px4_fix(log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_px4_fix(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     if "latitude_deg" in f:
         lat, lon, sea = f["latitude_deg"], f["longitude_deg"], f["altitude_msl_m"]
     else:  # until 2023
@@ -169,33 +167,33 @@ def _convert_px4_fix(log: Autopilot, _name: str, time_us: Int64, f: Fields) -> t
     return time_us, {"latitude": lat, "longitude": lon, **_make_fix(log, f["fix_type"], sea), **accuracy}
 
 
-def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     known = (f["vel_ned_valid"] != 0) & (f["fix_type"] >= _IN_3D)
     axes = {"east": f["vel_e_m_s"], "north": f["vel_n_m_s"], "up": -f["vel_d_m_s"]}
     values = {name: np.where(known, of, np.nan) for name, of in axes.items()}
     return time_us, values | {f"{name}_std": f["s_variance_m_s"] for name in axes}
 
 
-def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     unknown = f["accelerometer_timestamp_relative"] == np.iinfo(np.int32).max
     force = np.where(unknown[:, None], np.nan, f["accelerometer_m_s2"])
     return time_us, _turn_axes("angular_velocity", *f["gyro_rad"].T) | _turn_axes("linear_acceleration", *force.T)
 
 
-def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     voltage, current = f["voltage_v"], f["current_a"]  # 0 and -1 where it is not known
     drawn = np.where(current == -1, np.nan, -current)  # negative in BatteryState
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
 
 
-def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     """Return the mean of both wheels: drivers do not agree which is the left one."""
     if "RDD_WHEEL_RADIUS" not in log.parameters:
         raise KeyError("a wheel radius (RDD_WHEEL_RADIUS)")
     return time_us, {"linear_x": f["wheel_speed"].mean(axis=1) * log.parameters["RDD_WHEEL_RADIUS"]}
 
 
-def _convert_px4_command(log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_px4_command(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     if (name := next((name for name in _PX4_SPEEDS if name in f), None)) is not None:
         speed = f[name]
     else:  # of trajectory_setpoint, which had other names until 2022
@@ -210,7 +208,7 @@ _HELD_US = 1_000_000
 
 
 # ---------------------------------------------------------------- ArduPilot
-def _find_accuracy(log: Autopilot, name: str, time_us: Int64) -> Fields:
+def _find_accuracy(log: Autopilot, name: str, time_us: Int64) -> Columns:
     """Return the accuracies that are logged beside each fix."""
     return log.find_last(name.replace("GPS", "GPA"), time_us + _BESIDE_US, within_us=2 * _BESIDE_US)
 
@@ -218,14 +216,14 @@ def _find_accuracy(log: Autopilot, name: str, time_us: Int64) -> Fields:
 _BESIDE_US = 50_000
 
 
-def _convert_ardupilot_fix(log: Autopilot, name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_ardupilot_fix(log: Autopilot, name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     values = {"latitude": f["Lat"], "longitude": f["Lng"], **_make_fix(log, f["Status"], f["Alt"])}
     if accuracy := _find_accuracy(log, name, time_us):
         values |= {"east_std": accuracy["HAcc"], "north_std": accuracy["HAcc"], "up_std": accuracy["VAcc"]}
     return time_us, values
 
 
-def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     """Return the fields of GPSFix, which has speed and course; its errors are those of 95 per cent."""
     accuracy, unknown = _find_accuracy(log, name, time_us), np.full(len(time_us), np.nan)
     error = 2.0 * accuracy.get("SAcc", unknown)
@@ -235,22 +233,22 @@ def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Fi
     return time_us, {**values, "status.status": status}
 
 
-def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     broken = (f.get("GH", 1) == 0) | (f.get("AH", 1) == 0)
     rate, force = ([np.where(broken, np.nan, f[f"{of}{axis}"]) for axis in "XYZ"] for of in ("Gyr", "Acc"))
     return time_us, _turn_axes("angular_velocity", *rate) | _turn_axes("linear_acceleration", *force)
 
 
-def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     scale = 1.0 if f["Volt"].dtype.kind == "f" else 0.01  # before 2015 in hundredths
     voltage, drawn = f["Volt"] * scale, f["Curr"] * -scale
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
 
 
-def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     """Return speed and turn between two messages from the distances of the wheels, stamped in the middle."""
     step_s = np.diff(time_us, prepend=np.nan) * 1e-6
-    speed, right_m = list[NDArray[np.float64]](), list[float]()
+    speed, right_m = list[Floats](), list[float]()
     for distance_m, prefix in ((f["Dist0"], "WENC"), (f["Dist1"], "WENC2")):
         if log.parameters.get(f"{prefix}_TYPE", np.ptp(distance_m)):
             speed.append(np.diff(distance_m.astype(np.float64), prepend=np.nan) / step_s)
@@ -263,13 +261,13 @@ def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Int64, f: Fie
     return time_us - np.nan_to_num(step_s * 5e5).astype(np.int64), {"linear_x": ahead, "angular_z": turn}
 
 
-def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Int64, f: Fields) -> tuple[Int64, Fields]:
+def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     steering = log.find_last("STER", time_us, within_us=_HELD_US)
     turn = -np.radians(np.nan_to_num(steering.get("DesTurnRate", np.zeros(len(time_us)))))
     return time_us, {"linear_x": f["DesSpeed"], "angular_z": turn}
 
 
-_Convert = Callable[[Autopilot, str, Int64, Fields], tuple[Int64, Fields]]
+_Convert = Callable[[Autopilot, str, Int64, Columns], tuple[Int64, Columns]]
 _PX4_COMMANDS = """rover_speed_setpoint rover_differential_setpoint rover_ackermann_setpoint rover_mecanum_setpoint
 differential_drive_setpoint trajectory_setpoint"""
 _SOURCES: dict[str, tuple[tuple[str, str, str, str, _Convert], ...]] = {

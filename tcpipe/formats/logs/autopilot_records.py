@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import MAX_COLUMNS, MAX_TOPICS
@@ -33,7 +33,7 @@ _LAST_US = 4_000_000_000 * 10**6
 _FEW = 5
 
 Int64 = NDArray[np.int64]
-Layout = np.dtype[Any]
+Layout = np.dtype[np.void]
 
 
 @dataclass(slots=True)
@@ -62,7 +62,7 @@ class Messages:
 
 def _gather_field(data: bytes, places: Int64, layout: Layout, name: str) -> Int64:
     """Return a whole number of each message."""
-    offset: int = layout.fields[name][1]  # type: ignore[index]  a layout that has the field has fields
+    offset: int = layout.fields[name][1]  # type: ignore[index]  # a layout that has the field has fields
     return gather_integers(data, places + offset, layout[name].str[1:].replace("u8", "i8"))
 
 
@@ -87,10 +87,13 @@ class AutopilotRecords:
     """By cause, what could not be read."""
     dropouts: int = 0
 
-    def note(self, cause: str, **what: Any) -> None:
+    def note(
+        self, cause: str, topic: str | None = None, lost: int | None = None, *, reason: str = "", places: int = 1
+    ) -> None:
         """Add damage; more than some thousand entries say nothing new."""
         if len(self.damage) < MAX_TOPICS:
-            self.damage[Damage(cause, self.path.name, **what)] = None
+            found = Damage(cause, self.path.name, topic=topic, messages_lost=lost, reason=reason, places=places)
+            self.damage[found] = None
 
     def skip(self, start: int, end: int) -> int:
         """Return ``end``, up to where the file cannot be read from ``start``."""
@@ -108,7 +111,7 @@ class AutopilotRecords:
         clock = next((of for of in _CLOCKS if of in (layout.names or ()) and layout[of].str in ("<u8", "<u4")), None)
         if clock is None:
             reason = f"{name} has no time"
-            self.note("messages-not-decoded", topic=f"/{name}", messages_lost=0, reason=reason)
+            self.note("messages-not-decoded", f"/{name}", 0, reason=reason)
             return
         if len(self.messages) >= MAX_TOPICS:
             raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; no such log is read")
@@ -122,10 +125,10 @@ class AutopilotRecords:
         for name, of in list(self.messages.items()):
             known = (of.time_us >= 0) & (of.time_us <= latest_us) & ~_find_stray(of.time_us)
             if lost := int(np.count_nonzero(~known)):
-                self.note("time-invalid", topic=f"/{name}", messages_lost=lost)
+                self.note("time-invalid", f"/{name}", lost)
             of.offsets, of.time_us = of.offsets[known], of.time_us[known]
             if late := int(np.count_nonzero(np.diff(of.time_us) < 0)):
-                self.note("messages-unordered", topic=f"/{name}", messages_lost=0, places=late)
+                self.note("messages-unordered", f"/{name}", 0, places=late)
                 order = np.argsort(of.time_us, kind="stable")
                 of.offsets, of.time_us = of.offsets[order], of.time_us[order]
             if not len(of.time_us):
@@ -150,7 +153,7 @@ def read_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
     _UlogWalk(records).read() if kind == "ulog" else _read_dataflash(records)
     records.damage |= dict.fromkeys(records.skipped.values())
-    records.note("no-checksum", messages_lost=0)
+    records.note("no-checksum", lost=0)
     records.sort_by_time()
     return records
 
@@ -223,7 +226,7 @@ class _UlogWalk:
             self._records.skip(at, end_of_data)
         for number, count in self._unknown.items():
             reason = f"nothing says what messages of number {number} are"
-            self._records.note("messages-not-decoded", messages_lost=count, reason=reason)
+            self._records.note("messages-not-decoded", lost=count, reason=reason)
         for of in self._topics.values():
             if of.places:
                 self._records.add(of.name, of.instance, of.layout, np.array(of.places))
@@ -278,13 +281,13 @@ class _UlogWalk:
         found = self._layouts[name]
         self._by_id.pop(number, None)
         if isinstance(found, str):
-            self._records.note("messages-not-decoded", topic=f"/{name}", reason=found)
+            self._records.note("messages-not-decoded", f"/{name}", reason=found)
             return
         self._by_id[number] = self._topics.setdefault((name, instance), _UlogTopic(name, instance, *found))
 
     def _lay_out(self, name: str) -> tuple[Layout, int] | str:
         """Return how messages of a format lie, and their size with what pads them [byte]; or why nobody knows."""
-        fields: list[tuple[str, Any]] = []
+        fields: list[tuple[str, DTypeLike]] = []
         size = 0
         try:
             for field_name, code in self._iterate_fields(name, "", 0):
@@ -300,7 +303,7 @@ class _UlogWalk:
         except (KeyError, ValueError, TypeError) as error:
             return f"its format {name} is damaged ({error})"
 
-    def _iterate_fields(self, name: str, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
+    def _iterate_fields(self, name: str, prefix: str, depth: int) -> Iterator[tuple[str, DTypeLike]]:
         """Yield the fields of a format, those of formats in it as ``outer.inner`` or, of several, ``outer_0.inner``."""
         if depth > _FEW:
             raise ValueError("formats inside formats")
@@ -315,7 +318,7 @@ class _UlogWalk:
 
 
 # ---------------------------------------------------------------- ArduPilot
-_DATAFLASH_TYPES: dict[str, tuple[Any, float | None]] = {
+_DATAFLASH_TYPES: dict[str, tuple[DTypeLike, float | None]] = {
     "b": ("i1", None), "B": ("u1", None), "M": ("u1", None), "h": ("<i2", None), "H": ("<u2", None),
     "i": ("<i4", None), "I": ("<u4", None), "q": ("<i8", None), "Q": ("<u8", None),
     "g": ("<f2", None), "f": ("<f4", None), "d": ("<f8", None),
@@ -350,7 +353,7 @@ def _read_dataflash(records: AutopilotRecords) -> None:
         of = np.array(places[kind], np.int64)
         if len(of) and not layout.names:
             reason = f"the format of {name} contradicts itself"
-            records.note("messages-not-decoded", topic=f"/{name}", messages_lost=len(of), reason=reason)
+            records.note("messages-not-decoded", f"/{name}", len(of), reason=reason)
         elif len(of) and name not in _WITHOUT_TIME:
             _add_instances(records, name, layout, of, scales)
         if len(of) and name == "PARM" and {"Name", "Value"} <= set(layout.names or ()):

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
+from tcpipe.logs.messages import Columns
 from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
 _HASH_BYTES = 1 << 20
-Values = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,19 +97,19 @@ class TableLog:
             yield {name: self._made[name]()}
 
 
-def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, Values]:
+def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
     """Return the fields of a header's stamp."""
     second, rest = np.divmod(stamp_ns, 1_000_000_000)
     return {"header.stamp.sec": second, "header.stamp.nanosec": rest}
 
 
-def make_message_table(stamp_ns: NDArray[np.int64], columns: Mapping[str, Values]) -> pa.Table:
+def make_message_table(stamp_ns: NDArray[np.int64], columns: Columns) -> pa.Table:
     """Return messages as a table: both log times are the stamps [ns]; columns of shape (N, k) become lists, those of bytes texts."""
     times = {"log_time_ns": number_column(stamp_ns), "publish_time_ns": number_column(stamp_ns)}
     return pa.table({**times, **{name: _make_column(values) for name, values in columns.items()}})
 
 
-def _make_column(values: Values) -> pa.Array:
+def _make_column(values: NDArray[np.generic]) -> pa.Array:
     if values.dtype.kind == "S":
         return make_text_column(text.decode(errors="replace") for text in values.tolist())
     if values.ndim == 1:

@@ -142,10 +142,10 @@ def _read_messages(
         order, stamp_ns = np.flatnonzero(cells.stamp_known)[by_time], stamp_ns[by_time]
     values = {field: value[order] for field, value in values.items()}
     if kind in FLOAT_TYPES:
-        columns = {"data": next(iter(values.values()))}
+        table = make_message_table(stamp_ns, {"data": next(iter(values.values()))})
     else:
-        columns = make_stamp_fields(stamp_ns) | make_message_fields(role, values, stamp_ns.size)
-    table = make_message_table(stamp_ns, columns)
+        fields = make_message_fields(role, values, stamp_ns.size)
+        table = make_message_table(stamp_ns, {**make_stamp_fields(stamp_ns), **fields})
     span = (int(stamp_ns[0]), int(stamp_ns[-1]))
     return TopicMessages(Topic(topic, kind, stamp_ns.size, *span, "table", ""), lambda: table, damage)
 
