@@ -8,7 +8,7 @@ Which field of a role a column is, or a field of somebody's own message type, by
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -17,12 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs import roles
-from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
-from tcpipe.recipe.suggestions import suggest
-from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
 
@@ -306,8 +303,6 @@ CALLED: Mapping[str, Mapping[str, str]] = {
 }
 """What is called how, as patterns of names in lower case without a unit; the likelier role first."""
 
-_PROPOSED = ("gnss", "imu")
-"""Roles whose fields are called so that nothing else is taken for them."""
 _DEEPEST = 4
 _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
 """No receiver's message is longer or has more numbers; one that is made to hurt does not cost minutes."""
@@ -323,25 +318,8 @@ def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}
 
 
-def propose_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterator[Finding]:
-    """Yield a finding for each message type that no role knows and whose fields are called as those of a role that nothing can play.
-
-    ``settled`` are roles that are played, or that the recipe speaks of; what a definition in the log does not tell cannot be proposed.
-    """
-    held = [of for of in topics if of.message_count != 0 and of.problem is None and not of.name.startswith(OVERLAY)]
-    types = {topic.type_name for topic in held}
-    for role in _PROPOSED:
-        if role in settled or types & set(ROLE_TYPES[role]):
-            continue
-        for topic in held:
-            if found := match_field_names(role, _list_number_fields(topic)):
-                remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: found}})
-                names = {"role": role, "type": topic.type_name}
-                yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
-
-
-def _list_number_fields(topic: Topic) -> list[str]:
-    """Return the dotted names of a message's first numbers; none where its definition cannot be read or is far too long."""
+def list_number_fields(topic: Topic) -> list[str]:
+    """Return the dotted names of a message's first numbers, ``[]`` behind a list; none where its definition cannot be read or is too long."""
     if len(topic.definition) > _LONGEST_BYTES:
         return []
     try:
@@ -352,8 +330,10 @@ def _list_number_fields(topic: Topic) -> list[str]:
 
 def _iterate_below(messages: Mapping[str, FieldTypes], type_name: str, prefix: str = "") -> Iterator[str]:
     for name, of in messages.get(type_name, ()):
-        dotted = f"{prefix}{name}"
-        if of.length is None and of.name in BASE_TYPES - {"string", "wstring"}:
+        dotted = f"{prefix}{name}{'' if of.length is None else '[]'}"
+        if dotted.count("[]") > 1:
+            continue
+        if of.name in BASE_TYPES - {"string", "wstring"}:
             yield dotted
-        elif of.length is None and dotted.count(".") < _DEEPEST:
+        elif dotted.count(".") < _DEEPEST:
             yield from _iterate_below(messages, of.name, f"{dotted}.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeAlias
@@ -64,6 +64,35 @@ class RecipeFragment:
 
 def _format_lines(keys: Keys) -> list[str]:
     return [f"{name} = {as_toml(value)}" for name, value in keys.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class ProposedLine:
+    """One line of a recipe that is proposed for a log; one that a person has to decide is a comment."""
+
+    table: str
+    """Dotted name of its table; "" for keys that stand before all tables."""
+    key: str
+    value: TomlValue
+    note: str = ""
+    """A value of the log, or what there is to decide."""
+    is_certain: bool = True
+
+
+def format_proposals(head: Iterable[str], lines: Sequence[ProposedLine]) -> str:
+    """Return a recipe of proposed lines, in the order of their tables; ``head`` is the comment above.
+
+    The head of a table that holds decisions alone is a comment as well, except below ``read``, where it may be empty.
+    """
+    text = [f"# {line}".rstrip() for line in head]
+    for table in sorted({line.table for line in lines}, key=[line.table for line in lines].index):
+        mine = [line for line in lines if line.table == table]
+        is_open = any(line.is_certain for line in mine) or table.startswith("read.")
+        text += ["", *([f"{'' if is_open else '# '}[{table}]"] if table else [])]
+        for line in mine:
+            note = f"  # {' '.join(line.note.split())}" if line.note else ""
+            text.append(f"{'' if line.is_certain else '# '}{line.key} = {as_toml(line.value)}{note}")
+    return "\n".join(text) + "\n"
 
 
 def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:

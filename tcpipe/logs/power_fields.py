@@ -1,0 +1,139 @@
+"""Which fields of a message, or columns of a table, are voltage, current and power of what drives, by what they are called."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr", "bl", "br"})
+
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_QUANTITIES = {
+    "voltage": re.compile(r"volt(age|s)?|voltages|v(bat|batt|in|bus|pack)"),
+    "current": re.compile(r"curr?(ent)?s?|amp(ere)?s?|i(bat|batt|in|bus|pack)"),
+    "power": re.compile(r"power|watts?"),
+}
+_UNITS = {"v": "voltage", "mv": "voltage", "a": "current", "ma": "current", "w": "power", "mw": "power", "kw": "power"}
+_SCALES = {"m": 0.001, "k": 1000.0}
+_SUPPLY = re.compile(
+    r"bat|batt|battery|bms|pack|bus|supply|input|in|main|dc|source|vin|iin|[vi](bat|batt|in|bus|pack)|esc"
+)
+_DRIVES = re.compile(r"drives?|drivers?|motors?|wheels?|traction")
+_OTHER = re.compile(
+    r"min|max|limit|set|setpoint|target|cmd|command|commanded|desired|ref|nominal|rated|full|capacity|charge|percent(age)?|soc|temp|temperature|"
+    r"cells?|status|fault|error|id|iq|vd|vq|per|pred|true|std|cov|variance|health|design|supply_?status|technology|mode|button|acc|lin|ang|vel"
+)
+_PHASE = re.compile(r"phase|motors?|q|d|rms")
+
+
+@dataclass(frozen=True, slots=True)
+class PowerFields:
+    """What is read together: each rail's fields by quantity, with the factor that the unit in its name states, and what is unclear."""
+
+    rails: tuple[Mapping[str, str], ...]
+    scales: Mapping[str, float]
+    doubt: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Named:
+    name: str
+    quantity: str
+    scale: float
+    core: tuple[str, ...]
+    """Words that say neither quantity nor side."""
+    side: tuple[str, ...]
+
+
+def split_words(name: str) -> list[str]:
+    """Return the words of a name in lower case: at capitals, digits and signs."""
+    return [word.lower() for word in _WORDS.findall(name)]
+
+
+def split_sides(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return a name's words without sides and numbers, and those."""
+    words = split_words(name)
+    of_side = tuple(word for word in words if word in SIDES or word.isdigit())
+    return tuple(word for word in words if word not in of_side), of_side
+
+
+def match_power_fields(names: Iterable[str]) -> PowerFields | None:
+    """Return the voltage and current, or the power, among fields; None where neither a current nor a power is.
+
+    Fields whose names differ by sides or numbers alone belong together: their currents are added, each at its own voltage where there are as
+    many.
+    """
+    named = [found for name in names if (found := _read_name(name))]
+    watt, amp, volt = ([of for of in named if of.quantity == what] for what in ("power", "current", "voltage"))
+    drawn, others = _choose(amp or watt)
+    if not drawn:
+        return None
+    quantity = drawn[0].quantity
+    volt, _ = _choose([of for of in volt if of.core == drawn[0].core] or volt)
+    by_side = {of.side: of.name for of in volt}
+    if quantity == "power":
+        rails: list[dict[str, str]] = [{"power": " + ".join(of.name for of in drawn)}]
+    elif len(drawn) > 1 and all(of.side in by_side for of in drawn):
+        rails = [{"voltage": _of_one(by_side[of.side]), "current": of.name} for of in drawn]
+    else:
+        rails = [{"current": " + ".join(of.name for of in drawn)}]
+        rails = [{"voltage": _of_one(volt[0].name)} | rails[0]] if volt else rails
+    used = [*drawn, *(volt if "voltage" in rails[0] else [])]
+    scales = {of.quantity: of.scale for of in used if of.scale != 1.0}
+    return PowerFields(tuple(rails), scales, _find_doubt(drawn, others))
+
+
+def _read_name(name: str) -> _Named | None:
+    words = split_words(name)
+    own = split_words(name.rpartition(".")[2])
+    if any(_OTHER.fullmatch(word) for word in own):
+        return None
+    quantity = next((what for word in reversed(own) for what, of in _QUANTITIES.items() if of.fullmatch(word)), None)
+    unit = own[-1] if len(own) > 1 and own[-1] in _UNITS else ""
+    if (
+        quantity is None
+        and unit
+        and any(_SUPPLY.fullmatch(of) or (len(unit) > 1 and _DRIVES.fullmatch(of)) for of in words)
+    ):
+        quantity = _UNITS[unit]
+    if quantity is None or (unit and _UNITS[unit] != quantity):
+        return None
+    scale = _SCALES[unit[0]] if len(unit) > 1 else 1.0
+    rest, side = split_sides(name)
+    core = tuple(word for word in rest if word != unit and not any(of.fullmatch(word) for of in _QUANTITIES.values()))
+    return _Named(name, quantity, scale, core, side)
+
+
+def _choose(named: Sequence[_Named]) -> tuple[list[_Named], list[_Named]]:
+    """Return the fields that belong together, those of the supply first, and the others that could be meant as well."""
+    groups: dict[tuple[str, ...], list[_Named]] = {}
+    for of in named:
+        groups.setdefault(of.core, []).append(of)
+    ranked = sorted(groups.values(), key=lambda group: (not _has(_SUPPLY, group), _has(_PHASE, group)))
+    if not ranked:
+        return [], []
+    best = ranked[0]
+    alike = [
+        group
+        for group in ranked[1:]
+        if _has(_SUPPLY, group) == _has(_SUPPLY, best) and _has(_PHASE, group) == _has(_PHASE, best)
+    ]
+    return best, [of for group in alike for of in group]
+
+
+def _has(pattern: re.Pattern[str], group: Sequence[_Named]) -> bool:
+    return any(pattern.fullmatch(word) for word in group[0].core)
+
+
+def _of_one(name: str) -> str:
+    """Return the first element of a list: the sum of voltages is none."""
+    return name.replace("[]", "[0]")
+
+
+def _find_doubt(drawn: Sequence[_Named], others: Sequence[_Named]) -> str:
+    if others:
+        return f"{', '.join(of.name for of in others)} could be meant as well"
+    if _has(_PHASE, drawn) and not _has(_SUPPLY, drawn):
+        return "uncomment if these are drawn from the battery; currents of motor phases are larger"
+    return ""
