@@ -19,7 +19,7 @@ def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
     roles: dict[Role, list[str]] = {}
     for name, table in recipe.tables.items():
         role = cast("Role", table.role or name)
-        if role in get_args(Role) and (topic := find_topic(name, role, table.columns)[0]) in topics:
+        if role in get_args(Role) and (topic := find_topic(name, table)[0]) in topics:
             roles.setdefault(role, []).append(topic)
     return replace(recipe.read, topics={**roles, **recipe.read.topics}) if roles else recipe.read
 
