@@ -332,7 +332,7 @@ CALLED: Mapping[str, Mapping[str, str]] = {
     "gnss": {
         "latitude": r"(.*[_.])?lat(itude)?",
         "longitude": r"(.*[_.])?(lon(gitude)?|lng|long)",
-        "altitude": r"(.*[_.])?(alt(itude)?|height|h)",
+        "altitude": r"(.*[_.])?(alt(itude)?|height|h)(_?(msl|hae|ellipsoid(al)?))?",
         "east_std": r"sde",
         "north_std": r"sdn",
         "up_std": r"sdu",
@@ -368,7 +368,7 @@ def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
 
 
 def list_number_fields(topic: Topic) -> list[str]:
-    """Return the dotted names of a message's first numbers, ``[]`` behind a list; none where its definition cannot be read or is too long."""
+    """Return the dotted names of a message's first numbers, ``[]`` behind a list; none without a definition."""
     if len(topic.definition) > _LONGEST_BYTES:
         return []
     try:

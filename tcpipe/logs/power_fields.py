@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from tcpipe.logs.expressions import find_named_unit
+
 SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr", "bl", "br"})
 
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
@@ -61,8 +63,7 @@ def split_sides(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def match_power_fields(names: Iterable[str]) -> PowerFields | None:
     """Return the voltage and current, or the power, among fields; None where neither a current nor a power is.
 
-    Fields whose names differ by sides or numbers alone belong together: their currents are added, each at its own voltage where there are as
-    many.
+    Fields whose names differ by sides or numbers alone belong together: each at its own voltage where there are as many, else added.
     """
     named = [found for name in names if (found := _read_name(name))]
     watt, amp, volt = ([of for of in named if of.quantity == what] for what in ("power", "current", "voltage"))
@@ -82,6 +83,26 @@ def match_power_fields(names: Iterable[str]) -> PowerFields | None:
     used = [*drawn, *(volt if "voltage" in rails[0] else [])]
     scales = {of.quantity: of.scale for of in used if of.scale != 1.0}
     return PowerFields(tuple(rails), scales, _find_doubt(drawn, others))
+
+
+def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
+    """Return the forward velocity as the mean of those of both sides, and the turn rate for a track of 0.5 m; {} without.
+
+    Turn rates of wheels are no velocities.
+    """
+    found = [
+        name
+        for name in names
+        if {"vel", "velocity", "speed"} & set(split_words(name))
+        and find_named_unit(name)[0] not in ("rpm", "rad/s", "deg/s")
+    ]
+    sided = [name for name in found if {"l", "left", "r", "right", "fl", "fr", "rl", "rr"} & set(split_words(name))]
+    left = [name for name in sided if {"l", "left", "fl", "rl"} & set(split_words(name))]
+    if not left or 2 * len(left) != len(sided) or len({split_sides(name)[0] for name in sided}) != 1:
+        return {}
+    right = [name for name in sided if name not in left]
+    turn = f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)} / 0.5"
+    return {"linear_x": f"({' + '.join([*left, *right])}) / {len(sided)}", "angular_z": turn}
 
 
 def _read_name(name: str) -> _Named | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import isfinite
 from typing import Any, TypeAlias
 
 from tcpipe.errors import RecipeError
@@ -93,6 +94,20 @@ def format_proposals(head: Iterable[str], lines: Sequence[ProposedLine]) -> str:
             note = f"  # {' '.join(line.note.split())}" if line.note else ""
             text.append(f"{'' if line.is_certain else '# '}{line.key} = {as_toml(line.value)}{note}")
     return "\n".join(text) + "\n"
+
+
+def format_first(values: Any) -> str:
+    """Return the first number of an array that is not zero, as a sample."""
+    known = [value for value in values.tolist() if isinstance(value, int | float) and isfinite(value)]
+    return f"{next((value for value in known if value), 0):.7g}"
+
+
+def propose_extrinsics(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLine]:
+    """Yield the lines that place sensors, by role and frame: nobody but a person knows where they are mounted."""
+    for role, frame in frames:
+        turn = {} if role == "gnss" else {"rpy_rad": [0.0, 0.0, 0.0]}
+        note = f"measure it from base_link: nothing places {frame or 'it'}"
+        yield ProposedLine("read.extrinsics", role, {"xyz_m": [0.0, 0.0, 0.0], **turn}, note, is_certain=False)
 
 
 def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:

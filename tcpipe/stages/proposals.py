@@ -86,7 +86,7 @@ def judge_fields(role: str, found: Mapping[str, str], columns: Columns) -> tuple
     values = {name: np.asarray(of, np.float64) for name, of in columns.items()}
     values = {name: of[np.isfinite(of) & (of != 0.0)] for name, of in values.items()}
     if role == "gnss":
-        return _judge_fixes(dict(found), values, whole=np.issubdtype(columns["latitude"].dtype, np.integer))
+        return _judge_fixes(dict(found), values)
     if role == "imu":
         return _judge_imu(dict(found), values)
     return dict(found), ""
@@ -96,12 +96,11 @@ def _largest(values: Floats) -> float:
     return float(np.abs(values).max()) if values.size else np.nan
 
 
-def _judge_fixes(found: dict[str, str], values: Mapping[str, Floats], *, whole: bool) -> tuple[dict[str, str], str]:
+def _judge_fixes(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dict[str, str], str]:
     latitude, longitude = (_largest(values[name]) for name in ("latitude", "longitude"))
     doubt = ""
-    if (
-        whole and latitude > 90.0 and latitude <= 90e7 and longitude <= 180e7
-    ):  # as in u-blox' messages, whose heights are in mm
+    is_whole = not any(np.any(values[name] % 1.0) for name in ("latitude", "longitude"))
+    if is_whole and 90.0 < latitude <= 90e7 and longitude <= 180e7:  # as in u-blox' messages, whose heights are in mm
         found |= {name: f"{found[name]} * 1e-7" for name in ("latitude", "longitude")}
         found |= {"altitude": f"{found['altitude']} * 0.001"} if "altitude" in found else {}
         values = {**values, "altitude": values.get("altitude", np.zeros(0)) * 0.001}
@@ -235,16 +234,16 @@ def _find_bare_rails(log: LogReader, free: Sequence[Topic]) -> list[_Candidate]:
         return []
     used = _pair_rails(judged)
     if not used and all(what == "current" for _, what, _ in judged):
-        sources = tuple({**keys, **_NOMINAL, "rail": make_rail_name(of.name)} for of, _, keys in judged)
-        return [_Candidate(tuple(of.name for of, _, _ in judged), sources, numbers, _NO_VOLTAGE)]
+        sources = tuple({**keys, **NOMINAL, "rail": make_rail_name(of.name)} for of, _, keys in judged)
+        return [_Candidate(tuple(of.name for of, _, _ in judged), sources, numbers, NO_VOLTAGE)]
     topics = dict.fromkeys(of.name for of, _, _ in ([each for _, each in used] or judged))
     sources = tuple({**keys, "rail": rail} for rail, (_, _, keys) in used)
     return [_Candidate(tuple(topics), sources, numbers, _OF_DRIVES)]
 
 
 _OF_DRIVES = "uncomment if these feed the drives"
-_NOMINAL = {"nominal_voltage_volt": 24.0}
-_NO_VOLTAGE = "nothing is a voltage: state that of the battery"
+NOMINAL = {"nominal_voltage_volt": 24.0}
+NO_VOLTAGE = "nothing is a voltage: state that of the battery"
 
 
 def _pair_rails(
@@ -290,7 +289,7 @@ def _find_own_types(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate
         ]
         doubt = matched.doubt
         if not {"voltage", "power"} & set(matched.rails[0]):
-            sources, doubt = [{**keys, **_NOMINAL} for keys in sources], _NO_VOLTAGE
+            sources, doubt = [{**keys, **NOMINAL} for keys in sources], NO_VOLTAGE
         if found := _read_candidate(log, group, sources, doubt):
             yield found
 

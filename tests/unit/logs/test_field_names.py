@@ -1,7 +1,7 @@
 """What a message type of somebody's own could play is told by its definition, and by nothing that is of another role."""
 
 from tcpipe.formats.recipe_toml import load_shipped_profiles
-from tcpipe.logs.field_mapping import _list_number_fields, match_field_names, propose_roles
+from tcpipe.logs.field_mapping import list_number_fields, match_field_names, propose_roles
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages.read_roles import decide_roles
@@ -76,9 +76,9 @@ def test_a_definition_that_is_made_to_hurt_is_not_searched() -> None:
         inner = "int8" if level == 4 else f"L{level + 1}"
         deep += f"{rule}\nMSG: driver/L{level}\n" + "".join(f"{inner} f{n}\n" for n in range(60))
     assert len(deep) < 1 << 16
-    assert len(_list_number_fields(topic("/deep", deep))) == 1000, "of hundreds of millions"
-    assert len(_list_number_fields(topic("/wide", "int8 a\n" * 9_000))) == 1000
-    assert _list_number_fields(topic("/long", RTK + "int8 a\n" * 10_000)) == []
+    assert len(list_number_fields(topic("/deep", deep))) == 1000, "of hundreds of millions"
+    assert len(list_number_fields(topic("/wide", "int8 a\n" * 9_000))) == 1000
+    assert list_number_fields(topic("/long", RTK + "int8 a\n" * 10_000)) == []
 
 
 def test_a_log_without_motion_asks_with_the_proposal_and_one_with_motion_warns_with_it() -> None:
