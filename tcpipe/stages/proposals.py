@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,19 @@ from tcpipe.logs.field_mapping import list_number_fields, match_field_names
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
-from tcpipe.power.sources import FLOAT_TYPES, find_quantity, find_rejection, is_of_drives, make_rail_name, read_rails
+from tcpipe.power.sources import (
+    FLOAT_TYPES,
+    find_quantity,
+    find_rejection,
+    is_of_drives,
+    list_power_lists,
+    make_rail_name,
+    read_rails,
+    reject_power,
+)
 from tcpipe.recipe import ReadConfig
-from tcpipe.recipe.suggestions import TomlValue, suggest
-from tcpipe.robots import PowerSource, Profiles, parse_fields
+from tcpipe.recipe.suggestions import Keys, suggest
+from tcpipe.robots import PowerSource, Profiles
 from tcpipe.stages.message_arrays import LogReader, make_message_arrays
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -30,7 +39,7 @@ Floats = NDArray[np.float64]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _GRAVITY_MPS2 = 9.80665
-_UNSETTLED = {"sign": "auto", "averaging_unknown": True}
+_UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
 """What no name says of a current."""
 
 
@@ -39,10 +48,9 @@ def find_proposals(
 ) -> tuple[Finding, ...]:
     """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of."""
     free = [topic for topic in log.topics.values() if _is_free(topic, config)]
-    return (
-        *_propose_roles(log, free, {*assignment.roles, *config.topics}),
-        *_propose_power(log, free, assignment, config, known),
-    )
+    settled = {*assignment.roles, *config.topics}
+    power = () if "power" in settled else _propose_power(log, free, known)
+    return (*_propose_roles(log, free, settled), *power)
 
 
 def _is_free(topic: Topic, config: ReadConfig) -> bool:
@@ -125,201 +133,132 @@ def _judge_imu(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dic
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """Topics that could be power together: the tables that read them, what their values are, and what is unclear."""
+    """Topics that could be power together: the tables that read them, the range of their values, and what is unclear."""
 
     topics: tuple[str, ...]
-    sources: tuple[dict[str, TomlValue], ...]
-    numbers: Mapping[str, float]
+    sources: tuple[Keys, ...]
+    numbers: Mapping[str, float] = field(default_factory=dict)
     doubt: str = ""
 
 
-def _propose_power(
-    log: LogReader, free: Sequence[Topic], assignment: RoleAssignment, config: ReadConfig, known: Profiles
-) -> Iterator[Finding]:
-    """Yield what could be power in a log without a power topic, the likeliest first."""
-    if "power" in assignment.roles or "power" in config.topics:
-        return
+def _propose_power(log: LogReader, free: Sequence[Topic], known: Profiles) -> Iterator[Finding]:
+    """Yield what could be power in a log without a power topic: bare numbers, then messages of the user's own, then torques."""
     told = {*known.types(), *(of for types in ROLE_TYPES.values() for of in types)}
     own = [topic for topic in free if topic.type_name not in told]
-    found = (
-        _find_bare_rails(log, free)
-        or [*_find_own_types(log, own), *_find_bare_watts(log, free)]
-        or [*_find_joints(log, free)]
-    )
-    if not found:
-        return
+    found = [*_find_bare(log, free)] or [*_find_own(log, own)] or [*_find_joints(log, free)]
     found.sort(key=lambda of: bool(of.doubt))
-    best = found[0]
-    used: list[TomlValue] = list(best.topics)
-    doubt = best.doubt or (
-        ", ".join(found[1].topics) + " could be meant as well" if len(found) > 1 and not found[1].doubt else ""
-    )
-    yield make_finding(
-        "power-candidates",
-        Subject("role", "power"),
-        names={
-            "topics": ", ".join(topic for of in found for topic in of.topics),
-            **({"doubt": doubt} if doubt else {}),
-        },
-        remedies=suggest("use", {"read.topics": {"power": used}, "power_sources": best.sources})
-        if best.sources
-        else (),
-        topics_count=sum(len(of.topics) for of in found),
-        **best.numbers,
-    )
-
-
-def _read_candidate(
-    log: LogReader, topics: Sequence[Topic], sources: Sequence[Mapping[str, Any]], doubt: str
-) -> _Candidate | None:
-    """Return a candidate with the factors that its values show; None where they cannot be power."""
-    made, numbers = [], dict[str, float]()
-    for keys in sources:
-        on = [topic for topic in topics if topic.name == keys.get("topic", topic.name)]
-        for topic in on:
-            judged = _judge_source(log, topic, keys, numbers)
-            if judged is None:
-                return None
-            keys = judged  # noqa: PLW2901  one table for all topics of a type
-        made.append(dict(keys))
-    return _Candidate(tuple(dict.fromkeys(topic.name for topic in topics)), tuple(made), numbers, doubt)
+    for best in found[:1]:
+        rivals = [name for of in found[1:] if not of.doubt for name in of.topics]
+        doubt = best.doubt or (f"{', '.join(rivals)} could be meant as well" if rivals else "")
+        topics = [name for of in found for name in of.topics]
+        names = {"topics": ", ".join(topics), **({"doubt": doubt} if doubt else {})}
+        used = dict.fromkeys(str(keys.get("topic", "")) for keys in best.sources)
+        recipe = {"read.topics": {"power": [*(best.topics if "" in used else used)]}, "power_sources": best.sources}
+        remedies = suggest("use", recipe) if best.sources else ()
+        subject = Subject("role", "power")
+        yield make_finding(
+            "power-candidates", subject, names=names, remedies=remedies, topics_count=len(topics), **best.numbers
+        )
 
 
 _THOUSANDTHS = {"voltage-in-millivolts": "voltage_scale", "current-in-milliamperes": "current_scale"}
 
 
-def _judge_source(
-    log: LogReader, topic: Topic, keys: Mapping[str, Any], numbers: dict[str, float]
-) -> Mapping[str, Any] | None:
-    """Return the table of a source with the factors that make its values plausible, and add their range to ``numbers``."""
-    texts = [str(keys.get(what, "")) for what in ("voltage", "current", "power")]
-    columns = read_columns(
-        log, topic.name, [of.column for text in texts for of in parse_fields(text) if "[]." in of.column]
-    )
-    if not columns:
-        return None
+def _judge_source(log: LogReader, topic: Topic, keys: Keys, numbers: dict[str, float]) -> Keys | None:
+    """Return a power source with the factors that make its values plausible, and add their range to ``numbers``; None where none does."""
+    made: dict[str, Any] = {**keys}
+    columns = read_columns(log, topic.name, list_power_lists(topic.type_name, [PowerSource(**made)]))
     for _ in range(3):
-        source = PowerSource(**keys)
-        rails = read_rails(columns, [source], topic.name)
-        if isinstance(rails, Finding):
+        rails = read_rails(columns, [PowerSource(**made)], topic.name) if columns else []
+        if isinstance(rails, Finding) or not rails:
             return None
-        (rail,) = rails
-        why = find_rejection(rail, topic.name, columns)
-        if why is None:
+        why = find_rejection(rails[0], topic.name, columns)
+        scale = _THOUSANDTHS.get(why.names["reason"], "") if why else ""
+        if why is None or scale in {"", *made}:
             break
-        scale = _THOUSANDTHS.get(why.names["reason"])
-        if scale is None or scale in keys:
-            return None
-        keys = {**keys, scale: 0.001}
-    for unit, values in (("volt", rail.voltage_volt), ("watt" if source.power else "amp", rail.current_amp)):
+        made[scale] = 0.001
+    drawn = ("current_amp", "watt" if "power" in made else "amp")
+    for values, unit in ((getattr(rails[0], name), unit) for name, unit in (("voltage_volt", "volt"), drawn)):
         known = values[np.isfinite(values)]
-        if known.size and not (unit == "volt" and source.power):
-            if not known.any():
-                return None
+        if why is None and known.size and ("voltage" in made or unit != "volt"):
+            why = None if known.any() else reject_power(topic.name, "no-numbers")
             numbers[f"low_{unit}"] = min(numbers.get(f"low_{unit}", np.inf), float(known.min()))
             numbers[f"high_{unit}"] = max(numbers.get(f"high_{unit}", -np.inf), float(known.max()))
-    return keys
+    return made if why is None else None
 
 
-def _find_bare_rails(log: LogReader, free: Sequence[Topic]) -> list[_Candidate]:
-    """Return the rails that bare numbers make: each current with the voltage that is called alike, or with the only one."""
+def _find_bare(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
+    """Yield what topics of bare numbers make: rails of voltage and current, or powers, or currents without a voltage."""
     numbers = dict[str, float]()
-    judged: list[tuple[Topic, str, Mapping[str, Any]]] = []
+    judged: dict[str, list[Keys]] = {"voltage": [], "current": [], "power": []}
     for topic in free:
-        what = find_quantity(topic.name) if topic.type_name in FLOAT_TYPES else None
-        keys = {"type": topic.type_name, "topic": topic.name, str(what): "data", "rail": "", "sign": "auto"}
+        is_watt = bool(_WATT & set(split_words(topic.name.rpartition("/")[2])))
+        what = (find_quantity(topic.name) or ("power" if is_watt else "")) if topic.type_name in FLOAT_TYPES else ""
+        unsettled = _UNSETTLED if what == "power" else {"rail": make_rail_name(topic.name), "sign": "auto"}
+        keys = {"type": topic.type_name, "topic": topic.name, what: "data", **unsettled}
         if what and (found := _judge_source(log, topic, keys, numbers)):
-            judged.append((topic, what, found))
-    if not judged:
-        return []
-    used = _pair_rails(judged)
-    if not used and all(what == "current" for _, what, _ in judged):
-        sources = tuple({**keys, **NOMINAL, "rail": make_rail_name(of.name)} for of, _, keys in judged)
-        return [_Candidate(tuple(of.name for of, _, _ in judged), sources, numbers, NO_VOLTAGE)]
-    topics = dict.fromkeys(of.name for of, _, _ in ([each for _, each in used] or judged))
-    sources = tuple({**keys, "rail": rail} for rail, (_, _, keys) in used)
-    return [_Candidate(tuple(topics), sources, numbers, _OF_DRIVES)]
-
-
-_OF_DRIVES = "uncomment if these feed the drives"
-NOMINAL = {"nominal_voltage_volt": 24.0}
-NO_VOLTAGE = "nothing is a voltage: state that of the battery"
-
-
-def _pair_rails(
-    found: Sequence[tuple[Topic, str, Mapping[str, Any]]],
-) -> list[tuple[str, tuple[Topic, str, Mapping[str, Any]]]]:
-    """Return each rail's voltage and current: called alike, or all currents at the only voltage; of drives alone where some are."""
-    voltages = {make_rail_name(of[0].name): of for of in found if of[1] == "voltage"}
-    currents = [of for of in found if of[1] == "current"]
-    currents = [of for of in currents if is_of_drives(of[0].name)] or currents
-    used = []
-    for of in currents:
-        rail = make_rail_name(of[0].name)
-        voltage = voltages.get(rail) or (next(iter(voltages.values())) if len(voltages) == 1 else None)
-        if voltage is None:
-            return []
-        used += [(rail, voltage), (rail, of)]
-    return used
+            judged[what].append(found)
+    sources, doubt = _pair_rails(judged["voltage"], judged["current"]), "uncomment if these feed the drives"
+    if not sources and judged["power"]:
+        alike = split_sides(str(judged["power"][0]["topic"]))[0]
+        sources = [keys for keys in judged["power"] if split_sides(str(keys["topic"]))[0] == alike]
+    elif not sources and not judged["voltage"]:
+        sources, doubt = [{**keys, **NOMINAL} for keys in judged["current"]], NO_VOLTAGE
+    if topics := [str(keys["topic"]) for of in judged.values() for keys in of]:
+        yield _Candidate(tuple(topics), tuple(sources), numbers, doubt)
 
 
 _WATT = {"power", "watt", "watts"}
+NOMINAL: Keys = {"nominal_voltage_volt": 24.0}
+NO_VOLTAGE = "nothing is a voltage: state that of the battery"
 
 
-def _find_bare_watts(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
-    """Yield the bare numbers whose topic's name says that they are a power."""
-    named = [of for of in free if of.type_name in FLOAT_TYPES and _WATT & set(split_words(of.name.rpartition("/")[2]))]
-    for group in _group_by_sides(named):
-        sources = [{"type": of.type_name, "topic": of.name, "power": "data", **_UNSETTLED} for of in group]
-        if found := _read_candidate(log, group, sources, _OF_DRIVES):
-            yield found
+def _pair_rails(voltages: Sequence[Keys], currents: Sequence[Keys]) -> list[Keys]:
+    """Return each rail's voltage and current: called alike, or all currents at the only voltage; of drives alone where some are."""
+    by_rail = {keys["rail"]: keys for keys in voltages}
+    used: list[Keys] = []
+    for keys in [of for of in currents if is_of_drives(str(of["topic"]))] or currents:
+        voltage = by_rail.get(keys["rail"]) or (voltages[0] if len(voltages) == 1 else None)
+        if voltage is None:
+            return []
+        used += [{**voltage, "rail": keys["rail"]}, keys]
+    return used
 
 
-def _find_own_types(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
-    """Yield the messages of somebody's own that hold voltage and current, or power; topics of one type that differ by side are summed."""
-    for group in _group_by_sides(own):
+def _find_own(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
+    """Yield the messages of the user's own that hold voltage and current, or power; topics of a type that differ by side are summed."""
+    groups: dict[tuple[Any, ...], list[Topic]] = {}
+    for topic in own:
+        groups.setdefault((topic.type_name, split_sides(topic.name)[0]), []).append(topic)
+    for (type_name, _), group in groups.items():
         matched = match_power_fields(list_number_fields(group[0]))
-        if matched is None:
+        if matched is None or (len(matched.rails) > 1 and len(group) > 1):
             continue
         scales = {f"{what}_scale": factor for what, factor in matched.scales.items()}
-        named = ({"rail": f"{group[0].name}/{number}"} if len(matched.rails) > 1 else {} for number in range(9))
-        sources = [
-            {"type": group[0].type_name, **rail, **scales, **name, **_UNSETTLED}
-            for rail, name in zip(matched.rails, named, strict=False)
-        ]
-        doubt = matched.doubt
-        if not {"voltage", "power"} & set(matched.rails[0]):
-            sources, doubt = [{**keys, **NOMINAL} for keys in sources], NO_VOLTAGE
-        if found := _read_candidate(log, group, sources, doubt):
-            yield found
-
-
-def _group_by_sides(topics: Iterable[Topic]) -> list[list[Topic]]:
-    """Return topics of one type that are called alike but for a side or a number, together."""
-    groups: dict[tuple[Any, ...], list[Topic]] = {}
-    for topic in topics:
-        groups.setdefault((topic.type_name, split_sides(topic.name)[0]), []).append(topic)
-    return list(groups.values())
+        numbers, doubt, sources = dict[str, float](), matched.doubt, list[Keys]()
+        for rail in matched.rails:
+            named = {"rail": rail["current"]} if len(matched.rails) > 1 else {}
+            keys: Keys | None = {"type": type_name, **named, **rail, **scales, **_UNSETTLED}
+            if not {"voltage", "power"} & set(rail):
+                keys, doubt = {**keys, **NOMINAL}, NO_VOLTAGE
+            for topic in group:
+                keys = keys and _judge_source(log, topic, keys, numbers)
+            sources += [keys] if keys else []
+        if len(sources) == len(matched.rails):
+            yield _Candidate(tuple(topic.name for topic in group), tuple(sources), numbers, doubt)
 
 
 _DRIVING = re.compile(r".*(wheel|drive|motor|track|axle)(?!.*steer).*")
 
 
 def _find_joints(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
-    """Yield the joint states that have efforts and velocities: mechanical power."""
+    """Yield the joint states that have efforts and velocities of what drives."""
     for topic in free:
-        if topic.type_name != JOINT_STATE:
-            continue
-        columns = read_columns(log, topic.name, ["name[]"])
-        names = [str(name) for name in np.unique(columns.get("name[]", np.zeros(0, "U1"))).tolist() if name]
-        wheels = sorted(name for name in names if _DRIVING.fullmatch(name.lower()))
-        moving = [columns[of] for of in ("velocity", "effort") if of in columns and np.any(np.nan_to_num(columns[of]))]
-        if wheels and len(moving) == 2:
-            keys: dict[str, TomlValue] = {
-                "type": topic.type_name,
-                "joints": "|".join(map(re.escape, wheels)),
-                "sign": "auto",
-            }
+        columns = read_columns(log, topic.name, ["name[]"]) if topic.type_name == JOINT_STATE else {}
+        names = [str(name) for name in np.unique(columns.get("name[]", np.zeros(0, "U1"))).tolist()]
+        wheels = "|".join(re.escape(name) for name in names if _DRIVING.fullmatch(name.lower()))
+        if wheels and all(np.any(np.nan_to_num(columns.get(of, np.zeros(1)))) for of in ("velocity", "effort")):
+            keys: Keys = {"type": topic.type_name, "joints": wheels, "sign": "auto"}
             yield _Candidate(
-                (topic.name,), (keys,), {}, "uncomment if efforts are torques [N m]: mechanical power, without losses"
+                (topic.name,), (keys,), doubt="uncomment if efforts are torques [N m]: mechanical power alone"
             )
