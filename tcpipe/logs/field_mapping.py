@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs import roles
-from tcpipe.logs.expressions import FORM, Expression, ExpressionError, find_named_unit, parse_expression, strip_unit
+from tcpipe.logs.expressions import FORM, Expression, ExpressionError, parse_expression, split_unit
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
-from tcpipe.recipe import TABLE_POWER, TableMapping
 
 Floats = NDArray[np.float64]
+Columns = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ def read_fields(
 
 def _choose_factor(unit: str, column: str | None, stated: str | None) -> float | str:
     """Return what one of a column's unit is in a field's, or what is unclear about that."""
-    named, in_brackets = (None, False) if stated or column is None or unit not in UNITS else find_named_unit(column)
+    _, named, in_brackets = split_unit("" if stated or column is None else column)
     if unit == "1" or (stated or named) is None:
         return 1.0
     factor = UNITS[unit].get(stated or named or "")
@@ -221,9 +221,7 @@ def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> d
     return made | _collect_other_fields(role, values, made, rows)
 
 
-def _collect_other_fields(
-    role: str, values: Mapping[str, Floats], made: Mapping[str, NDArray[Any]], rows: int
-) -> dict[str, NDArray[Any]]:
+def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, NDArray[Any]]:
     """Return the fields of a role's message that no mapping names."""
     if role == "gnss":
         status = made["status.status"]
@@ -237,14 +235,16 @@ def _collect_other_fields(
     return {"orientation_covariance": np.full((rows, 9), -1.0)} if unoriented else {}
 
 
-def find_topic(name: str, mapping: TableMapping) -> tuple[str, str]:
-    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, told by the name."""
-    role = mapping.role or name
-    if mapping.make_power_source(name) is not None:
-        return f"/{name}", TABLE_POWER
-    if role != "power" or len(mapping.columns) != 1:
-        return f"/{name}", MAPPED_TYPES.get(role, "")
-    (alone,) = mapping.columns
+def find_topic(name: str, role: str, columns: Collection[str], power_type: str | None) -> tuple[str, str]:
+    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, told by the name.
+
+    ``power_type`` is that of a source that the recipe makes of the table.
+    """
+    if power_type is not None:
+        return f"/{name}", power_type
+    if role != "power" or len(columns) != 1:
+        return f"/{name}", MAPPED_TYPES[role]
+    (alone,) = columns
     return f"/{name}" if find_quantity(name) == alone else f"/{name}/{alone}", FLOAT_TYPES[1]
 
 
@@ -275,9 +275,7 @@ def utc_from_gps_ns(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def make_mapped_message(
-    role: str, columns: Mapping[str, NDArray[Any]], fields: Mapping[str, str]
-) -> dict[str, NDArray[Any]] | list[str]:
+def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, NDArray[Any]] | list[str]:
     """Return a custom message's columns as those of the message that a role usually has, or what is wrong with the mapping.
 
     Parameters
@@ -317,7 +315,7 @@ def _find_misfit(values: NDArray[Any], name: str, index: int | None) -> str | No
     return f"{name} is no list" if values.ndim == 1 and index is not None else None
 
 
-def _read_column(columns: Mapping[str, NDArray[Any]], name: str, index: int | None) -> Floats:
+def _read_column(columns: Columns, name: str, index: int | None) -> Floats:
     values = columns[name] if index is None else columns[name][:, index]
     return values.astype(np.float64)
 
@@ -361,7 +359,7 @@ def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     """Return the name of each field of a role; {} where one is missing that the role needs."""
     found: dict[str, str] = {}
     for field, pattern in CALLED[role].items():
-        match = next((name for name in names if re.fullmatch(pattern, strip_unit(name))), None)
+        match = next((name for name in names if re.fullmatch(pattern, split_unit(name)[0].lower())), None)
         if match is not None and match not in found.values():
             found[field] = match
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from tcpipe.logs.expressions import find_named_unit
+from tcpipe.logs.expressions import split_unit
 
 SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr", "bl", "br"})
 
@@ -16,8 +16,10 @@ _QUANTITIES = {
     "current": re.compile(r"curr?(ent)?s?|amp(ere)?s?|i(bat|batt|in|bus|pack)"),
     "power": re.compile(r"power|watts?"),
 }
-_UNITS = {"v": "voltage", "mv": "voltage", "a": "current", "ma": "current", "w": "power", "mw": "power", "kw": "power"}
-_SCALES = {"m": 0.001, "k": 1000.0}
+_UNITS = {
+    "V": ("voltage", 1.0), "mV": ("voltage", 0.001), "A": ("current", 1.0), "mA": ("current", 0.001), "W": ("power", 1.0),
+    "mW": ("power", 0.001), "kW": ("power", 1000.0),
+}  # fmt: skip
 _SUPPLY = re.compile(
     r"bat|batt|battery|bms|pack|bus|supply|input|in|main|dc|source|vin|iin|[vi](bat|batt|in|bus|pack)|esc"
 )
@@ -27,6 +29,9 @@ _OTHER = re.compile(
     r"cells?|status|fault|error|id|iq|vd|vq|per|pred|true|std|cov|variance|health|design|supply_?status|technology|mode|button|acc|lin|ang|vel"
 )
 _PHASE = re.compile(r"phase|motors?|q|d|rms")
+
+
+_TURNS = ("rpm", "rad/s", "deg/s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,13 +95,9 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
 
     Turn rates of wheels are no velocities.
     """
-    found = [
-        name
-        for name in names
-        if {"vel", "velocity", "speed"} & set(split_words(name))
-        and find_named_unit(name)[0] not in ("rpm", "rad/s", "deg/s")
-    ]
-    sided = [name for name in found if {"l", "left", "r", "right", "fl", "fr", "rl", "rr"} & set(split_words(name))]
+    speeds = [name for name in names if {"vel", "velocity", "speed"} & set(split_words(name))]
+    sides = {"l", "left", "r", "right", "fl", "fr", "rl", "rr"}
+    sided = [name for name in speeds if sides & set(split_words(name)) and split_unit(name)[1] not in _TURNS]
     left = [name for name in sided if {"l", "left", "fl", "rl"} & set(split_words(name))]
     if not left or 2 * len(left) != len(sided) or len({split_sides(name)[0] for name in sided}) != 1:
         return {}
@@ -106,24 +107,16 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
 
 
 def _read_name(name: str) -> _Named | None:
-    words = split_words(name)
-    own = split_words(name.rpartition(".")[2])
-    if any(_OTHER.fullmatch(word) for word in own):
-        return None
+    bare, unit, _ = split_unit(name.replace("`", "").removesuffix("[]"))
+    (core, side), own = split_sides(bare), split_words(bare.rpartition(".")[2])
     quantity = next((what for word in reversed(own) for what, of in _QUANTITIES.items() if of.fullmatch(word)), None)
-    unit = own[-1] if len(own) > 1 and own[-1] in _UNITS else ""
-    if (
-        quantity is None
-        and unit
-        and any(_SUPPLY.fullmatch(of) or (len(unit) > 1 and _DRIVES.fullmatch(of)) for of in words)
-    ):
-        quantity = _UNITS[unit]
-    if quantity is None or (unit and _UNITS[unit] != quantity):
+    measured, scale = _UNITS.get(unit or "", (quantity, 1.0))
+    of_rail = any(_SUPPLY.fullmatch(word) or _DRIVES.fullmatch(word) for word in core)
+    quantity = quantity or (measured if of_rail and scale != 1.0 else None)  # a "wheel_v" alone is a velocity
+    if quantity is None or measured != quantity or any(_OTHER.fullmatch(word) for word in own):
         return None
-    scale = _SCALES[unit[0]] if len(unit) > 1 else 1.0
-    rest, side = split_sides(name)
-    core = tuple(word for word in rest if word != unit and not any(of.fullmatch(word) for of in _QUANTITIES.values()))
-    return _Named(name, quantity, scale, core, side)
+    rest = tuple(word for word in core if not any(of.fullmatch(word) for of in _QUANTITIES.values()))
+    return _Named(name, quantity, scale, rest, side)
 
 
 def _choose(named: Sequence[_Named]) -> tuple[list[_Named], list[_Named]]:
@@ -131,20 +124,14 @@ def _choose(named: Sequence[_Named]) -> tuple[list[_Named], list[_Named]]:
     groups: dict[tuple[str, ...], list[_Named]] = {}
     for of in named:
         groups.setdefault(of.core, []).append(of)
-    ranked = sorted(groups.values(), key=lambda group: (not _has(_SUPPLY, group), _has(_PHASE, group)))
-    if not ranked:
-        return [], []
-    best = ranked[0]
-    alike = [
-        group
-        for group in ranked[1:]
-        if _has(_SUPPLY, group) == _has(_SUPPLY, best) and _has(_PHASE, group) == _has(_PHASE, best)
-    ]
-    return best, [of for group in alike for of in group]
+    ranked = sorted(groups.values(), key=_rank)
+    return (ranked or [[]])[0], [of for group in ranked[1:] if _rank(group) == _rank(ranked[0]) for of in group]
 
 
-def _has(pattern: re.Pattern[str], group: Sequence[_Named]) -> bool:
-    return any(pattern.fullmatch(word) for word in group[0].core)
+def _rank(group: Sequence[_Named]) -> tuple[bool, bool]:
+    """Return whether the fields are not named like the supply, and whether they are named like a motor."""
+    supply, phase = (any(of.fullmatch(word) for word in group[0].core) for of in (_SUPPLY, _PHASE))
+    return not supply, phase
 
 
 def _of_one(name: str) -> str:
@@ -155,6 +142,6 @@ def _of_one(name: str) -> str:
 def _find_doubt(drawn: Sequence[_Named], others: Sequence[_Named]) -> str:
     if others:
         return f"{', '.join(of.name for of in others)} could be meant as well"
-    if _has(_PHASE, drawn) and not _has(_SUPPLY, drawn):
+    if _rank(drawn) == (True, True):
         return "uncomment if these are drawn from the battery; currents of motor phases are larger"
     return ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.table_log import Cells, read_cells, read_column_names
-from tcpipe.logs.expressions import find_named_unit, strip_unit
+from tcpipe.logs.expressions import split_unit
 from tcpipe.logs.field_mapping import MAPPED, STAMP_UNITS, match_field_names, parse_stamps_ns, read_fields
 from tcpipe.logs.power_fields import match_power_fields, match_sided_velocities
 from tcpipe.power.sources import RailReadings, find_rejection
@@ -80,8 +80,9 @@ def propose_tables(folder: Path, files: Sequence[Path]) -> TableProposals:
             table = _read_table(name, path, columns)
         except LogError:
             continue
-        for role, lines in _iterate_roles(table) if table else ():
-            roles.setdefault(role, []).append((table, lines))
+        if table is not None:
+            for role, lines in _iterate_roles(table):
+                roles.setdefault(role, []).append((table, lines))
     found.head = [
         f"Proposed from the tables in {folder.name} by tcpipe init. Comments need a decision: remove the # and correct the value."
     ]
@@ -119,12 +120,12 @@ def _group_files(folder: Path, files: Sequence[Path]) -> dict[str, Path]:
 def _read_table(file: str, path: Path, names: tuple[str, ...]) -> _Table | None:
     """Return a table with the stamps that suit best: those since 1970, of these the finest; None where there are none."""
     best: tuple[tuple[bool, int, bool], _Table] | None = None
-    for stamp in [name for name in names if _STAMP.fullmatch(strip_unit(name))] or names[:1]:
+    for stamp in [name for name in names if _STAMP.fullmatch(split_unit(name)[0].lower())] or names[:1]:
         cells = read_cells(path, stamp=stamp, columns=[])
         known = cells.stamp[cells.stamp_known]
         if known.size < 2:
             continue
-        unit = find_named_unit(stamp)[0]
+        unit = split_unit(stamp)[1]
         is_absolute = cells.stamp_is_time or not isinstance(parse_stamps_ns(known, "auto"), str)
         stated = None if is_absolute or unit in STAMP_UNITS else _guess_unit(known)
         if stated == "":

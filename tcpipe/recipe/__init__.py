@@ -1,7 +1,6 @@
 """The recipe: every key that rules the pipeline, with default, bounds and reason; checked when it is made, in TOML and in Python alike."""
 
 from tcpipe.recipe.sections import (
-    TABLE_POWER,
     CovariateConfig,
     DatasetConfig,
     Extrinsics,
@@ -19,7 +18,6 @@ from tcpipe.recipe.sections import (
 )
 
 __all__ = [
-    "TABLE_POWER",
     "CovariateConfig",
     "DatasetConfig",
     "Extrinsics",

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tcpipe.recipe.checking import validate_fields
-from tcpipe.robots import NOMINAL_STD_FRACTION, PlausibleSpeed, PowerSource, Robot, Share, Volt
+from tcpipe.robots import NOMINAL_STD_FRACTION, TABLE_POWER, PlausibleSpeed, PowerSource, Robot, Share, Volt
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import LEFT_OUT
 
@@ -329,10 +329,6 @@ class TableMapping:
             nominal_voltage_volt=self.nominal_voltage_volt,
             nominal_voltage_std_fraction=self.nominal_voltage_std_fraction,
         )
-
-
-TABLE_POWER = "tcpipe/msg/TablePower"
-"""The type of a table of power that no message usually is."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,9 @@ OFFSET_STD_WATT = 5.0
 NOMINAL_STD_FRACTION = 0.1
 """σ of a voltage that nobody measured, as a fraction: a battery of lead falls by 20 % of its nominal voltage, one of lithium by 25 %."""
 
+TABLE_POWER = "tcpipe/msg/TablePower"
+"""The type of a table of power, where that is neither a voltage nor a current as it stands."""
+
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
 

@@ -20,6 +20,7 @@ from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import (
     FLOAT_TYPES,
+    RailReadings,
     find_quantity,
     find_rejection,
     is_of_drives,
@@ -137,7 +138,7 @@ class _Candidate:
 
     topics: tuple[str, ...]
     sources: tuple[Keys, ...]
-    numbers: Mapping[str, float] = field(default_factory=dict)
+    numbers: Mapping[str, Any] = field(default_factory=dict)
     doubt: str = ""
 
 
@@ -153,7 +154,10 @@ def _propose_power(log: LogReader, free: Sequence[Topic], known: Profiles) -> It
         topics = [name for of in found for name in of.topics]
         names = {"topics": ", ".join(topics), **({"doubt": doubt} if doubt else {})}
         used = dict.fromkeys(str(keys.get("topic", "")) for keys in best.sources)
-        recipe = {"read.topics": {"power": [*(best.topics if "" in used else used)]}, "power_sources": best.sources}
+        recipe: dict[str, Keys | Sequence[Keys]] = {
+            "read.topics": {"power": [*(best.topics if "" in used else used)]},
+            "power_sources": best.sources,
+        }
         remedies = suggest("use", recipe) if best.sources else ()
         subject = Subject("role", "power")
         yield make_finding(
@@ -167,6 +171,7 @@ _THOUSANDTHS = {"voltage-in-millivolts": "voltage_scale", "current-in-milliamper
 def _judge_source(log: LogReader, topic: Topic, keys: Keys, numbers: dict[str, float]) -> Keys | None:
     """Return a power source with the factors that make its values plausible, and add their range to ``numbers``; None where none does."""
     made: dict[str, Any] = {**keys}
+    rails: list[RailReadings] | Finding = []
     columns = read_columns(log, topic.name, list_power_lists(topic.type_name, [PowerSource(**made)]))
     for _ in range(3):
         rails = read_rails(columns, [PowerSource(**made)], topic.name) if columns else []
@@ -177,8 +182,9 @@ def _judge_source(log: LogReader, topic: Topic, keys: Keys, numbers: dict[str, f
         if why is None or scale in {"", *made}:
             break
         made[scale] = 0.001
+    (rail,) = rails
     drawn = ("current_amp", "watt" if "power" in made else "amp")
-    for values, unit in ((getattr(rails[0], name), unit) for name, unit in (("voltage_volt", "volt"), drawn)):
+    for values, unit in ((getattr(rail, name), unit) for name, unit in (("voltage_volt", "volt"), drawn)):
         known = values[np.isfinite(values)]
         if why is None and known.size and ("voltage" in made or unit != "volt"):
             why = None if known.any() else reject_power(topic.name, "no-numbers")
@@ -238,9 +244,10 @@ def _find_own(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
         numbers, doubt, sources = dict[str, float](), matched.doubt, list[Keys]()
         for rail in matched.rails:
             named = {"rail": rail["current"]} if len(matched.rails) > 1 else {}
-            keys: Keys | None = {"type": type_name, **named, **rail, **scales, **_UNSETTLED}
-            if not {"voltage", "power"} & set(rail):
-                keys, doubt = {**keys, **NOMINAL}, NO_VOLTAGE
+            lacks_voltage = not {"voltage", "power"} & set(rail)
+            doubt = NO_VOLTAGE if lacks_voltage else doubt
+            assumed = NOMINAL if lacks_voltage else {}
+            keys: Keys | None = {"type": type_name, **named, **rail, **scales, **_UNSETTLED, **assumed}
             for topic in group:
                 keys = keys and _judge_source(log, topic, keys, numbers)
             sources += [keys] if keys else []

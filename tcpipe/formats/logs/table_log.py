@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
-from tcpipe.logs.expressions import find_named_unit
+from tcpipe.logs.expressions import split_unit
 from tcpipe.logs.field_mapping import (
     STAMP_UNITS,
     find_mapping_problems,
@@ -167,7 +167,9 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
         field: factor * np.broadcast_to(of.evaluate(lambda column, _: cells.columns[column]), len(cells.stamp))
         for field, (of, factor) in fields.items()
     }
-    return _read_messages((*find_topic(name, mapping), role), mapping, cells, values, stamp_ns)
+    source = mapping.make_power_source(name)
+    read_as = find_topic(name, role, mapping.columns, source and source.type)
+    return _read_messages((*read_as, role), mapping, cells, values, stamp_ns)
 
 
 def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.int64] | str:
@@ -175,7 +177,7 @@ def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.
     known = cells.stamp[cells.stamp_known]
     if not known.size:
         return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
-    named, stated = find_named_unit(stamp)[0], mapping.stamp_unit
+    named, stated = split_unit(stamp)[1], mapping.stamp_unit
     unit = "ns" if cells.stamp_is_time else named if stated == "auto" and named in STAMP_UNITS else stated
     found = parse_stamps_ns(known, unit)
     if isinstance(found, str):

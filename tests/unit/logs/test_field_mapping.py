@@ -15,7 +15,8 @@ from tcpipe.logs.field_mapping import (
     utc_from_gps_ns,
 )
 from tcpipe.logs.messages import list_needed_fields, read_messages
-from tcpipe.recipe import TABLE_POWER, TableMapping
+from tcpipe.recipe import TableMapping
+from tcpipe.robots import TABLE_POWER
 
 PLACE = {"x": 1.0, "y": 2.0, "z": 3.0, "x_std": 0.1, "y_std": 0.2, "z_std": 0.3}
 NOW_S = 1_760_456_485
@@ -129,7 +130,8 @@ def test_voltage_and_current_apart_are_bare_numbers_called_so():
         ("pack", {"voltage": "v", "current": "i"}, ("/pack", "sensor_msgs/msg/BatteryState")),
         ("pack", {"power": "p"}, ("/pack", TABLE_POWER)),
     ):
-        assert find_topic(name, TableMapping("a.csv", "power", columns)) == wanted
+        source = TableMapping("a.csv", "power", columns).make_power_source(name)
+        assert find_topic(name, "power", columns, source and source.type) == wanted
 
 
 def test_a_message_of_ones_own_is_mapped_field_by_field_and_all_that_is_wrong_is_said():
