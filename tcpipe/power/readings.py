@@ -185,13 +185,7 @@ def _convert_thousandths(
     """Return the sources in millivolts or milliamperes, as far as their numbers are power then; none where they are not."""
     for volt, amp in ((1.0, 1e-3), (1e-3, 1.0), (1e-3, 1e-3)):
         scaled = [
-            replace(
-                of,
-                voltage_scale=volt * of.voltage_scale,
-                current_scale=amp * of.current_scale if of.current else of.current_scale,
-                power_scale=amp * of.power_scale if of.power else of.power_scale,
-            )
-            for of in sources
+            replace(of, voltage_scale=volt * of.voltage_scale, current_scale=amp * of.current_scale) for of in sources
         ]
         found = read_rails(columns, scaled, topic, known)
         if not isinstance(found, Finding) and all(find_rejection(rail, topic, columns) is None for rail in found):

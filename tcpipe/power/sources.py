@@ -189,7 +189,7 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         return RailReadings(name, voltage, counter.mean_amp(_choose_stamps(columns), voltage), counter)
     current = source.current_scale * _sum_fields(columns, parse_fields(source.current))
     if source.power:
-        watt = source.power_scale * _sum_fields(columns, parse_fields(source.power))
+        watt = source.current_scale * _sum_fields(columns, parse_fields(source.power))
         current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
         current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)

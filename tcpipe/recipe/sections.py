@@ -295,19 +295,19 @@ class TableMapping:
     """A table in a folder of CSV, text or Parquet files: its role, columns, units and stamps."""
 
     file: str = ""
-    """File name, relative to the ingested folder; with a * (imu_*.csv) the files in which it is the same text are one run."""
+    """File name, relative to the ingested folder; a * (imu_*.csv) stands for the number of a run."""
     role: Role | None = None
     """Role of the table; default: its name. Power may have several tables."""
     columns: dict[str, str] = field(default_factory=dict)
-    """Column by field (latitude, linear_x, voltage, …: docs/how-to/tables.md), or an expression of columns, as "(velL + velR) / 2"."""
+    """Column by field (latitude, linear_x, voltage, …: docs/how-to/tables.md), or an expression, as "(velL + velR) / 2"."""
     units: dict[str, str] = field(default_factory=dict)
-    """Units by field: "rad", "km/h", "g", "mV", "Wh", …; default: that of the column's name, else deg, m, m/s, rad/s, m/s2, V, A, W, J."""
+    """Units by field: "rad", "km/h", "g", "mV", …; default: that of the column's name, else deg, m, m/s, rad/s, m/s2, V, A, W, J."""
     nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
-    """Constant voltage of a table of currents, where none is measured: an assumption [V]."""
+    """Assumed voltage of a current [V]."""
     nominal_voltage_std_fraction: Share = field(
         default=NOMINAL_STD_FRACTION, metadata={"json": (NOMINAL_STD_FRACTION,)}
     )
-    """σ of the nominal voltage, as a fraction: one error of the whole run."""
+    """Its σ, as a fraction: one error of a run."""
     stamp: str | None = None
     """Column of the stamps; default: the first."""
     stamp_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"

@@ -108,21 +108,19 @@ class PowerSource:
     energy: str = ""
     """Field of a counter of energy, in place of a current, for example drawn - given_back."""
     power: str = field(default="", metadata=LEFT_OUT)
-    """Field of the power [W], in place of a current; no voltage is needed besides it."""
+    """Field of the power [W], in place of a current; needs no voltage."""
     voltage_scale: Scale = 1.0
     """Factor on the voltage: 0.001 if it is in millivolts."""
     current_scale: Scale = 1.0
-    """Factor on the current: 0.001 if it is in milliamperes."""
+    """Factor on the current or power: 0.001 if it is in milliamperes."""
     energy_scale: Scale = 1.0
     """Factor on the counter: 3600 if it counts watt-hours."""
-    power_scale: Scale = field(default=1.0, metadata={"json": (1.0,)})
-    """Factor on the power: 0.001 if it is in milliwatts."""
     nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
-    """Constant voltage of a current, where none is measured: an assumption, which a finding states [V]."""
+    """Assumed voltage of a current [V]."""
     nominal_voltage_std_fraction: Share = field(
         default=NOMINAL_STD_FRACTION, metadata={"json": (NOMINAL_STD_FRACTION,)}
     )
-    """σ of the nominal voltage, as a fraction: one error of the whole run, in addition to that of the gain."""
+    """Its σ, as a fraction: one error of a run."""
     counter_wraps: Annotated[float, Bounds(gt=0, le=1e19)] | None = None
     """Value at which the counter wraps to zero, in its own unit; if omitted, a decrease is a reset."""
     rail: str = ""
@@ -144,7 +142,7 @@ class PowerSource:
     offset_std_watt: Annotated[float, Bounds(ge=0, le=1e6)] = field(
         default=OFFSET_STD_WATT, metadata={"json": (OFFSET_STD_WATT,)}
     )
-    """The same of power or energy without a voltage [W]."""
+    """The same of a power without voltage [W]."""
     rest_current_amp: tuple[Amp, Amp] | None = field(default=None, metadata=LEFT_OUT)
     """Lowest and highest current of the stationary robot, if known; beyond is an offset [A]."""
     other_loads: str = ""

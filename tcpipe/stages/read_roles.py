@@ -20,7 +20,7 @@ def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
     for name, table in recipe.tables.items():
         role = cast("Role", table.role or name)
         of, power = table.columns, table.make_power_source(name)
-        if role in get_args(Role) and (topic := find_topic(name, role, of, power and power.type)[0]) in topics:
+        if role in get_args(Role) and (topic := find_topic(name, role, of, power.type if power else None)[0]) in topics:
             roles.setdefault(role, []).append(topic)
     return replace(recipe.read, topics={**roles, **recipe.read.topics}) if roles else recipe.read
 

@@ -168,7 +168,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
         for field, (of, factor) in fields.items()
     }
     source = mapping.make_power_source(name)
-    read_as = find_topic(name, role, mapping.columns, source and source.type)
+    read_as = find_topic(name, role, mapping.columns, source.type if source else None)
     return _read_messages((*read_as, role), mapping, cells, values, stamp_ns)
 
 
