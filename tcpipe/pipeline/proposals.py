@@ -126,9 +126,11 @@ def _propose_for_log(log: Log | TableLog, robot: str | None) -> tuple[list[str],
         pose, placed_by = places.get(cast("Role", role.name), (None, ""))
         place = f"; at {np.round(pose.xyz_m, 3).tolist()} m ({placed_by})" if pose and placed_by == "tf_static" else ""
         head += [f"{role.name}: {name}{_sample(found, name, role.name)}{place}" for name in role.topics]
+    lacking = [role for role in ("gnss", "imu", "wheel_odometry", "power", "command") if role not in {*assigned.roles, *assigned.choices}]
+    head += [f"not found: {', '.join(lacking)}"] if lacking else []
     unplaced = [(role, frames[role]) for role, (_, placed_by) in places.items() if placed_by == "assumed"]
     lines = [*_iterate_power(found), *_iterate_topics(found), *_iterate_fields(found), *propose_extrinsics(unplaced)]
-    return [*head, "", "The above needs no line." if lines else "Nothing has to be stated."], lines
+    return [*head, "", "What is above needs no line." if lines else "Nothing is proposed beyond."], lines
 
 
 def _list_used(assigned: RoleAssignment, proposals: Sequence[Finding]) -> dict[str, str]:

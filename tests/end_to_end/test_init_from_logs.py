@@ -170,7 +170,7 @@ def test_inspect_preflight_and_init_propose_the_same(drive, tmp_path):
         first = lines.index("[read.topics]")
         block = parse_toml("\n".join(line for line in lines[first:] if line.startswith("[") or " = " in line))
         assert {name: block[name] for name in ("power_sources", "read")} == values
-    again = run("init", tmp_path, "--from", log)
+    again = run("init", tmp_path, "--from", log, "--robot", "generic", "--msgdef", tmp_path)
     assert "nothing to do" in again.output
 
 
