@@ -56,7 +56,7 @@ def init(directory: str, *, source: str | None, robot: str | None, msgdef: str |
 
     path = Path(directory) / FILE_NAME
     proposed = source and propose_recipe(source, robot=robot, message_definitions=Path(msgdef) if msgdef else None)
-    text = proposed.text if proposed else format_commented_toml()
+    text = proposed.toml() if proposed else format_commented_toml()
     clear_beside(path)
     if path.is_file() and path.read_bytes() == text.encode():
         print_line(f"nothing to do: {path} exists")

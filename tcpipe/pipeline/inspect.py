@@ -22,7 +22,6 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_remote_logs
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.suggestions import format_proposals
 from tcpipe.store import Store, is_store, run_at
 from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
 
@@ -252,8 +251,10 @@ class InspectedTables:
 
 
 def _inspect_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
-    from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.pipeline.table_proposals import propose_tables, read_columns  # noqa: PLC0415  polars only where a table is read
 
+    columns, problems = read_columns(folder, files)
     found = propose_tables(folder, files)
-    recipe = format_proposals(found.head, found.lines) if found.lines else ""
-    return InspectedTables(path=str(folder), columns=found.columns, problems=found.problems, recipe=recipe)
+    return InspectedTables(
+        path=str(folder), columns=columns, problems=problems, recipe=found.toml() if found.lines else ""
+    )

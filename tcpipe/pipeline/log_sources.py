@@ -185,7 +185,7 @@ def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
                 *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
             ) from None
         if path.is_dir() and (held := list_table_files(path)):
-            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): map them in the recipe; 'tcpipe init --from {path}' proposes how"
+            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): 'tcpipe init --from {path}' writes a recipe for them"
             raise LogError(*error.problems, hint) from None
         raise
 

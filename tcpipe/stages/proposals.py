@@ -30,7 +30,7 @@ from tcpipe.power.sources import (
     reject_power,
 )
 from tcpipe.recipe import ReadConfig
-from tcpipe.recipe.suggestions import Keys, suggest
+from tcpipe.recipe.suggestions import Keys, format_first, suggest
 from tcpipe.robots import PowerSource, Profiles
 from tcpipe.stages.message_arrays import LogReader, make_message_arrays
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -83,7 +83,8 @@ def _propose_roles(log: LogReader, free: Sequence[Topic], settled: set[str]) -> 
                     continue
                 mapped, doubt = judge_fields(role, found, {name: columns[of] for name, of in found.items()})
                 remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: mapped}})
-                names = {"role": role, "type": topic.type_name, **({"doubt": doubt} if doubt else {})}
+                names = {field: format_first(columns[of]) for field, of in found.items()}
+                names |= {"role": role, "type": topic.type_name, **({"doubt": doubt} if doubt else {})}
                 yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
 
 

@@ -22,7 +22,7 @@ def write(path, **columns):
 
 def proposed(folder):
     """The recipe as it is written, and with every comment of a line removed."""
-    text = propose_recipe(folder).text
+    text = propose_recipe(folder).toml()
     bare = "\n".join(
         line.removeprefix("# ") if " = " in line or line.startswith("# [") else line for line in text.splitlines()
     )
@@ -75,7 +75,7 @@ def test_numbers_of_motors_are_no_runs(tmp_path):
     write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES)
     for motor in (1, 2):
         write(tmp_path / f"motor_{motor}.csv", time=SECONDS + UTC_S, voltage=24.0 + SECONDS, current=1.0 + SECONDS)
-    assert "*" not in propose_recipe(tmp_path).text
+    assert "*" not in propose_recipe(tmp_path).toml()
 
 
 @pytest.mark.parametrize(
@@ -123,5 +123,5 @@ def test_commands_and_velocities_of_one_table_are_told_apart(tmp_path):
 
 def test_a_folder_without_known_names_says_so(tmp_path):
     write(tmp_path / "notes.csv", week=SECONDS, done=1.0)
-    with pytest.raises(UsageError, match="no column of its tables has a known name"):
+    with pytest.raises(UsageError, match="no table with columns of known names"):
         propose_recipe(tmp_path)
