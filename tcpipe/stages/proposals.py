@@ -20,7 +20,6 @@ from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import (
     FLOAT_TYPES,
-    RailReadings,
     find_quantity,
     find_rejection,
     is_of_drives,
@@ -154,11 +153,12 @@ def _propose_power(log: LogReader, free: Sequence[Topic], known: Profiles) -> It
         doubt = best.doubt or (f"{', '.join(rivals)} could be meant as well" if rivals else "")
         topics = [name for of in found for name in of.topics]
         names = {"topics": ", ".join(topics), **({"doubt": doubt} if doubt else {})}
-        used = dict.fromkeys(str(keys.get("topic", "")) for keys in best.sources)
-        recipe: dict[str, Keys | Sequence[Keys]] = {
-            "read.topics": {"power": [*(best.topics if "" in used else used)]},
-            "power_sources": best.sources,
-        }
+        used = list(dict.fromkeys(str(keys["topic"]) for keys in best.sources if "topic" in keys))
+        used = used or (
+            [*best.topics] if len(best.topics) > 1 else []
+        )  # one topic of a type that is known needs no name
+        chosen: dict[str, Keys | Sequence[Keys]] = {"read.topics": {"power": used}} if used else {}
+        recipe = {**chosen, "power_sources": best.sources}
         remedies = suggest("use", recipe) if best.sources else ()
         subject = Subject("role", "power")
         yield make_finding(
@@ -172,18 +172,17 @@ _THOUSANDTHS = {"voltage-in-millivolts": "voltage_scale", "current-in-milliamper
 def _judge_source(log: LogReader, topic: Topic, keys: Keys, numbers: dict[str, float]) -> Keys | None:
     """Return a power source with the factors that make its values plausible, and add their range to ``numbers``; None where none does."""
     made: dict[str, Any] = {**keys}
-    rails: list[RailReadings] | Finding = []
     columns = read_columns(log, topic.name, list_power_lists(topic.type_name, [PowerSource(**made)]))
     for _ in range(3):
-        rails = read_rails(columns, [PowerSource(**made)], topic.name) if columns else []
-        if isinstance(rails, Finding) or not rails:
+        found = read_rails(columns, [PowerSource(**made)], topic.name) if columns else []
+        if isinstance(found, Finding) or not found:
             return None
-        why = find_rejection(rails[0], topic.name, columns)
+        rail = found[0]
+        why = find_rejection(rail, topic.name, columns)
         scale = _THOUSANDTHS.get(why.names["reason"], "") if why else ""
-        if why is None or scale in {"", *made}:
+        if scale in {"", *made}:
             break
         made[scale] = 0.001
-    (rail,) = rails
     drawn = ("current_amp", "watt" if "power" in made else "amp")
     for values, unit in ((getattr(rail, name), unit) for name, unit in (("voltage_volt", "volt"), drawn)):
         known = values[np.isfinite(values)]

@@ -138,7 +138,7 @@ def followed(text, *, removing):
         (watts, ("power", "power_sources"), 0.03),
         (escs, (), 0.03),
         (vescs, (), 0.03),
-        (joints, ("power", "power_sources"), 0.1),
+        (joints, ("power_sources",), 0.1),
         (own_fixes, (), 0.03),
         (unplaced, ("gnss", "imu"), 0.03),
     ],
@@ -170,6 +170,8 @@ def test_inspect_preflight_and_init_propose_the_same(drive, tmp_path):
         first = lines.index("[read.topics]")
         block = parse_toml("\n".join(line for line in lines[first:] if line.startswith("[") or " = " in line))
         assert {name: block[name] for name in ("power_sources", "read")} == values
+    (tmp_path / "acme_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "acme_msgs" / "msg" / "Other.msg").write_text("float32 data\n")
     again = run("init", tmp_path, "--from", log, "--robot", "generic", "--msgdef", tmp_path)
     assert "nothing to do" in again.output
 
