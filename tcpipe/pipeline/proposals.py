@@ -70,7 +70,9 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
     tables = log.tables(list(dict.fromkeys([*used, *assigned.static_transforms])))
     lists = {name: list_power_lists(kind, known.power_sources) for name, kind in types.items()}
     columns = {name: make_message_arrays(tables[name], lists[name]) for name in used if name in tables}
-    frames = {cast("Role", used[name]): next(iter(count_frames(of, types[name])), "") for name, of in columns.items()}
+    frames: dict[Role, str] = {}
+    for name, of in columns.items():
+        frames.setdefault(cast("Role", used[name]), next(iter(count_frames(of, types[name])), ""))
     places = place_frames(log, tables, assigned, frames, config)
     head = ["", f"robot: {assigned.robot}, {assigned.robot_why}"]
     for role in assigned.roles.values():
@@ -85,14 +87,14 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
     lacking = [role for role in ("gnss", "imu", "wheel_odometry", "power", "command") if role not in decided]
     head += [f"not found: {', '.join(lacking)}"] if lacking else []
     lines = [*_iterate_questions(assigned, log)]
-    for of in proposals:
-        ranges = ", ".join(
-            f"{name.partition('_')[0]} {format_number(name, value)}"
-            for name, value in of.numbers.items()
-            if not name.endswith("_count")
-        )
-        for remedy in of.remedies:
-            lines += propose_lines(remedy.recipe, {**of.names, "power_sources": ranges}, of.names.get("doubt", ""))
+    for finding in proposals:
+        low = {
+            name[4:]: format_number(name, value) for name, value in finding.numbers.items() if name.startswith("low_")
+        }
+        ends = (f"{text} to {format_number(name, finding.numbers[f'high_{name}'])}" for name, text in low.items())
+        notes = {**finding.names, "power_sources": ", ".join(ends)}
+        for remedy in finding.remedies:
+            lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
     unplaced = [(role, frames[role]) for role, (_, by) in places.items() if by == "assumed"]
     return ProposedRecipe([*head, "", "These need no line."], [*lines, *propose_extrinsics(unplaced)], path)
 

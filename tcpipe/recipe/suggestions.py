@@ -135,10 +135,9 @@ def propose_extrinsics(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLi
         yield ProposedLine("read.extrinsics", role, {"xyz_m": [0.0, 0.0, 0.0], **turn}, note, is_certain=False)
 
 
-def format_first(values: Any) -> str:
-    """Return the first number of an array that is not zero, as a sample."""
-    known = [value for value in values.tolist() if isinstance(value, int | float) and isfinite(value)]
-    return f"{next((value for value in known if value), 0):.7g}"
+def format_first(values: Iterable[float]) -> str:
+    """Return the first number that is not zero, as a sample."""
+    return f"{next((value for value in map(float, values) if value and isfinite(value)), 0.0):.7g}"
 
 
 def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:

@@ -20,6 +20,7 @@ from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import (
     FLOAT_TYPES,
+    Columns,
     find_quantity,
     find_rejection,
     is_of_drives,
@@ -34,7 +35,6 @@ from tcpipe.robots import PowerSource, Profiles
 from tcpipe.stages.message_arrays import LogReader, make_message_arrays
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
-Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -58,7 +58,7 @@ def _is_free(topic: Topic, config: ReadConfig) -> bool:
     return readable and topic.name not in config.ignore_topics and not topic.name.startswith(OVERLAY)
 
 
-def read_columns(log: LogReader, topic: str, in_lists: Iterable[str] = ()) -> dict[str, NDArray[Any]]:
+def read_columns(log: LogReader, topic: str, in_lists: Iterable[str] = ()) -> Columns:
     """Return a topic's messages by field; {} where they cannot be decoded."""
     tables = log.tables([topic])
     return make_message_arrays(tables[topic], [*in_lists]) if topic in tables else {}
@@ -233,7 +233,7 @@ def _pair_rails(voltages: Sequence[Keys], currents: Sequence[Keys]) -> list[Keys
 
 def _find_own(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
     """Yield the messages of the user's own that hold voltage and current, or power; topics of a type that differ by side are summed."""
-    groups: dict[tuple[Any, ...], list[Topic]] = {}
+    groups: dict[tuple[str, tuple[str, ...]], list[Topic]] = {}
     for topic in own:
         groups.setdefault((topic.type_name, split_sides(topic.name)[0]), []).append(topic)
     for (type_name, _), group in groups.items():

@@ -163,16 +163,17 @@ def test_inspect_preflight_and_init_propose_the_same(drive, tmp_path):
     log = tmp_path / "run.mcap"
     write_mcap(log, escs(drive))
     told = [run(command, log).output for command in ("inspect", "preflight")]
-    run("init", tmp_path, "--from", log)
+    (tmp_path / "acme_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "acme_msgs" / "msg" / "Other.msg").write_text("float32 data\n")
+    call = ("init", tmp_path, "--from", log, "--robot", "generic", "--msgdef", tmp_path)
+    run(*call)
     values = parse_toml((tmp_path / "tcpipe.toml").read_text())
     for output in told:
         lines = [line.strip() for line in output.splitlines()]
         first = lines.index("[read.topics]")
         block = parse_toml("\n".join(line for line in lines[first:] if line.startswith("[") or " = " in line))
         assert {name: block[name] for name in ("power_sources", "read")} == values
-    (tmp_path / "acme_msgs" / "msg").mkdir(parents=True)
-    (tmp_path / "acme_msgs" / "msg" / "Other.msg").write_text("float32 data\n")
-    again = run("init", tmp_path, "--from", log, "--robot", "generic", "--msgdef", tmp_path)
+    again = run(*call)
     assert "nothing to do" in again.output
 
 
