@@ -16,12 +16,20 @@ from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES
+from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, list_number_fields
+from tcpipe.logs.fix_quality import find_quality
 from tcpipe.logs.messages import LOG_TIME, count_frames
 from tcpipe.logs.roles import TWIST, TWIST_STAMPED, RoleAssignment
 from tcpipe.power.sources import Columns, find_sources, list_power_lists, read_rails
 from tcpipe.recipe import ReadConfig, Recipe, Role
-from tcpipe.recipe.suggestions import ProposedLine, ProposedRecipe, format_first, propose_extrinsics, propose_lines
+from tcpipe.recipe.suggestions import (
+    ProposedLine,
+    ProposedRecipe,
+    format_first,
+    propose_extrinsics,
+    propose_lines,
+    propose_quality,
+)
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.proposals import find_proposals
@@ -95,6 +103,9 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
         notes = {**finding.names, "power_sources": ", ".join(ends)}
         for remedy in finding.remedies:
             lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
+        if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
+            fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
+            lines += [propose_quality("read.fields", "gnss.quality", of) for of in fields]
     unplaced = [(role, frames[role]) for role, (_, by) in places.items() if by == "assumed"]
     return ProposedRecipe([*head, "", "These need no line."], [*lines, *propose_extrinsics(unplaced)], path)
 

@@ -15,9 +15,17 @@ from tcpipe.formats.logs.table_log import read_cells, read_column_names
 from tcpipe.formats.object_storage import format_path
 from tcpipe.logs.expressions import split_unit
 from tcpipe.logs.field_mapping import MAPPED, STAMP_UNITS, match_field_names, parse_stamps_ns, read_fields
+from tcpipe.logs.fix_quality import find_quality
 from tcpipe.logs.power_fields import match_power_fields, match_sided_velocities
 from tcpipe.power.sources import RailReadings, find_rejection
-from tcpipe.recipe.suggestions import ProposedLine, ProposedRecipe, TomlValue, format_first, propose_extrinsics
+from tcpipe.recipe.suggestions import (
+    ProposedLine,
+    ProposedRecipe,
+    TomlValue,
+    format_first,
+    propose_extrinsics,
+    propose_quality,
+)
 from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, judge_fields
 
 Floats = NDArray[np.float64]
@@ -181,11 +189,14 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     keys: dict[str, tuple[TomlValue, str]] = {"role": ("power", "")} if name != role else {}
     keys |= {"file": (table.file, doubt), "stamp": (table.stamp, "")}
     keys |= {"stamp_unit": (table.stamp_unit, "by its steps")} if table.stamp_unit else {}
-    keys |= {f"columns.{of}": (text, format_first(values[of])) for of, text in mapped.items()}
+    samples = {of: "" if of == "quality" else format_first(values[of]) for of in mapped}
+    keys |= {f"columns.{of}": (text, samples[of]) for of, text in mapped.items()}
     head = f"tables.{name}"
     lines = [ProposedLine(head, key, value, note, is_certain=not doubt) for key, (value, note) in keys.items()]
     if mapped.get("angular_z", "").endswith(_OVER_TRACK):
         lines[-1] = replace(lines[-1], note="state the track width in place of 0.5 m", is_certain=False)
+    if role == "gnss" and "quality" not in mapped:
+        lines += [propose_quality(head, "columns.quality", of) for of in find_quality(table.names)]
     if role == "power" and set(mapped) == {"current"}:
         lines += [ProposedLine(head, of, volt, NO_VOLTAGE, is_certain=False) for of, volt in NOMINAL.items()]
     return lines
@@ -196,9 +207,11 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[s
     fields = read_fields("", role, columns, {}, table.names)
     if isinstance(fields, list):
         return {}
-    used = [column for of, _ in fields.values() for column, _ in of.operands()]
-    cells = read_cells(table.path, stamp=table.stamp, columns=used).columns
-    found = {name: factor * of.evaluate(lambda column, _: cells[column]) for name, (of, factor) in fields.items()}
+    used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
+    numbers = [column for name, named in used.items() if name != "quality" for column in named]
+    cells = read_cells(table.path, stamp=table.stamp, columns=numbers, words=used.get("quality", ()))
+    rows = len(cells.stamp)
+    found = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
     return {name: values for name, values in found.items() if np.isfinite(values).any()}
 
 

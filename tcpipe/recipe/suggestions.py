@@ -135,6 +135,12 @@ def propose_extrinsics(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLi
         yield ProposedLine("read.extrinsics", role, {"xyz_m": [0.0, 0.0, 0.0], **turn}, note, is_certain=False)
 
 
+def propose_quality(table: str, key: str, source: str) -> ProposedLine:
+    """Return the line of a fix quality whose codes no name states."""
+    note = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_common or words"
+    return ProposedLine(table, key, source, note, is_certain=False)
+
+
 def format_first(values: Iterable[float]) -> str:
     """Return the first number that is not zero, as a sample."""
     return f"{next((value for value in map(float, values) if value and isfinite(value)), 0.0):.7g}"

@@ -82,7 +82,7 @@ def _propose_roles(log: LogReader, free: Sequence[Topic], settled: set[str]) -> 
                     continue
                 mapped, doubt = judge_fields(role, found, {name: columns[of] for name, of in found.items()})
                 remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: mapped}})
-                names = {field: format_first(columns[of]) for field, of in found.items()}
+                names = {field: format_first(columns[of]) for field, of in found.items() if field != "quality"}
                 names |= {"role": role, "type": topic.type_name, **({"doubt": doubt} if doubt else {})}
                 yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
 

@@ -17,7 +17,7 @@ from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
 from tcpipe.store import Store
 
 ESC = "std_msgs/Header header\nfloat32 voltage\nfloat32 current\nint32 rpm\nfloat32 temperature\n"
-SOLUTION = "std_msgs/Header header\nfloat64 lat\nfloat64 lon\nfloat32 height\nuint8 num_sv\n"
+SOLUTION = "std_msgs/Header header\nfloat64 lat\nfloat64 lon\nfloat32 height\nuint8 quality\n"
 WHEELS = [f"{end}_{side}_wheel_joint" for end in ("front", "rear") for side in ("left", "right")]
 HUSKY = {"gnss": "[0.1, 0.0, 0.9]", "imu": "[0.05, -0.1, 0.3], rpy_rad = [3.1416, 0.0, 1.5708]"}
 """Where the simulated robot's sensors sit, as somebody would measure it."""
@@ -108,7 +108,8 @@ def own_fixes(drive):
     (fixes,) = (stream for stream in drive.messages if stream.topic == NAMES["gnss"])
     columns = {name: fixes.columns[name] for name in fixes.columns if name.startswith("header.stamp")}
     names = {"lat": "latitude", "lon": "longitude", "height": "altitude"}
-    columns |= {name: fixes.columns[of] for name, of in names.items()} | {"num_sv": np.full(fixes.log_time_ns.size, 14)}
+    columns |= {name: fixes.columns[of] for name, of in names.items()}
+    columns["quality"] = np.where(fixes.columns["status.status"] < 0, 0, 4).astype(np.uint8)
     frame = {"header.frame_id": fixes.constants["header.frame_id"]}
     own = MessageStream(
         "/rtk/solution", "acme_gnss/msg/Solution", fixes.log_time_ns, columns, frame, definition=SOLUTION
@@ -124,7 +125,7 @@ def followed(text, *, removing):
     """The recipe with the lines that a person edits, and how many these are."""
     lines, edited = text.splitlines(), 0
     for number, line in enumerate(lines):
-        key = re.match(r"# (\w+) = ", line)
+        key = re.match(r"# ([\w.]+) = ", line)
         if key and key[1] in removing:
             edited += 1
             place = HUSKY.get(key[1])
@@ -139,7 +140,7 @@ def followed(text, *, removing):
         (escs, (), 0.03),
         (vescs, (), 0.03),
         (joints, ("power_sources",), 0.1),
-        (own_fixes, (), 0.03),
+        (own_fixes, ("gnss.quality",), 0.03),
         (unplaced, ("gnss", "imu"), 0.03),
     ],
 )

@@ -115,7 +115,7 @@ def test_fau_and_borealtc_map_the_columns_that_are_published(tmp_path: Path) -> 
     fau, borealtc = (load_recipe(PIPELINES / f"{name}.toml") for name in ("fau", "borealtc"))
     fixes, seconds = (fau.tables[name] for name in ("gnss", "imu"))
     for table, head, row in (
-        (fixes, ",".join(("timestamp (ns)", *fixes.columns.values())), "26.37,-80.1,2.6,4"),
+        (fixes, "timestamp (ns),latitude (deg),longitude (deg),alt_msl (m),fix_quality", "26.37,-80.1,2.6,4"),
         (seconds, ",".join(("timestamp (ns)", "Power (w)", *seconds.columns.values())), "53.4" + ",0.1" * 10),
     ):
         path = tmp_path / table.file

@@ -149,8 +149,9 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
             problems.append(f"{where}.stamp: {mapping.file} has no column {stamp}; it has {', '.join(names)}")
         if isinstance(fields, list) or problems:
             return problems
-        used = [column for of, _ in fields.values() for column, _ in of.operands()]
-        cells = read_cells(path, stamp=stamp, columns=used)
+        used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
+        numbers = [column for name, columns in used.items() if name != "quality" for column in columns]
+        cells = read_cells(path, stamp=stamp, columns=numbers, words=used.get("quality", ()))
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
@@ -163,10 +164,8 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
     if empty:
         return empty
-    values = {
-        field: factor * np.broadcast_to(of.evaluate(lambda column, _: cells.columns[column]), len(cells.stamp))
-        for field, (of, factor) in fields.items()
-    }
+    rows = len(cells.stamp)
+    values = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
     source = mapping.make_power_source(name)
     read_as = find_topic(name, role, mapping.columns, source.type if source else None)
     return _read_messages((*read_as, role), mapping, cells, values, stamp_ns)
@@ -279,13 +278,16 @@ def read_column_names(path: Path) -> list[str]:
     return _scan(path).collect_schema().names()
 
 
-def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
-    """Read a column of stamps and columns of numbers; every other column is passed over. `LogError`: the file cannot be read as a table."""
-    wanted = list(dict.fromkeys(columns))
+def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[str] = ()) -> Cells:
+    """Read a column of stamps, columns of numbers and of ``words`` or numbers; every other column is passed over.
+
+    `LogError`: the file cannot be read as a table.
+    """
+    wanted = [name for name in dict.fromkeys(columns) if name not in words]
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            frame = _collect_columns(path, [stamp, *(name for name in wanted if name != stamp)], numbers=wanted)
+            frame = _collect_columns(path, [*dict.fromkeys([stamp, *wanted, *words])], numbers=wanted)
             stamps = frame[stamp]
             stamps = _parse_times(stamps) if stamps.dtype == pl.String else stamps
             if is_time := stamps.dtype.is_temporal():
@@ -302,7 +304,8 @@ def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
         made.fill_null(0).to_numpy(),
         (made.is_not_null() & made.is_finite()).to_numpy() if not whole else made.is_not_null().to_numpy(),
         is_time,
-        {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()},
+        {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()}
+        | {name: frame[name].to_numpy() for name in words},
         texts,
         tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in said)),
     )
