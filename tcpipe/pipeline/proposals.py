@@ -39,7 +39,7 @@ from tcpipe.tables.findings import Finding
 
 if TYPE_CHECKING:
     from tcpipe.formats.logs.log_file import Log
-    from tcpipe.formats.logs.table_log import TableLog
+    from tcpipe.formats.logs.message_tables import TableLog
 
 
 def propose_recipe(
