@@ -271,6 +271,8 @@ class SampleConfig:
     """Smallest share of valid pixels of a patch."""
     max_position_std_m: Deviation = 0.10
     """Largest standard deviation of the absolute position of a sample [m]."""
+    align: bool = False
+    """Whether each run is moved by the shift at which its heights fit the map's ground; its σ counts in max_position_std_m."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "sample")
