@@ -77,7 +77,7 @@ def _add_windows(recipe: Recipe, path: Path) -> Recipe:
         cells = {str(name).strip(): str(value).strip() for name, value in row.items() if value}
         given = {name: value if name == "run" else _read_cell(value) for name, value in cells.items() if value}
         windows.append(from_values(TimeWindow, given, where=f"{file}, line {number}"))
-    return replace(recipe, mask=replace(recipe.mask, windows=windows, windows_csv=""))
+    return replace(recipe, mask=replace(recipe.mask, windows=windows, windows_csv=None))
 
 
 def _read_cell(text: str) -> float | str:

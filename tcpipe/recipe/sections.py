@@ -218,7 +218,7 @@ class MaskConfig:
     """A section is a gap where the standard deviation of the distance over one chord exceeds this [m]."""
     windows: list[TimeWindow] = field(default_factory=list, metadata=LEFT_OUT)
     """Spans of runs that are kept or dropped, as {run = "farm_*", action = "drop", start = 0, end = 30}."""
-    windows_csv: str = field(default="", metadata=LEFT_OUT)
+    windows_csv: str | None = field(default=None, metadata=LEFT_OUT)
     """More of them: a CSV file beside the recipe, with columns run, action, start, end."""
 
     def __post_init__(self) -> None:

@@ -107,7 +107,7 @@ class PowerSource:
     """Field of the current [A]; omit it if the message contains only a voltage, or a counter."""
     energy: str = ""
     """Field of a counter of energy, in place of a current, for example drawn - given_back."""
-    power: str = field(default="", metadata=LEFT_OUT)
+    power: str = field(default="", metadata={"json": ("",)})
     """Field of the power [W], in place of a current; needs no voltage."""
     voltage_scale: Scale = 1.0
     """Factor on the voltage: 0.001 if it is in millivolts."""
