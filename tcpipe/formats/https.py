@@ -47,6 +47,14 @@ class HttpsClient:
                 "if you trust it, add it to hosts in the TOML file that you give with --stac"
             )
 
+    def check_left(self, url: str, wanted_bytes: int) -> None:
+        """Raise `MapError` where so many bytes more are too many."""
+        if wanted_bytes > self.left_bytes:
+            raise MapError(
+                f"{url}: would be {wanted_bytes / 1e6:.3g} MB, {self.left_bytes / 1e6:.3g} of {self._most_bytes / 1e6:g} MB a command "
+                "are left; name fewer runs with --around, or a smaller --margin"
+            )
+
     def get(self, url: str, *, most: int, span: tuple[int, int] | None = None) -> tuple[bytes, HTTPMessage]:
         """Return the body of a URL, or its bytes from first to last, and the head of the reply; a failed request is made three times.
 
@@ -58,6 +66,7 @@ class HttpsClient:
         for pause_s in _PAUSES_S:
             try:
                 self.check_url(url)
+                self.check_left(url, most)
                 with self._opener.open(Request(url, headers=headers), timeout=_SILENT_S) as reply:  # noqa: S310  checked
                     if span and reply.status != 206:
                         remedy = "download it and give it with --height or --ortho"
@@ -77,15 +86,12 @@ class HttpsClient:
 
     def _read(self, reply: Any, url: str, most: int) -> bytes:
         deadline_s, data = time.monotonic() + _REQUEST_S, b""
-        most = min(most, self.left_bytes)
         while len(data) <= most and (piece := reply.read1(_PIECE_BYTES)):
             data += piece
             if time.monotonic() > deadline_s:
                 raise TimeoutError(f"{len(data)} bytes in {_REQUEST_S:g} s")
         if len(data) > most:
-            raise MapError(
-                f"{url}: more than {most / 1e6:.3g} MB, of {self._most_bytes / 1e6:g} MB in all that one command may read; name fewer runs"
-            )
+            raise MapError(f"{url}: sends more than {most} bytes, expected at most these; it is no such file")
         if reply.length:
             raise HTTPException(f"ended after {len(data)} of {len(data) + reply.length} bytes")
         self.left_bytes -= len(data)
