@@ -207,7 +207,7 @@ def refuse(server, url, path, match, **how):
         ("cut", "ended after 32768 of 65536 bytes"),
         ("http://localhost/x.tif", "http://localhost/x.tif: expected an https:// URL"),
         ("https://other.example/x.tif", r"is on other.example, which the catalogue's entry does not name \(localhost:"),
-        ("file:///etc/passwd", "HTTP Error 302"),
+        ("file:///etc/passwd", "file:///etc/passwd: expected an https:// URL"),
         ("https://127.0.0.1/x.tif", "is on 127.0.0.1, which the catalogue's entry does not name"),
         ("https://localhost@169.254.169.254/x", "does not name"),
         ([None, "changing"], r"asked for bytes \d+ to \d+, got \d+ .* run the command again"),
