@@ -11,7 +11,7 @@ from tcpipe.formats.maps.open_data import Item, choose_newest, make_area
 
 
 @given(lat=st.floats(-65, 65), margin_m=st.floats(5, 500), seed=st.integers(0, 99))
-def test_the_margin_is_right_to_one_per_cent(lat, margin_m, seed):
+def test_the_margin_is_right_to_two_per_cent(lat, margin_m, seed):
     walk = np.cumsum(np.random.default_rng(seed).normal(size=(30, 2)), axis=0) * 1e-5
     track = np.array([7.4, lat]) + walk
     area = make_area([track], margin_m)
@@ -19,7 +19,7 @@ def test_the_margin_is_right_to_one_per_cent(lat, margin_m, seed):
     for x, y in shapely.get_coordinates(area.exterior)[:-1:7]:
         points = shapely.get_coordinates(shapely.segmentize(line, 1e-6))
         distance_m = geod.inv(*np.broadcast_arrays(x, y, *points.T))[2].min()
-        assert distance_m == pytest.approx(margin_m, abs=0.01 * margin_m + 0.6)  # 0.5 m: the track is simplified
+        assert distance_m == pytest.approx(margin_m, abs=0.02 * margin_m + 0.6)  # 0.5 m: the track is simplified
 
 
 boxes = st.tuples(st.integers(0, 8), st.integers(0, 8), st.integers(1, 6), st.integers(1, 6), st.integers(2015, 2026))
