@@ -104,9 +104,9 @@ class GateReset:
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """A change that explains a contradiction: its kind (a key of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
+    """A change that explains a contradiction: its kind (``varies``: the scale, or in `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
 
-    ``size``: median innovation of fixes there [m]; 0 of another sensor.
+    ``size``: median innovation of fixes there [m]; σ of a scale that varies [1]; 0 of other changes.
     """
 
     kind: str
