@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.power.noise import compute_median_period_s
-from tcpipe.power.rails import Rail, Samples
+from tcpipe.power.rails import Rail, Samples, is_power_only
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.facts import EnergyBudget
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
@@ -267,7 +267,7 @@ def touches_voltage_outside(
     """Return the spans that touch a voltage sample outside the range [V], shape (M,); none without a range."""
     outside = np.zeros(len(start_ns), dtype=np.bool_)
     low, high = range_volt or (-np.inf, np.inf)
-    for voltage in (rail.voltage for rail in rails):
+    for voltage in (rail.voltage for rail in rails if not is_power_only(rail.voltage.value)):
         bad = np.concatenate(([0], np.cumsum((voltage.value < low) | (voltage.value > high))))
         first = np.maximum(np.searchsorted(voltage.stamp_ns, start_ns, side="right") - 1, 0)
         last = np.minimum(np.searchsorted(voltage.stamp_ns, end_ns, side="left") + 1, len(voltage.value))

@@ -209,7 +209,8 @@ def load_shipped_profiles() -> Profiles:
 
 def load_profiles(recipe: Recipe | IngestSections) -> Profiles:
     """Return what a recipe knows, and beyond that the package."""
-    return Profiles(recipe.robots, recipe.power_sources).before(load_shipped_profiles())
+    of_tables = [of for name, table in recipe.tables.items() if (of := table.make_power_source(name))]
+    return Profiles(recipe.robots, [*recipe.power_sources, *of_tables]).before(load_shipped_profiles())
 
 
 _MOST_DOTS = 1000

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs import roles
+from tcpipe.logs.expressions import FORM, Expression, ExpressionError, parse_expression, split_unit
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
@@ -25,6 +27,7 @@ from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
+Columns = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +86,12 @@ MAPPED: dict[str, dict[str, MappedField]] = {
     },
     "wheel_odometry": _ODOMETRY,
     "visual_odometry": _ODOMETRY,
-    "power": {"voltage": MappedField("voltage", "V"), "current": MappedField("current", "A")},
+    "power": {
+        "voltage": MappedField("voltage", "V"),
+        "current": MappedField("current", "A"),
+        "power": MappedField("power", "W"),
+        "energy": MappedField("energy", "J"),
+    },
     "command": {
         **_map_vector("linear", "twist.linear", "m/s", needed="x"),
         **_map_vector("angular", "twist.angular", "rad/s"),
@@ -107,22 +115,23 @@ MAPPED_TYPES = {
 UNITS: dict[str, dict[str, float]] = {
     "deg": {"deg": 1.0, "rad": 180.0 / np.pi, "1e-7 deg": 1e-7},
     "m": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
-    "m/s": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "mph": 0.44704},
+    "m/s": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600},
     "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
-    "m/s2": {"m/s2": 1.0, "g": 9.80665},
+    "m/s2": {"m/s2": 1.0, "g": 9.80665, "mg": 0.00980665},
     "V": {"V": 1.0, "mV": 0.001},
     "A": {"A": 1.0, "mA": 0.001},
+    "W": {"W": 1.0, "mW": 0.001, "kW": 1000.0},
+    "J": {"J": 1.0, "kJ": 1000.0, "mWh": 3.6, "Wh": 3600.0, "kWh": 3.6e6},
     "1": {"1": 1.0},
 }
 """What one of a unit is in the field's own."""
 
-_NS_OF = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+STAMP_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+"""What one of a unit of stamps is in [ns]."""
 _YEARS_S = (3e8, 1e10)
 """Seconds since 1970 from 1979 to 2286: what a stamp is told its unit by."""
 _LEAPS = ((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18))
 """From when [s since 1970] GPS time is how far ahead of UTC [s] (IERS Bulletin C)."""
-
-_SOURCE = re.compile(r"\s*+([\w.]++)(?:\[(\d++)\])?\s*+(?:\*\s*+([-+.\w]++)\s*+)?")
 
 
 def find_mapping_problems(
@@ -137,8 +146,8 @@ def find_mapping_problems(
         yield f"{where}.columns: {role} has no {', '.join(unknown)}; it has {', '.join(known)}"
     if missing := [name for name, field in known.items() if field.needed and name not in columns]:
         yield f"{where}.columns: {role} needs {', '.join(missing)}"
-    if role == "power" and not columns:
-        yield f"{where}.columns: power needs voltage, current or both"
+    if role == "power" and len({"current", "power", "energy"} & set(columns)) != 1 and set(columns) != {"voltage"}:
+        yield f"{where}.columns: power needs one of current, power and energy, or a voltage, or one with a voltage"
     for name, unit in units.items():
         if name not in columns:
             yield f"{where}.units: {name} is not in columns"
@@ -146,10 +155,49 @@ def find_mapping_problems(
             yield f"{where}.units: {name} is in {unit!r}; expected one of {', '.join(UNITS[known[name].unit])}"
 
 
-def convert_units(role: str, values: Mapping[str, Floats], units: Mapping[str, str]) -> dict[str, Floats]:
-    """Return values in the units of their fields."""
-    factors = {name: UNITS[MAPPED[role][name].unit][unit] for name, unit in units.items()}
-    return {name: value * factors[name] if factors.get(name, 1.0) != 1.0 else value for name, value in values.items()}
+def read_fields(
+    where: str, role: str, columns: Mapping[str, str], units: Mapping[str, str], known: Collection[str]
+) -> dict[str, tuple[Expression, float]] | list[str]:
+    """Return by field the expression that the recipe gives it and the factor to its unit, or every problem.
+
+    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none.
+    """
+    found: dict[str, tuple[Expression, float]] = {}
+    problems: list[str] = []
+    for name, text in columns.items():
+        place = f"{where}.{name}"
+        try:
+            expression = parse_expression(text, known)
+        except ExpressionError:
+            held = ", ".join(known)
+            problems.append(f'{place} is "{text}", and there is no such column; expected {FORM}; there are {held}')
+            continue
+        if lacking := dict.fromkeys(column for column, _ in expression.operands() if column not in known):
+            problems.append(f"{place}: there is no column {', '.join(lacking)}; there are {', '.join(known)}")
+        elif name == "voltage" and not expression.operands():
+            problems.append(f"{place} is the constant {text}; state nominal_voltage_volt, which has an uncertainty")
+        else:
+            factor = _choose_factor(MAPPED[role][name].unit, expression.column, units.get(name))
+            if isinstance(factor, str):
+                problems.append(f"{place}: {factor}")
+            else:
+                found[name] = expression, factor
+    return problems or found
+
+
+def _choose_factor(unit: str, column: str | None, stated: str | None) -> float | str:
+    """Return what one of a column's unit is in a field's, or what is unclear about that."""
+    _, named, in_brackets = split_unit("" if stated or column is None else column)
+    if unit == "1" or (stated or named) is None:
+        return 1.0
+    factor = UNITS[unit].get(stated or named or "")
+    if factor is None and (in_brackets or len(named or "") > _CLEARLY_A_UNIT):
+        return f"the column is called {column}, and {unit} are expected; state its unit under units: {', '.join(UNITS[unit])}"
+    return 1.0 if factor is None else factor
+
+
+_CLEARLY_A_UNIT = 2
+"""Characters: what is shorter at the end of a name may be something else."""
 
 
 def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, NDArray[Any]]:
@@ -176,9 +224,7 @@ def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> d
     return made | _collect_other_fields(role, values, made, rows)
 
 
-def _collect_other_fields(
-    role: str, values: Mapping[str, Floats], made: Mapping[str, NDArray[Any]], rows: int
-) -> dict[str, NDArray[Any]]:
+def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, NDArray[Any]]:
     """Return the fields of a role's message that no mapping names."""
     if role == "gnss":
         status = made["status.status"]
@@ -192,9 +238,14 @@ def _collect_other_fields(
     return {"orientation_covariance": np.full((rows, 9), -1.0)} if unoriented else {}
 
 
-def find_topic(name: str, role: str, columns: Mapping[str, str]) -> tuple[str, str]:
-    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, told by the name."""
-    if role != "power" or len(columns) == 2:
+def find_topic(name: str, role: str, columns: Collection[str], power_type: str | None) -> tuple[str, str]:
+    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, told by the name.
+
+    ``power_type`` is that of a source that the recipe makes of the table.
+    """
+    if power_type is not None:
+        return f"/{name}", power_type
+    if role != "power" or len(columns) != 1:
         return f"/{name}", MAPPED_TYPES[role]
     (alone,) = columns
     return f"/{name}" if find_quantity(name) == alone else f"/{name}/{alone}", FLOAT_TYPES[1]
@@ -207,11 +258,11 @@ def parse_stamps_ns(values: NDArray[Any], unit: str) -> NDArray[np.int64] | str:
     """
     if unit == "auto":
         middle = float(np.median(values)) if values.size else 0.0
-        fitting = [name for name, ns in _NS_OF.items() if _YEARS_S[0] < middle * ns / 1e9 < _YEARS_S[1]]
+        fitting = [name for name, ns in STAMP_UNITS.items() if _YEARS_S[0] < middle * ns / 1e9 < _YEARS_S[1]]
         if not fitting:
-            return f"its stamps ({middle:.12g}) do not count from 1970; set their unit, one of {', '.join(_NS_OF)}"
+            return f"its stamps ({middle:.12g}) do not count from 1970; set their unit, one of {', '.join(STAMP_UNITS)}"
         unit = fitting[0]
-    factor = _NS_OF[unit]
+    factor = STAMP_UNITS[unit]
     if np.issubdtype(values.dtype, np.integer):
         return np.asarray(values, np.int64) * factor
     whole: Floats = np.floor(values)
@@ -227,9 +278,7 @@ def utc_from_gps_ns(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def make_mapped_message(
-    role: str, columns: Mapping[str, NDArray[Any]], fields: Mapping[str, str]
-) -> dict[str, NDArray[Any]] | list[str]:
+def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, NDArray[Any]] | list[str]:
     """Return a custom message's columns as those of the message that a role usually has, or what is wrong with the mapping.
 
     Parameters
@@ -237,35 +286,22 @@ def make_mapped_message(
     columns : the custom message's fields by dotted name, and its log time.
     fields : by short name the field it is taken from: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
     """
-    problems = list(find_mapping_problems(f"recipe read.fields.{role}", role, fields, {}))
+    where = f"recipe read.fields.{role}"
+    problems = list(find_mapping_problems(where, role, fields, {}))
+    known = [field for field in columns if not field.endswith("time_ns")]
+    mapped = {name: text for name, text in fields.items() if name in MAPPED[role]}
+    found = read_fields(where, role, mapped, {}, known)
+    if isinstance(found, list):
+        return problems + found
+    rows = len(columns["log_time_ns"])
     values: dict[str, Floats] = {}
-    for name, text in fields.items():
-        found = _SOURCE.fullmatch(text)
-        try:
-            factor = float(found[3]) if found and found[3] else 1.0
-        except ValueError:
-            found = None
-        if found is None:
-            problems.append(
-                f'recipe read.fields.{role}.{name} is "{text}"; expected a field, as "pvt.lat" or "lat * 1e-7"'
-            )
-        elif found[1] not in columns or (columns[found[1]].ndim == 2) != (found[2] is not None):
-            held = ", ".join(field for field in columns if not field.endswith("time_ns"))
-            problems.append(
-                f"recipe read.fields.{role}.{name} names {text}, which its messages do not have; they have {held}"
-            )
-        elif not np.issubdtype(columns[found[1]].dtype, np.number):
-            problems.append(f"recipe read.fields.{role}.{name} names {text}, which is text; expected numbers")
-        elif found[2] is not None and int(found[2]) >= columns[found[1]].shape[1]:
-            problems.append(
-                f"recipe read.fields.{role}.{name} names {text}; the list has {columns[found[1]].shape[1]} elements"
-            )
-        else:
-            value = columns[found[1]] if found[2] is None else columns[found[1]][:, int(found[2])]
-            values[name] = value.astype(np.float64) * factor
+    for name, (expression, factor) in found.items():
+        unfit = [why for of in expression.operands() if (why := _find_misfit(columns[of[0]], *of))]
+        problems += [f"{where}.{name}: {why}" for why in unfit]
+        if not unfit:
+            values[name] = factor * np.broadcast_to(expression.evaluate(partial(_read_column, columns)), rows)
     if problems:
         return problems
-    rows = len(columns["log_time_ns"])
     stamps = {
         name: columns.get(name, np.zeros(rows, np.int64)) for name in ("header.stamp.sec", "header.stamp.nanosec")
     }
@@ -273,7 +309,18 @@ def make_mapped_message(
     return own | stamps | make_message_fields(role, values, rows)
 
 
-_ANY_UNIT = re.compile(r"(?<!\s)\s*+[\[(].*|_?(deg|rad|m|mps2?|radps|volt|amp)$")
+def _find_misfit(values: NDArray[Any], name: str, index: int | None) -> str | None:
+    """Return why a field of a message is no number a message."""
+    if not np.issubdtype(values.dtype, np.number):
+        return f"{name} is text; expected numbers"
+    if values.ndim == 2 and (index is None or index >= values.shape[1]):
+        return f"{name} is a list of {values.shape[1]} elements; expected one of them, as {name}[0]"
+    return f"{name} is no list" if values.ndim == 1 and index is not None else None
+
+
+def _read_column(columns: Columns, name: str, index: int | None) -> Floats:
+    values = columns[name] if index is None else columns[name][:, index]
+    return values.astype(np.float64)
 
 
 def _match_axes(before: str, name: str) -> dict[str, str]:
@@ -317,7 +364,7 @@ def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     """Return the name of each field of a role; {} where one is missing that the role needs."""
     found: dict[str, str] = {}
     for field, pattern in CALLED[role].items():
-        match = next((name for name in names if re.fullmatch(pattern, _ANY_UNIT.sub("", name.lower()))), None)
+        match = next((name for name in names if re.fullmatch(pattern, split_unit(name)[0].lower())), None)
         if match is not None and match not in found.values():
             found[field] = match
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}

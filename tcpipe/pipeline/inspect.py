@@ -16,7 +16,7 @@ from tcpipe.formats.bucket_directories import fetch_directory_by_range, has_card
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.logs.log_file import is_log_file, list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
-from tcpipe.formats.logs.table_folders import find_table_folders, list_table_files
+from tcpipe.formats.logs.table_folders import find_table_logs, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
@@ -175,7 +175,7 @@ def _inspect_logs_or_tables(
 ) -> InspectedLog | InspectedLogs | InspectedTables:
     if not path.is_dir():
         return ask(path)
-    logs = [*list_logs_below(path), *find_table_folders(path, recipe.tables)]
+    logs = [*list_logs_below(path), *(files[0] for files in find_table_logs(path, recipe.tables))]
     if logs or not (tables := list_table_files(path)):
         return _inspect_logs_at(logs, path, ask)
     return propose_tables(path, tables)

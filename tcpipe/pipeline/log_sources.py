@@ -18,7 +18,7 @@ from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, find_logs, is_log_file, list_logs_below
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
-from tcpipe.formats.logs.table_folders import Mappings, find_table_folders, list_table_files
+from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -66,6 +66,8 @@ class LogSource:
         path = self.paths[0]
         suffix = next((end for end in sorted(LOG_SUFFIXES, key=len, reverse=True) if path.name.endswith(end)), "")
         stem = path.name if path.is_dir() else path.name.removesuffix(suffix)
+        if is_table(path.name) and not path.is_dir():
+            stem = f"{path.parent.name}_{path.stem}"
         return clean_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")
 
     @property
@@ -127,9 +129,9 @@ def find_sources(
     """Return the logs at or below the given paths.
 
     With ``as_one`` they are all parts of one. For what lies in object storage there are stand-ins in ``staging``. A folder that holds one
-    of the files of ``tables`` is a log.
+    of the files of ``tables`` is a log; where their names have a ``*``, the files of each run are one.
     """
-    paths: dict[str, tuple[Path, str]] = {}
+    paths: dict[str, list[tuple[Path, str]]] = {}
     urls: dict[Path, str] = {}
     queries: dict[Path, str] = {}
     problems: dict[str, tuple[str, ...]] = {}
@@ -143,18 +145,20 @@ def find_sources(
                 urls.update(remote)
                 queries.update(dict.fromkeys(remote, query))
                 for path, url in remote.items():
-                    paths.setdefault(str(path), (path, url.removeprefix(above_url.rstrip("/")).lstrip("/") or url))
+                    place = url.removeprefix(above_url.rstrip("/")).lstrip("/") or url
+                    paths.setdefault(str(path), [(path, place)])
             else:
                 above = Path(entry)
-                for path in _find_logs_at(above, tables or {}):
-                    paths.setdefault(_resolve_path(path, folders), (_as_named(path), _place_in(path, above)))
+                for files in _find_logs_at(above, tables or {}):
+                    found = [(_as_named(path), _place_in(path, above)) for path in files]
+                    paths.setdefault(_resolve_path(files[0], folders), found)
         except LogError as error:
             problems[format_path(entry)] = error.problems
             transient |= is_transient(error)
-    for part, line in _find_lone_parts([path for path, _ in paths.values()], together=as_one):
+    for part, line in _find_lone_parts([found[0][0] for found in paths.values()], together=as_one):
         problems[str(part)] = (line,)
-        paths = {real: found for real, found in paths.items() if found[0] != part}
-    groups = [tuple(sorted(paths.values()))] if as_one and paths else [(found,) for found in paths.values()]
+        paths = {real: found for real, found in paths.items() if found[0][0] != part}
+    groups = [sorted(part for found in paths.values() for part in found)] if as_one and paths else [*paths.values()]
     sources = tuple(
         LogSource(
             tuple(path for path, _ in group),
@@ -168,13 +172,12 @@ def find_sources(
     return FoundLogs(sources, problems, transient)
 
 
-def _find_logs_at(path: Path, tables: Mappings) -> list[Path]:
-    """Return the logs at or below a path, folders of mapped tables among them; `LogError` where there is none."""
-    folders = find_table_folders(path, tables) if tables and path.is_dir() else []
-    if folders:
-        return [*list_logs_below(path), *folders]
+def _find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
+    """Return the files of each log at or below a path, mapped tables among them; `LogError` where there is none."""
+    if of_tables := find_table_logs(path, tables) if tables else []:
+        return [*((log,) for log in (list_logs_below(path) if path.is_dir() else ())), *of_tables]
     try:
-        return find_logs(path)
+        return [(log,) for log in find_logs(path)]
     except LogError as error:
         if tables and path.is_dir():
             files = ", ".join(mapping.file for mapping in tables.values())

@@ -99,6 +99,8 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
     if len(stamp_ns) < _FEWEST_SAMPLES:
         return None
     values = [interpolate_rail(each, stamp_ns) for each in known]
+    if all(np.ptp(of[0]) == 0.0 for of in values):  # nobody measured a voltage
+        return None
     volt, amp = np.mean([of[0] for of in values], axis=0), np.sum([of[1] for of in values], axis=0)
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
     volt, amp = (of - _compute_moving_mean(of, rows) for of in (volt, amp))

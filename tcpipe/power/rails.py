@@ -40,6 +40,15 @@ class Samples:
     value: Floats
 
 
+UNIT_VOLT = 1.0
+"""Voltage of a rail of which only the power is known: its current then is the power in watts."""
+
+
+def is_power_only(voltage_volt: Floats) -> bool:
+    """Return whether a rail's voltages [V] say that only its power is known."""
+    return bool(len(voltage_volt)) and bool(np.all(voltage_volt == UNIT_VOLT))
+
+
 @dataclass(frozen=True, slots=True)
 class Rail:
     """One drive rail in one clock epoch: its samples, and both signals on the union of their stamps where both are known.
@@ -119,6 +128,7 @@ def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tu
     """Return mean voltage [V], summed current [A] and summed power [W] at each stamp, each of shape (M,).
 
     NaN without rails, and where any rail's voltage or current has no sample on both sides within max(3 of its periods, ``max_gap_ns``).
+    Voltage and current are NaN, too, where only the power of a rail is known.
     """
     if not rails:
         return (np.full(at_ns.size, np.nan),) * 3
@@ -134,7 +144,8 @@ def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tu
     power = voltage * current
     known = np.isfinite(power).all(0)
     volt, amp, watt = voltage.mean(0), current.sum(0), power.sum(0)
-    return np.where(known, volt, np.nan), np.where(known, amp, np.nan), np.where(known, watt, np.nan)
+    told = known & (not any(is_power_only(each.voltage.value) for each in rails))
+    return np.where(told, volt, np.nan), np.where(told, amp, np.nan), np.where(known, watt, np.nan)
 
 
 def _interpolate_known(signal: Samples, at_ns: Stamps, *, averaged: bool, max_gap_ns: int) -> Floats:

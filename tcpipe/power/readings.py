@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
-    LARGEST_AMP,
     REJECTED,
     Columns,
     Floats,
@@ -109,7 +108,7 @@ def read_power(
         return PowerReadings(findings=of_sign)
     includes = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
-    findings += [*of_sign, *odd, *loads]
+    findings += [*of_sign, *odd, *loads, *_find_nominal(sources)]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(of.energy for of in sources)
     unknown = any(of.averaging_unknown for of in sources) and not counts
@@ -122,12 +121,27 @@ def read_power(
         tuple(dict.fromkeys(findings)),
         told_by,
         includes,
-        gain_std_fraction=max(of.gain_std_fraction for of in sources),
-        offset_std_amp=max(of.offset_std_amp for of in sources),
+        gain_std_fraction=max(
+            float(
+                np.hypot(
+                    of.gain_std_fraction, 0.0 if of.nominal_voltage_volt is None else of.nominal_voltage_std_fraction
+                )
+            )
+            for of in sources
+        ),
+        offset_std_amp=max(of.offset_std_watt if of.lacks_voltage else of.offset_std_amp for of in sources),
         rest_current_amp=(min(of[0] for of in rest), max(of[1] for of in rest))
         if rest and len(rest) == sum(bool(of.current or of.energy) for of in sources)
         else None,
     )
+
+
+def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
+    """Yield the finding that a voltage is assumed."""
+    for of in sources:
+        if (volt := of.nominal_voltage_volt) is not None:
+            names, fraction = {"rail": of.rail or of.topic or of.type}, of.nominal_voltage_std_fraction
+            yield make_finding("voltage-assumed", _POWER, names=names, voltage_volt=volt, std_fraction=fraction)
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,13 +274,13 @@ def _exclude_implausible(rails: Rails) -> tuple[dict[str, list[RailReadings]], l
             usual = float(np.median(known)) if known.size else np.nan
             low_volt, high_volt = usual * low, usual * high
             odd_volt = ((rail.voltage_volt < low_volt) & (rail.current_amp != 0.0)) | (rail.voltage_volt > high_volt)
-            odd_amp = np.abs(rail.current_amp) > LARGEST_AMP
+            odd_amp = np.abs(rail.current_amp) > rail.largest_amp
             counts: dict[str, Any] = {
                 "voltages_count": int(np.count_nonzero(odd_volt)),
                 "currents_count": int(np.count_nonzero(odd_amp)),
             }
             if any(counts.values()):
-                numbers = counts | {"low_volt": low_volt, "high_volt": high_volt, "high_amp": LARGEST_AMP}
+                numbers = counts | {"low_volt": low_volt, "high_volt": high_volt, "high_amp": rail.largest_amp}
                 numbers = {name: value for name, value in numbers.items() if np.isfinite(value)}
                 findings.append(make_finding(_ODD, _POWER, names={"rail": rail.name}, **numbers))
             volt, amp = np.where(odd_volt, np.nan, rail.voltage_volt), np.where(odd_amp, np.nan, rail.current_amp)

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
@@ -41,6 +42,11 @@ class RailReadings:
     voltage_volt: Floats
     current_amp: Floats
     counter: Counter | None = None
+
+    @property
+    def largest_amp(self) -> float:
+        """The largest plausible current [A]; where only power is known, the largest power [W]."""
+        return LARGEST_AMP * (_LARGEST_PER_VOLT if is_power_only(self.voltage_volt) else 1.0)
 
 
 BATTERY_STATE = "sensor_msgs/msg/BatteryState"
@@ -79,7 +85,7 @@ def find_sources(
 
 def list_power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
     """Return the columns inside lists of messages that a type's tables name, as drivers[].current."""
-    texts = [text for of in known if of.type == type_name for text in (of.voltage, of.current, of.energy)]
+    texts = [text for of in known if of.type == type_name for text in (of.voltage, of.current, of.power, of.energy)]
     return frozenset(of.column for text in texts for of in parse_fields(text) if "[]." in of.column)
 
 
@@ -153,7 +159,8 @@ def read_rails(
 def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Sequence[PowerSource]) -> Finding | None:
     """Return why messages do not fit a source."""
     currents = parse_fields(source.current)
-    for of in [*parse_fields(source.voltage), *currents, *parse_fields(source.energy)]:
+    others = (source.voltage, source.power, source.energy)
+    for of in [*currents, *(of for text in others for of in parse_fields(text))]:
         names = {"field": of.column}
         if of.column not in columns:
             return reject_power(topic, "field-missing", names=names)
@@ -163,8 +170,8 @@ def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Seque
         needed = of.index + 1 if of.index is not None else int(of.every)
         listed = source.currents_listed if of in currents else None
         if (needed and (width or 0) < needed) or listed not in (None, width):
-            others = [by for by in known if width and by.type == source.type and by.currents_listed == width]
-            if platforms := sorted({by.platform for by in others if by.platform}):
+            fitting = [by for by in known if width and by.type == source.type and by.currents_listed == width]
+            if platforms := sorted({by.platform for by in fitting if by.platform}):
                 names["platforms"] = ", ".join(platforms)
             counts = {"values_count": width or 0, "expected_count": listed or needed}
             return reject_power(topic, "values-count-differs", names=names, **counts)
@@ -174,11 +181,16 @@ def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Seque
 def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReadings:
     name = source.rail or (make_rail_name(topic) if source.type in FLOAT_TYPES else topic)
     voltage = source.voltage_scale * _sum_fields(columns, parse_fields(source.voltage))
+    if not source.voltage and (source.lacks_voltage or source.nominal_voltage_volt is not None):
+        voltage = np.full(len(voltage), UNIT_VOLT if source.lacks_voltage else source.nominal_voltage_volt)
     if source.energy:
         parts = [(of.sign * source.energy_scale, _read_values(columns, of)) for of in parse_fields(source.energy)]
         counter = count_energy(parts, wraps=source.counter_wraps)
         return RailReadings(name, voltage, counter.mean_amp(_choose_stamps(columns), voltage), counter)
     current = source.current_scale * _sum_fields(columns, parse_fields(source.current))
+    if source.power:
+        watt = source.current_scale * _sum_fields(columns, parse_fields(source.power))
+        current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
         current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)
     return RailReadings(name, voltage, current)
@@ -224,7 +236,7 @@ def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding 
     voltage, current = (values[np.isfinite(values)] for values in (rail.voltage_volt, rail.current_amp))
     volt = float(np.median(voltage)) if len(voltage) else np.nan
     amp = float(np.median(np.abs(current))) if len(current) else np.nan
-    reason = _check_voltage(voltage, volt, rail.voltage_volt, columns) or _check_current(current, amp)
+    reason = _check_voltage(voltage, volt, rail.voltage_volt, columns) or _check_current(current, amp, rail.largest_amp)
     if not len(voltage) and not len(current):
         reason = "no-numbers"
     if reason is None:
@@ -248,13 +260,15 @@ def _check_voltage(voltage: Floats, median_volt: float, every_voltage: Floats, c
     return "voltage-too-small" if median_volt < _SMALLEST_VOLT else None
 
 
-def _check_current(current: Floats, median_amp: float) -> str | None:
+def _check_current(current: Floats, median_amp: float, largest_amp: float) -> str | None:
     if len(current) > _MIN_ROWS_TO_JUDGE and np.ptp(current) == 0:
         return "current-constant"
-    return "current-in-milliamperes" if median_amp > LARGEST_AMP else None
+    return "current-in-milliamperes" if median_amp > largest_amp else None
 
 
 LARGEST_VOLT, LARGEST_AMP = read_threshold(REJECTED, "max_median_volt"), read_threshold(REJECTED, "max_median_amp")
+_LARGEST_PER_VOLT = 100.0
+"""Times the largest current is the largest power [W]: 100 kW."""
 _SMALLEST_VOLT = read_threshold(REJECTED, "min_median_volt")
 _MIN_ROWS_TO_JUDGE = read_threshold(REJECTED, "max_equal_count")
 _UNAMBIGUOUS = read_threshold(REJECTED, "min_net_fraction")  # of the charge moved flows one way

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tcpipe.recipe.checking import validate_fields
-from tcpipe.robots import PlausibleSpeed, PowerSource, Robot
+from tcpipe.robots import NOMINAL_STD_FRACTION, TABLE_POWER, PlausibleSpeed, PowerSource, Robot, Share, Volt
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import LEFT_OUT
 
@@ -295,19 +295,40 @@ class TableMapping:
     """A table in a folder of CSV, text or Parquet files: its role, columns, units and stamps."""
 
     file: str = ""
-    """File name, relative to the ingested folder."""
+    """File name, relative to the ingested folder; a * (imu_*.csv) stands for the number of a run."""
     role: Role | None = None
     """Role of the table; default: its name. Power may have several tables."""
     columns: dict[str, str] = field(default_factory=dict)
-    """Column name by field (latitude, linear_x, voltage, …: docs/how-to/tables.md); column_1 and so on without a header."""
+    """Column by field (latitude, linear_x, voltage, …: docs/how-to/tables.md), or an expression, as "(velL + velR) / 2"."""
     units: dict[str, str] = field(default_factory=dict)
-    """Units by field, if not deg, m, m/s, rad/s, m/s2, V and A: "rad", "km/h", "deg/s", "g", "mV", …"""
+    """Units by field: "rad", "km/h", "g", "mV", …; default: that of the column's name, else deg, m, m/s, rad/s, m/s2, V, A, W, J."""
+    nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
+    """Assumed voltage of a current [V]."""
+    nominal_voltage_std_fraction: Share = field(
+        default=NOMINAL_STD_FRACTION, metadata={"json": (NOMINAL_STD_FRACTION,)}
+    )
+    """Its σ, as a fraction: one error of a run."""
     stamp: str | None = None
     """Column of the stamps; default: the first."""
     stamp_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of numeric stamps; auto infers it from their size if they count from 1970. Text is date and time, UTC unless stated."""
     offset_s: Offset = 0.0
     """Added to the stamps [s]."""
+
+    def make_power_source(self, name: str) -> PowerSource | None:
+        """Return what a table of this name holds of power, where that is neither a voltage nor a current as it stands."""
+        if (self.role or name) != "power" or (
+            self.nominal_voltage_volt is None and not {"power", "energy"} & set(self.columns)
+        ):
+            return None
+        return PowerSource(
+            TABLE_POWER,
+            **{of: of for of in ("voltage", "current", "power", "energy") if of in self.columns},  # type: ignore[arg-type]
+            topic=f"/{name}",
+            sign="drawn_positive" if "energy" in self.columns else "auto",
+            nominal_voltage_volt=self.nominal_voltage_volt,
+            nominal_voltage_std_fraction=self.nominal_voltage_std_fraction,
+        )
 
 
 @dataclass(frozen=True, slots=True)

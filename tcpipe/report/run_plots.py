@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.json_files import Json
 from tcpipe.geometry.datum import enu_from_geodetic
+from tcpipe.power.rails import is_power_only
 from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS
 from tcpipe.report.page import Column, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
@@ -150,11 +151,14 @@ def make_track_series(track: pa.Table, timeline: Timeline, xy_m: Floats) -> Seri
 
 
 def make_rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
-    """Yield voltage and current of each rail as measured."""
+    """Yield voltage and current of each rail as measured, or its power where only that is known."""
     rails = to_texts(power.column("rail"))
     for rail in dict.fromkeys(rails.tolist()):
         rail_power = power.filter(pa.array(rails == rail))
-        for name, column, digits in (("voltage", "voltage_volt", 2), ("current", "current_amp", 3)):
+        quantities: tuple[tuple[str, str, int], ...] = (("voltage", "voltage_volt", 2), ("current", "current_amp", 3))
+        if is_power_only(to_floats(rail_power, "voltage_volt")):
+            quantities = (("power", "current_amp", 2),)
+        for name, column, digits in quantities:
             values, t_s = to_floats(rail_power, column), _compute_seconds(rail_power, timeline)
             known = np.isfinite(values) & np.isfinite(t_s)
             if known.any():

@@ -29,6 +29,14 @@ GAIN_STD_FRACTION, OFFSET_STD_AMP = 0.02, 0.2
 """σ of gain and zero [A] of a current sensor where nothing better is known: those of open-loop Hall sensors (Allegro ACS712, 20 A, data
 sheet: total output error ± 1.5 %; its zero drifts by 3.4 mA per kelvin, 0.14 A over 40 K), and half as much again."""
 
+OFFSET_STD_WATT = 5.0
+"""σ of the zero of a power without voltage [W]: that of a current at 24 V."""
+NOMINAL_STD_FRACTION = 0.1
+"""σ of a voltage that nobody measured, as a fraction: a battery of lead falls by 20 % of its nominal voltage, one of lithium by 25 %."""
+
+TABLE_POWER = "tcpipe/msg/TablePower"
+"""The type of a table of power, where that is neither a voltage nor a current as it stands."""
+
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
 
@@ -37,6 +45,7 @@ MAX_PLAUSIBLE_MPS = 15.0
 
 CurrentSign = Literal["drawn_positive", "drawn_negative", "auto"]
 
+_QUANTITIES = ("voltage", "current", "power", "energy")
 _FIELD = re.compile(r"\s*(?P<path>[\w.]+)(?P<of_list>\[(?P<index>\d*)\](?P<inner>\.[\w.]+)?)?\s*")
 _TYPE = re.compile(r"\w+/msg/\w+")
 
@@ -98,12 +107,20 @@ class PowerSource:
     """Field of the current [A]; omit it if the message contains only a voltage, or a counter."""
     energy: str = ""
     """Field of a counter of energy, in place of a current, for example drawn - given_back."""
+    power: str = field(default="", metadata=LEFT_OUT)
+    """Field of the power [W], in place of a current; needs no voltage."""
     voltage_scale: Scale = 1.0
     """Factor on the voltage: 0.001 if it is in millivolts."""
     current_scale: Scale = 1.0
-    """Factor on the current: 0.001 if it is in milliamperes."""
+    """Factor on the current or power: 0.001 if it is in milliamperes."""
     energy_scale: Scale = 1.0
     """Factor on the counter: 3600 if it counts watt-hours."""
+    nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
+    """Assumed voltage of a current [V]."""
+    nominal_voltage_std_fraction: Share = field(
+        default=NOMINAL_STD_FRACTION, metadata={"json": (NOMINAL_STD_FRACTION,)}
+    )
+    """Its σ, as a fraction: one error of a run."""
     counter_wraps: Annotated[float, Bounds(gt=0, le=1e19)] | None = None
     """Value at which the counter wraps to zero, in its own unit; if omitted, a decrease is a reset."""
     rail: str = ""
@@ -122,6 +139,10 @@ class PowerSource:
         default=OFFSET_STD_AMP, metadata={"json": (OFFSET_STD_AMP,)}
     )
     """σ of the zero of the current, likewise [A]."""
+    offset_std_watt: Annotated[float, Bounds(ge=0, le=1e6)] = field(
+        default=OFFSET_STD_WATT, metadata={"json": (OFFSET_STD_WATT,)}
+    )
+    """The same of a power without voltage [W]."""
     rest_current_amp: tuple[Amp, Amp] | None = field(default=None, metadata=LEFT_OUT)
     """Lowest and highest current of the stationary robot, if known; beyond is an offset [A]."""
     other_loads: str = ""
@@ -145,22 +166,29 @@ class PowerSource:
     wraps_amp: Annotated[float, Bounds(ge=1, le=1e9)] | None = None
     """A current above half of this is a negative one read as unsigned [A]; if omitted, tcpipe infers it from the data."""
 
+    @property
+    def lacks_voltage(self) -> bool:
+        """Whether only power or energy is known."""
+        return bool(self.power or self.energy) and not self.voltage and self.nominal_voltage_volt is None
+
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield each key whose value cannot be, and what was wanted."""
         if not _TYPE.fullmatch(self.type):
             yield "type", "package/msg/Name"
-        for key in ("voltage", "current", "energy"):
+        for key in _QUANTITIES:
             if (text := getattr(self, key)) and not all(map(_FIELD.fullmatch, re.split(r"[+-]", text))):
                 yield key, "fields joined by + or -, for example status.left_amp + amps[1] or drivers[].amp"
         if self.unsupported_reason:
-            if self.voltage or self.current or self.energy:
+            if any(getattr(self, key) for key in _QUANTITIES):
                 yield "unsupported_reason", "no field besides it"
-        elif not self.voltage and not self.current:
-            yield "current", "a voltage, a current or both"
+        elif not any(getattr(self, key) for key in _QUANTITIES):
+            yield "current", "a voltage, a current or both, a power or a counter of energy"
         if self.rest_current_amp is not None and self.rest_current_amp[0] > self.rest_current_amp[1]:
             yield "rest_current_amp", "the lower of two currents first"
-        if self.energy and (self.current or not self.voltage):
-            yield "energy", "a voltage besides it, and no current"
+        if sum(bool(of) for of in (self.current, self.power, self.energy)) > 1:
+            yield "current", "one of current, power and energy"
+        if self.voltage and self.nominal_voltage_volt is not None:
+            yield "nominal_voltage_volt", "no measured voltage besides it"
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,8 @@ def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
     roles: dict[Role, list[str]] = {}
     for name, table in recipe.tables.items():
         role = cast("Role", table.role or name)
-        if role in get_args(Role) and (topic := find_topic(name, role, table.columns)[0]) in topics:
+        of, power = table.columns, table.make_power_source(name)
+        if role in get_args(Role) and (topic := find_topic(name, role, of, power.type if power else None)[0]) in topics:
             roles.setdefault(role, []).append(topic)
     return replace(recipe.read, topics={**roles, **recipe.read.topics}) if roles else recipe.read
 

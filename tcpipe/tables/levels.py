@@ -108,7 +108,7 @@ def _make_odometry_schema(name: str, doc: str) -> TableSchema:
             _make_nullable(f"{prefix}_{axis}_{suffix}", unit, f"{text}, {axis}", "child")
             for prefix, suffix, unit, text in (
                 ("velocity", "mps", "m/s", "body velocity; null where the source does not measure it"),
-                ("angular_velocity", "radps", "rad/s", "body angular velocity; null where not measured"),
+                ("angular_velocity", "radps", "rad/s", "body angular velocity; null if not measured"),
                 ("velocity_var", "m2ps2", "m2/s2", "variance of the body velocity; null where unknown"),
             )
             for axis in "xyz"
@@ -142,8 +142,14 @@ POWER = _make_stream_schema(
     "power",
     "Voltage and current of each drive rail; a rail's power is their product, the robot's the sum over rails.",
     Column("rail", pa.string(), "", "name of the rail (profile or topic)"),
-    _make_nullable("voltage_volt", "V", "voltage; null where this row carries only a current"),
-    _make_nullable("current_amp", "A", "current, positive when drawn; null where this row carries only a voltage"),
+    _make_nullable(
+        "voltage_volt", "V", "voltage; null where this row carries only a current; 1 if only power [W] is known"
+    ),
+    _make_nullable(
+        "current_amp",
+        "A",
+        "current, positive when drawn; null where this row carries only a voltage",
+    ),
 )
 
 COMMAND = _make_stream_schema(
@@ -215,8 +221,8 @@ _TRACK_COLUMNS = (
         "commanded_velocity_mps", "m/s", "commanded forward velocity, last value; null without", "base_link"
     ),
     _make_nullable("commanded_yaw_rate_radps", "rad/s", "commanded yaw rate, last value; null without", "base_link"),
-    _make_nullable("voltage_volt", "V", "mean voltage over the rails, interpolated; null without power"),
-    _make_nullable("current_amp", "A", "sum of the rails' currents, interpolated; null without power"),
+    _make_nullable("voltage_volt", "V", "mean voltage over the rails, interpolated; null if not measured"),
+    _make_nullable("current_amp", "A", "sum of the rails' currents, interpolated; null if not measured"),
     _make_nullable("power_watt", "W", "sum over rails of voltage times current; null without power"),
 )
 
@@ -310,7 +316,7 @@ MOTION_COLUMNS = tuple(
 _NET_COLUMNS = tuple(
     _make_nullable(name, unit, doc, since="1.3")
     for name, unit, doc in (
-        ("voltage_volt", "V", "time-mean of the voltage, over the rails; null without power"),
+        ("voltage_volt", "V", "time-mean of the voltage, over the rails; null if not measured"),
         ("idle_power_watt", "W", "power of the stationary robot in this run; null if it was hardly stationary"),
         (
             "idle_power_std_watt",

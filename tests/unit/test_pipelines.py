@@ -1,14 +1,15 @@
 """The shipped recipes parse and say what their comments claim; schedulers call what there is."""
 
 import re
-import runpy
 import shutil
 import subprocess
 from pathlib import Path
 
 import polars as pl
+import pytest
 
 from tcpipe.cli import cli
+from tcpipe.formats.logs.log_joining import AnyLog, open_logs
 from tcpipe.formats.logs.table_log import TableLog
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, load_recipe
 from tcpipe.logs.topics import Topic
@@ -19,7 +20,7 @@ PIPELINES = Path(__file__).parents[2] / "pipelines"
 VI, SIDES = ("voltage", "current"), ("left", "right")
 
 
-def played(recipe: Recipe, log: TableLog) -> set[str]:
+def played(recipe: Recipe, log: AnyLog) -> set[str]:
     """The roles that are played, all that the recipe says settled."""
     found = decide_roles(
         find_read_config(recipe, log.topics), log.topics.values(), recipe.robot, known=load_profiles(recipe)
@@ -110,17 +111,26 @@ def test_schedulers_call_commands_and_options_that_exist() -> None:
     assert "OnCalendar=*-*-* 02:15:00\n" in (PIPELINES / "systemd/tcpipe-night.timer").read_text()
 
 
-def test_fau_makes_its_tables_of_the_published_columns(tmp_path: Path) -> None:
-    script = runpy.run_path(str(PIPELINES / "fau_tables.py"))
-    fixes, seconds = (tmp_path / file for file in script["FILES"])
-    for path, head, row in (
-        (fixes, "timestamp (ns),latitude (deg),longitude (deg),alt_msl (m),fix_quality", "26.37,-80.1,2.6,{quality}"),
-        (seconds, ",".join(("timestamp (ns)", "Power (w)", *script["INERTIAL"].values())), "53.4" + ",0.1" * 10),
+def test_fau_and_borealtc_map_the_columns_that_are_published(tmp_path: Path) -> None:
+    fau, borealtc = (load_recipe(PIPELINES / f"{name}.toml") for name in ("fau", "borealtc"))
+    fixes, seconds = (fau.tables[name] for name in ("gnss", "imu"))
+    for table, head, row in (
+        (fixes, ",".join(("timestamp (ns)", *fixes.columns.values())), "26.37,-80.1,2.6,4"),
+        (seconds, ",".join(("timestamp (ns)", "Power (w)", *seconds.columns.values())), "53.4" + ",0.1" * 10),
     ):
+        path = tmp_path / table.file
         path.parent.mkdir(parents=True)
-        rows = (f"{1763501392569776384 + k * 10**8},{row.format(quality=(4, 5, 2)[k % 3])}\n" for k in range(30))
+        rows = (f"{1763501392569776384 + k * 10**8},{row}\n" for k in range(30))
         path.write_text(f"{head}\n{''.join(rows)}", encoding="utf-8")
-    script["main"](tmp_path, tmp_path / "fau")
-    recipe, gnss = load_recipe(PIPELINES / "fau.toml"), pl.read_csv(tmp_path / "fau" / "gnss.csv")
-    assert played(recipe, TableLog(tmp_path / "fau", recipe.tables)) == {"gnss", "imu", "power"}
-    assert gnss["std"].to_list()[:3] == [0.02, 0.3, 0.8]
+    assert played(fau, TableLog(tmp_path, fau.tables)) == {"gnss", "imu", "power"}
+    (tmp_path / "imu_03.csv").write_text(
+        "time,wx,wy,wz,ax,ay,az\n" + "".join(f"{k / 100},0,0,0,0,0,9.8\n" for k in range(99))
+    )
+    (tmp_path / "pro_03.csv").write_text(
+        "time,curL,curR,velL,velR\n" + "".join(f"{k / 6.5},4,5,1,1.5\n" for k in range(20))
+    )
+    with open_logs([tmp_path / "pro_03.csv"], tables=borealtc.tables) as log:
+        assert played(borealtc, log) == {"imu", "wheel_odometry", "power"}
+        wheels = log.tables(["/wheel_odometry"])["/wheel_odometry"]
+    assert wheels["twist.twist.linear.x"][0].as_py() == 1.25
+    assert wheels["twist.twist.angular.z"][0].as_py() == pytest.approx(0.5 / 0.85)

@@ -19,7 +19,7 @@ import pyarrow as pa
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.logs.rosbag2 import is_one_bag
-from tcpipe.formats.logs.table_folders import Mappings
+from tcpipe.formats.logs.table_folders import Mappings, find_table_run
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -141,9 +141,11 @@ def open_logs(
 
     A folder that is no bag is one of tables, where ``tables`` says what they hold.
     """
+    runs = {path: find_table_run(path, tables or {}) for path in sorted(paths, key=Path)}
+    firsts = {run.files if run else (path,): path for path, run in reversed(runs.items())}
     with ExitStack() as stack:
         logs: list[Log | TableLog] = []
-        for path in sorted(paths, key=Path):
+        for path in reversed(firsts.values()):
             logs.append(open_single_log(path, message_definitions=message_definitions, tables=tables))
             stack.callback(logs[-1].close)
         alone = logs[0] if len(logs) == 1 else None
@@ -156,11 +158,13 @@ def open_logs(
 
 
 def open_single_log(path: Path | str, *, message_definitions: Path | None, tables: Mappings | None) -> Log | TableLog:
-    """Open one log: a folder that is no bag is one of tables, where ``tables`` says what they hold."""
-    if tables and isinstance(path, Path) and path.is_dir() and not is_one_bag(path):
-        from tcpipe.formats.logs.table_log import TableLog  # noqa: PLC0415  polars only where a table is read
+    """Open one log: a folder that is no bag, or a table of a run, is one of tables, where ``tables`` says what they hold."""
+    if tables and isinstance(path, Path):
+        run = find_table_run(path, tables) if path.is_file() else None
+        if run or (path.is_dir() and not is_one_bag(path)):
+            from tcpipe.formats.logs.table_log import TableLog  # noqa: PLC0415  polars only where a table is read
 
-        return TableLog(path, tables)
+            return TableLog(run.folder, run.mappings, run.files) if run else TableLog(path, tables)
     return open_log(path, message_definitions=message_definitions)
 
 

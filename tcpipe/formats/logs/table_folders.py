@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tcpipe.recipe import TableMapping
@@ -21,15 +23,57 @@ def list_table_files(folder: Path) -> list[Path]:
     return sorted(Path(place) / name for place, _, names in _walk_folders(folder) for name in names if is_table(name))
 
 
-def find_table_folders(path: Path, mappings: Mappings) -> list[Path]:
-    """Return the folders at or below a path that hold a mapped file, in order of their names; what lies below one is its own."""
-    wanted = [mapping.file for mapping in mappings.values() if mapping.file]
-    found = list[Path]()
+@dataclass(frozen=True, slots=True)
+class TableRun:
+    """The tables of one run where a recipe's names have a ``*``: the files in which it is the same text, in one folder."""
+
+    folder: Path
+    mappings: dict[str, TableMapping]
+    """With the names of this run's files."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The tables that are there, by name."""
+        return tuple(sorted({path for of in self.mappings.values() if (path := self.folder / of.file).is_file()}))
+
+
+def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
+    """Return the logs at or below a path that are tables, in order of their names.
+
+    A log is a folder that holds a mapped file, with what lies below it, or the files of a `TableRun`.
+    """
+    if path.is_file():
+        return [run.files] if (run := find_table_run(path, mappings)) else []
+    numbered = [mapping.file for mapping in mappings.values() if "*" in mapping.file]
+    fixed = [mapping.file for mapping in mappings.values() if mapping.file and "*" not in mapping.file]
+    found = list[tuple[Path, ...]]()
     for place, folders, _ in _walk_folders(path):
-        if any((Path(place) / file).is_file() for file in wanted):
-            found.append(Path(place))
-            folders.clear()
+        folder = Path(place)
+        files = sorted(file for pattern in numbered for file in folder.glob(pattern))
+        runs = (run for file in files if (run := find_table_run(file, mappings)))
+        if grouped := dict.fromkeys(run.files for run in runs):
+            found += grouped
+        elif any((folder / file).is_file() for file in fixed):
+            found.append((folder,))
+        else:
+            continue
+        folders.clear()
     return found
+
+
+def find_table_run(path: Path | str, mappings: Mappings) -> TableRun | None:
+    """Return the run that a table belongs to by its name, None where no mapped name has a ``*`` that fits."""
+    path = Path(path)
+    for mapping in mappings.values():
+        parts = mapping.file.split("/")
+        if "*" not in mapping.file or len(path.parts) <= len(parts):
+            continue
+        pattern = "([^/]+)".join(map(re.escape, mapping.file.split("*")))
+        if named := re.fullmatch(pattern, "/".join(path.parts[-len(parts) :])):
+            names = {name: of.file.replace("*", named[1]) for name, of in mappings.items()}
+            of_run = {name: replace(of, file=names[name]) for name, of in mappings.items()}
+            return TableRun(path.parents[len(parts) - 1], of_run)
+    return None
 
 
 def _walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -27,12 +27,14 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
+from tcpipe.logs.expressions import split_unit
 from tcpipe.logs.field_mapping import (
-    convert_units,
+    STAMP_UNITS,
     find_mapping_problems,
     find_topic,
     make_message_fields,
     parse_stamps_ns,
+    read_fields,
     utc_from_gps_ns,
 )
 from tcpipe.logs.topics import Damage, Topic, find_damage
@@ -62,8 +64,11 @@ class TableLog:
     """Tables have no index, and are hashed."""
     is_known_by_outline = False
 
-    def __init__(self, path: Path, mappings: Mappings) -> None:
-        """Read the tables; `LogError` has a line for each thing in which the mapping and the folder do not agree."""
+    def __init__(self, path: Path, mappings: Mappings, files: Sequence[Path] | None = None) -> None:
+        """Read the tables of a folder, of which ``files`` are the log's, by default all.
+
+        `LogError` has a line for each thing in which the mapping and the folder do not agree.
+        """
         self.path = path
         problems: list[str] = []
         read: list[_Read] = []
@@ -80,7 +85,7 @@ class TableLog:
         self.topics = {found.topic.name: found.topic for found in read}
         """Every mapped table by its topic's name."""
         self.findings = find_damage(damage for found in read for damage in found.damage)
-        self._files = list_table_files(path)
+        self._files = list_table_files(path) if files is None else files
 
     def __enter__(self) -> Self:
         """Return the log."""
@@ -96,11 +101,11 @@ class TableLog:
 
     @property
     def size_bytes(self) -> int:
-        """Size of the folder's tables together, mapped or not."""
+        """Size of the log's tables together, mapped or not."""
         return sum(file.stat().st_size for file in self._files)
 
     def sha256(self) -> str:
-        """Return the SHA-256 of all tables of the folder, mapped or not, one after the other, by name."""
+        """Return the SHA-256 of all tables of the log, mapped or not, one after the other, by name."""
         digest = hashlib.sha256()
         for file in self._files:
             with file.open("rb") as stream:
@@ -138,9 +143,14 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
     try:
         names = read_column_names(path)
         stamp = names[0] if mapping.stamp is None else mapping.stamp
-        if missing := [name for name in dict.fromkeys([stamp, *mapping.columns.values()]) if name not in names]:
-            return [f"{where}: {mapping.file} has no column {', '.join(missing)}; it has {', '.join(names)}"]
-        cells = read_cells(path, stamp=stamp, columns=list(mapping.columns.values()))
+        fields = read_fields(f"{where}.columns", role, mapping.columns, mapping.units, names)
+        problems = [f"{problem} ({mapping.file})" for problem in fields] if isinstance(fields, list) else []
+        if stamp not in names:
+            problems.append(f"{where}.stamp: {mapping.file} has no column {stamp}; it has {', '.join(names)}")
+        if isinstance(fields, list) or problems:
+            return problems
+        used = [column for of, _ in fields.values() for column, _ in of.operands()]
+        cells = read_cells(path, stamp=stamp, columns=used)
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
@@ -151,7 +161,15 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
     stamp_ns = _read_stamps(cells, stamp, mapping)
     if isinstance(stamp_ns, str):
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
-    return empty or _read_messages(find_topic(name, role, mapping.columns), role, mapping, cells, stamp_ns)
+    if empty:
+        return empty
+    values = {
+        field: factor * np.broadcast_to(of.evaluate(lambda column, _: cells.columns[column]), len(cells.stamp))
+        for field, (of, factor) in fields.items()
+    }
+    source = mapping.make_power_source(name)
+    read_as = find_topic(name, role, mapping.columns, source.type if source else None)
+    return _read_messages((*read_as, role), mapping, cells, values, stamp_ns)
 
 
 def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.int64] | str:
@@ -159,7 +177,9 @@ def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.
     known = cells.stamp[cells.stamp_known]
     if not known.size:
         return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
-    found = parse_stamps_ns(known, "ns" if cells.stamp_is_time else mapping.stamp_unit)
+    named, stated = split_unit(stamp)[1], mapping.stamp_unit
+    unit = "ns" if cells.stamp_is_time else named if stated == "auto" and named in STAMP_UNITS else stated
+    found = parse_stamps_ns(known, unit)
     if isinstance(found, str):
         return f"{found} (stamp_unit)"
     found = utc_from_gps_ns(found) if cells.stamp_is_time and stamp == _GPS_TIME else found
@@ -167,10 +187,14 @@ def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.
 
 
 def _read_messages(
-    read_as: tuple[str, str], role: str, mapping: TableMapping, cells: Cells, stamp_ns: NDArray[np.int64]
+    read_as: tuple[str, str, str],
+    mapping: TableMapping,
+    cells: Cells,
+    values: Mapping[str, NDArray[np.float64]],
+    stamp_ns: NDArray[np.int64],
 ) -> _Read:
-    """Return a table as the messages of its topic and type, in order of time, and what of it is lost."""
-    topic, kind = read_as
+    """Return a table as the messages of its topic, type and role, in order of time, and what of it is lost."""
+    topic, kind, role = read_as
     lost = int(np.count_nonzero(~cells.stamp_known))
     damage = [Damage("time-invalid", mapping.file, messages_lost=lost)] if lost else []
     damage += [
@@ -178,13 +202,12 @@ def _read_messages(
         for column, (count, row, text) in cells.texts.items()
     ]
     damage += [Damage("table-cells", mapping.file, messages_lost=0, reason=note) for note in cells.notes]
-    values = {field: cells.columns[column] for field, column in mapping.columns.items()}
     order = slice(None) if not lost else np.flatnonzero(cells.stamp_known)
     if backward := int(np.count_nonzero(np.diff(stamp_ns) < 0)):
         damage.append(Damage("messages-unordered", mapping.file, messages_lost=0, places=backward))
         by_time = np.argsort(stamp_ns, kind="stable")
         order, stamp_ns = np.flatnonzero(cells.stamp_known)[by_time], stamp_ns[by_time]
-    values = convert_units(role, {field: value[order] for field, value in values.items()}, mapping.units)
+    values = {field: value[order] for field, value in values.items()}
     if kind in FLOAT_TYPES:
         columns = {"data": next(iter(values.values()))}
     else:

@@ -6,15 +6,17 @@ import pytest
 from tcpipe.logs.field_mapping import (
     MAPPED,
     MAPPED_TYPES,
-    convert_units,
     find_mapping_problems,
     find_topic,
     make_mapped_message,
     make_message_fields,
     parse_stamps_ns,
+    read_fields,
     utc_from_gps_ns,
 )
 from tcpipe.logs.messages import list_needed_fields, read_messages
+from tcpipe.recipe import TableMapping
+from tcpipe.robots import TABLE_POWER
 
 PLACE = {"x": 1.0, "y": 2.0, "z": 3.0, "x_std": 0.1, "y_std": 0.2, "z_std": 0.3}
 NOW_S = 1_760_456_485
@@ -46,19 +48,40 @@ def test_gps_time_is_18_s_ahead_since_2017_and_17_before():
     assert (utc_from_gps_ns(np.array(at) * 10**9) // 10**9).tolist() == [1_483_228_800, 1_483_228_800, NOW_S - 18]
 
 
-def test_units_are_those_of_the_fields():
-    one = np.ones(1)
-    assert convert_units(
-        "imu",
-        {"angular_velocity_x": 180 * one, "linear_acceleration_z": one},
-        {"angular_velocity_x": "deg/s", "linear_acceleration_z": "g"},
-    ) == {"angular_velocity_x": pytest.approx([np.pi]), "linear_acceleration_z": pytest.approx([9.80665])}
-    assert convert_units("gnss", {"latitude": np.array([471234567.0])}, {"latitude": "1e-7 deg"})[
-        "latitude"
-    ] == pytest.approx([47.1234567])
-    assert convert_units("command", {"linear_x": np.array([3.6])}, {"linear_x": "km/h"})["linear_x"] == pytest.approx(
-        [1.0]
-    )
+@pytest.mark.parametrize(
+    ("role", "field", "column", "stated", "one"),
+    [
+        ("imu", "angular_velocity_x", "wx", "deg/s", np.pi / 180),
+        ("imu", "angular_velocity_x", "gyro x [dps]", None, np.pi / 180),
+        ("imu", "linear_acceleration_z", "acc_z (m/s²)", None, 1.0),
+        ("imu", "linear_acceleration_z", "acc_z_mg", None, 9.80665e-3),
+        ("gnss", "latitude", "lat", "1e-7 deg", 1e-7),
+        ("gnss", "latitude", "lat (rad)", None, 180 / np.pi),
+        ("gnss", "latitude", "latitude (deg)", None, 1.0),
+        ("command", "linear_x", "speed_kmh", None, 1 / 3.6),
+        ("command", "linear_x", "Speed (knots)", None, 1852 / 3600),
+        ("command", "linear_x", "speed_kmh", "m/s", 1.0),  # the recipe knows better
+        ("command", "linear_x", "wheel_v", None, 1.0),  # v is no volt here
+        ("power", "power", "Power (w)", None, 1.0),
+        ("power", "energy", "used_Wh", None, 3600.0),
+        ("power", "current", "motor current [mA]", None, 1e-3),
+        ("pose", "x", "x", "ft", 0.3048),
+    ],
+)
+def test_the_unit_of_a_column_is_stated_or_stands_in_its_name(role, field, column, stated, one):
+    units = {field: stated} if stated else {}
+    ((expression, factor),) = read_fields("r", role, {field: column}, units, [column]).values()
+    assert factor == pytest.approx(one, rel=1e-12)
+    assert expression.evaluate(lambda name, _: {column: np.ones(2)}[name]).tolist() == [1.0, 1.0]
+
+
+def test_a_unit_that_is_another_quantity_s_or_not_known_is_asked_for():
+    for column in ("gyro_x_deg", "gyro (deg)", "gyro (filtered)"):
+        (said,) = read_fields("r", "imu", {"angular_velocity_x": column}, {}, [column])
+        assert "state its unit under units: rad/s" in said
+        assert isinstance(
+            read_fields("r", "imu", {"angular_velocity_x": column}, {"angular_velocity_x": "rad/s"}, [column]), dict
+        )
 
 
 def test_every_problem_of_a_mapping_is_said():
@@ -100,9 +123,15 @@ def test_deviations_are_the_diagonal_of_a_covariance():
 
 
 def test_voltage_and_current_apart_are_bare_numbers_called_so():
-    assert find_topic("left_voltage", "power", {"voltage": "value"}) == ("/left_voltage", "std_msgs/msg/Float64")
-    assert find_topic("left", "power", {"current": "value"}) == ("/left/current", "std_msgs/msg/Float64")
-    assert find_topic("pack", "power", {"voltage": "v", "current": "i"}) == ("/pack", "sensor_msgs/msg/BatteryState")
+    bare = "std_msgs/msg/Float64"
+    for name, columns, wanted in (
+        ("left_voltage", {"voltage": "value"}, ("/left_voltage", bare)),
+        ("left", {"current": "value"}, ("/left/current", bare)),
+        ("pack", {"voltage": "v", "current": "i"}, ("/pack", "sensor_msgs/msg/BatteryState")),
+        ("pack", {"power": "p"}, ("/pack", TABLE_POWER)),
+    ):
+        source = TableMapping("a.csv", "power", columns).make_power_source(name)
+        assert find_topic(name, "power", columns, source and source.type) == wanted
 
 
 def test_a_message_of_ones_own_is_mapped_field_by_field_and_all_that_is_wrong_is_said():
@@ -122,5 +151,7 @@ def test_a_message_of_ones_own_is_mapped_field_by_field_and_all_that_is_wrong_is
     names = {"latitude": "pvt.height", "longitude": "name", "altitude": "acc[3]", "up_std": "a + b", "x": "acc"}
     wrong = make_mapped_message("gnss", columns, names)
     assert isinstance(wrong, list)
-    assert len(wrong) == 6
-    assert "which its messages do not have; they have pvt.lat, pvt.lon, acc, name" in wrong[1]
+    assert [word in " ".join(wrong) for word in ("no column pvt.height", "no column a, b", "has no x")] == [True] * 3
+    names = {"latitude": "pvt.lat", "longitude": "name", "altitude": "acc[3]", "up_std": "acc"}
+    wrong = make_mapped_message("gnss", columns, names)
+    assert [word in " ".join(wrong) for word in ("name is text", "a list of 1 elements", "as acc[0]")] == [True] * 3

@@ -147,7 +147,7 @@ def test_runs_that_have_to_be_ingested_again_are_told_each_time_unless_so_many_a
         assert problems(result) == [("run-ingested-otherwise", run_id) for run_id in "bcd"]
         (line,) = result.finding_lines(problems=True)
         assert line.startswith("warning: 3 of 4 runs: Run excluded: ingested with another recipe")
-        assert "To ingest the logs again: 'tcpipe ingest /logs'" in line
+        assert "To ingest the logs again, with this --recipe: 'tcpipe ingest /logs'" in line
         assert (result.status, result.exit_code) == (status, 3)
     assert build(store, min_runs=1).exit_code == 0
     assert runs(store) == ["a"]

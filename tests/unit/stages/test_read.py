@@ -491,7 +491,7 @@ def test_a_gnss_message_of_ones_own_is_read_by_the_fields_the_recipe_names():
         np.testing.assert_allclose(found.tables["gnss"][name].to_numpy(), given, rtol=1e-12)
     with pytest.raises(RoleError) as caught:
         read(topics, topics={"gnss": ["/rtk/pvt"]}, fields={"gnss": {"latitude": "lat", "longitude": "pvt.lon"}})
-    assert "names lat, which its messages do not have; they have" in caught.value.problems[0]
+    assert "there is no column lat; there are" in caught.value.problems[0]
 
 
 def pose(lon: np.ndarray, lat: np.ndarray) -> tuple[str, pa.Table]:

@@ -130,13 +130,13 @@ def test_all_that_a_mapping_names_in_vain_is_said_at_once(tmp_path):
     with pytest.raises(LogError) as caught:
         TableLog(folder, mappings)
     said = "\n".join(caught.value.problems)
-    assert len(caught.value.problems) == 8
+    assert len(caught.value.problems) == 9
     for words in (
         "tables.gnss.file: there is no fixes.csv here; there are imu.csv, late.csv, odom.csv",
         "tables.imu.columns: imu needs angular_velocity_y",
         "tables.cmd: role is 'cmd'; expected one of gnss",
         "column v of words.csv contains text ('fast' in row 1), expected numbers",
-        "odom.csv has no column px, py; it has t, v, w",
+        "tables.pose.columns.x: there is no column px; there are t, v, w (odom.csv)",
         "relative.csv, column t: its stamps",
         "/speed and /wheel_odometry have no time in common (they begin 1000.000 s apart)",
         "notes.docx'; expected a name that ends in .csv",

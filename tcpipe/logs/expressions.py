@@ -1,0 +1,117 @@
+"""Expressions of columns in a recipe, as ``(velL + velR) / 2`` or ``pvt.lat * 1e-7``, and the unit that a column's name states."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Read = Callable[[str, int | None], Floats]
+"""Returns a column's values, those of one element where it is a list."""
+
+FORM = 'a column, or numbers and columns joined by + - * / ( ), as "(velL + velR) / 2"; other names in backquotes, as "`Power (w)` * 2"'
+_LONGEST = 300
+"""Characters: nothing that is nested deeper than the parser goes."""
+_QUOTED = re.compile(r"`([^`]*)`")
+_MARK = "quoted_column_"
+_OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
+
+
+class ExpressionError(ValueError):
+    """The text is no expression of columns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expression:
+    """Columns joined by arithmetic."""
+
+    tree: ast.expr
+    quoted: tuple[str, ...]
+
+    @property
+    def column(self) -> str | None:
+        """The column's name where it is one column as it stands."""
+        is_one = isinstance(self.tree, ast.Name | ast.Attribute | ast.Subscript)
+        return self.operands()[0][0] if is_one else None
+
+    def operands(self) -> list[tuple[str, int | None]]:
+        """Return the columns that it reads, each with the element of its list, None where it is no list."""
+        found: list[tuple[str, int | None]] = []
+
+        def record(name: str, index: int | None) -> Floats:
+            found.append((name, index))
+            return np.ones(())
+
+        self.evaluate(record)
+        return found
+
+    def evaluate(self, read: Read) -> Floats:
+        """Return the values, shape (N,), or () of a constant."""
+        with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
+            return self._evaluate(self.tree, read)
+
+    def _evaluate(self, node: ast.expr, read: Read) -> Floats:
+        match node:
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+                joined: Floats = _OPERATORS[type(op)](self._evaluate(left, read), self._evaluate(right, read))
+                return joined
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return -self._evaluate(operand, read)
+            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+                return np.asarray(value, np.float64)
+            case ast.Subscript(value=value, slice=ast.Constant(value=int(index))):
+                return read(self._name(value), index)
+        return read(self._name(node), None)
+
+    def _name(self, node: ast.expr) -> str:
+        match node:
+            case ast.Name(id=name):
+                return self.quoted[int(name.removeprefix(_MARK))] if name.startswith(_MARK) else name
+            case ast.Attribute(value=value, attr=attribute):
+                return f"{self._name(value)}.{attribute}"
+        raise ExpressionError
+
+
+def parse_expression(text: str, known: Collection[str] = ()) -> Expression:
+    """Return the expression of a text; one that is a ``known`` column's name is that column. `ExpressionError`: it is none."""
+    quoted = (text,) if text in known else tuple(_QUOTED.findall(text))
+    marks = (f"{_MARK}{number}" for number in range(len(quoted)))
+    source = next(marks) if text in known else _QUOTED.sub(lambda _: next(marks), text.strip())
+    if len(source) > _LONGEST:
+        raise ExpressionError
+    try:
+        made = Expression(ast.parse(source, mode="eval").body, quoted)
+    except (SyntaxError, ValueError, MemoryError, RecursionError):
+        raise ExpressionError from None
+    made.operands()
+    return made
+
+
+_UNIT_NAMES = """
+deg degree degrees °; rad radian radians; m meter meters metre metres; cm; mm; km; ft feet; m/s mps m_s; cm/s cmps; mm/s mmps; km/h kmh kph;
+mph; kn kt kts knot knots; rad/s radps rads rad_s; deg/s degps degs dps deg_s °/s; rpm; m/s2 m/s^2 m/s² m/s/s mps2; g; mg; V volt volts;
+mV millivolt millivolts; A amp amps ampere amperes; mA milliamp milliamps; W watt watts; mW; kW; J joule joules; kJ; Wh; mWh; kWh;
+s sec secs second seconds; ms msec milliseconds; us µs μs usec microseconds; ns nsec nanoseconds"""
+"""Units, and what else they are called in the name of a column."""
+_UNIT_OF = {name.lower(): names[0] for names in map(str.split, _UNIT_NAMES.split(";")) for name in names}
+_SUFFIX = re.compile(
+    r"(.*[^_ .\-])[_ .\-]++(" + "|".join(sorted(map(re.escape, _UNIT_OF), key=len, reverse=True)) + ")"
+)
+
+
+def split_unit(name: str) -> tuple[str, str | None, bool]:
+    """Return a column's name without the unit that it ends with, that unit, and whether it stands in brackets.
+
+    ``lat (deg)``, ``Power [w]`` and ``speed_kmh`` state one. In brackets it is what stands there where that is no unit that is known.
+    """
+    opening = max(name.rfind("("), name.rfind("["))
+    if opening > 0 and name.rstrip().endswith((")", "]")):
+        inside = name.rstrip()[opening + 1 : -1].strip()
+        return name[:opening].rstrip(), _UNIT_OF.get(inside.lower(), inside or None), True
+    found = _SUFFIX.fullmatch(name.lower())
+    return (name[: found.end(1)], _UNIT_OF[found[2]], False) if found else (name, None, False)
