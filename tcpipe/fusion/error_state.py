@@ -59,7 +59,7 @@ from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smoo
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts, make_vector
+from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 
 Floats = NDArray[np.float64]
@@ -495,29 +495,12 @@ def _make_facts(  # noqa: PLR0917
         taken = np.concatenate([tests.nis[tests.verdict[:, kind] == ACCEPTED, kind] for kind in kinds])
         nis[role] = float(taken.mean()) / state.SIZES[kinds[0]] if taken.size else None
         verdicts[role] = np.concatenate([tests.verdict[rows[kind][1], kind] for kind in kinds])
-    last, active = smoothed.states[-1], list(made.model.active)
-
-    def spread(error: int) -> float:
-        return float(smoothed.spreads[-1, active.index(error)]) if error in active else 0.0
-
-    x = last[6:]
     return StretchFacts(
         nis_mean=nis,
         measurements={role: int(of.size) for role, of in verdicts.items()},
         rejected={role: int((of == REJECTED).sum()) for role, of in verdicts.items()},
-        reopened={role: int((of == RESET).sum()) for role, of in verdicts.items()},
-        events=int(made.ticks.stamp_ns.size),
-        zero_velocity_updates=int((tests.verdict[:, state.STATIONARY] != NONE).sum()),
-        gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
-        gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
-        turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
-        accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),
-        wheel_scale=float(1.0 + x[state.WHEEL_SCALE] + x[state.WHEEL_SLIP] + x[state.SHARED_SCALE]),
-        wheel_scale_std=max(spread(state.WHEEL_SCALE), scale_std),
-        visual_scale=float(1.0 + x[state.VISUAL_SCALE] + x[state.VISUAL_SLIP] + x[state.SHARED_SCALE]),
-        visual_scale_std=max(spread(state.VISUAL_SCALE), scale_std),
         common_scale_std=scale_std,
         parameters=_describe_parameters(m, made, smoothed, std),
     )

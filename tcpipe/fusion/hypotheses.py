@@ -272,8 +272,10 @@ def explain(
 
 def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> bool:
     """Return whether what it changes is part of the state, and the same scale does not vary already."""
-    known = change.kind == "varies" and any((each.kind, each.role) == ("varies", change.role) for each in best.changes)
-    return not known and all(e in active for place, count, _ in change.blocks for e in range(place, place + count))
+    varying = {each.role for each in best.changes if each.kind == change.kind == "varies"}
+    return change.role not in varying and all(
+        e in active for place, count, _ in change.blocks for e in range(place, place + count)
+    )
 
 
 def _drop_changes(
@@ -336,8 +338,8 @@ def _list_changes(suspect: Suspect, suspects: Sequence[Suspect], tests: Tests, p
     """Yield single changes that could explain a suspect."""
     size = tests.verdict.shape[0]
     role, first, last = suspect.role, suspect.first, None if suspect.last >= size else suspect.last
-    yield Change("varies", state.WHEELS, first)
-    yield Change("varies", state.VISUAL, first)
+    for odometry in _ODOMETRIES:
+        yield Change("varies", odometry, first)
     if role != state.FIX:
         if role == state.ATTITUDE:
             yield Change("frame", role, first)

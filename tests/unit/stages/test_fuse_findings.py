@@ -80,12 +80,9 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
     told = make_section_facts(TrackSection(2, 10, 20, heard), began, found)
     assert (told.clock_epoch, told.start_ns, told.end_ns, told.rows) == (2, 10, 20, 4)
     assert set(told.sensors) == {"gnss", "imu"}
-    assert (told.gyro_noise_radps, told.accelerometer_noise_mps2) == (0.01, 0.1)
-    assert told.initial_yaw_rad == pytest.approx(0.5)
-    assert (told.initial_yaw_std_rad, told.heading_from) == (0.3, "orientation")
+    assert (told.gyro_noise_radps, told.heading_from) == (0.01, "orientation")
     alone = make_section_facts(TrackSection(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
     assert alone.gyro_noise_radps is None
-    assert alone.accelerometer_noise_mps2 is None
 
 
 def test_nothing_is_said_where_nothing_is_odd():
