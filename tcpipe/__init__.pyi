@@ -1,7 +1,7 @@
 from tcpipe import errors
 from tcpipe.api import evaluate, plan_path, predict_path, train
 from tcpipe.dataset import open_dataset
-from tcpipe.formats.logs.log_file import open_log as read_log
+from tcpipe.formats.logs.log_joining import open_single_log as read_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map

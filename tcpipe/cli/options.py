@@ -231,6 +231,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "lonlat": {"type": LonLat()},
     "robot": {"shell_complete": complete_robots},
     "map": {"shell_complete": complete_maps},
+    "run": {"shell_complete": complete_runs},
     "tags": {"callback": tag_values, "multiple": True},
     "layers": {"callback": layer_values, "multiple": True, "type": ONE_OF_SEVERAL},
     "class_tables": {"callback": class_table_values, "multiple": True, "type": ONE_OF_SEVERAL},

@@ -121,6 +121,17 @@ class MapRegistration:
     height_scale_std: float | None = None
     expected_misfit_m: float | None = None
     """What the track's own height errors and the map's resolution leave [m]."""
+    applied_std_m: float | None = field(default=None, metadata=LEFT_OUT)
+    """DRMS of the shift, where the run's positions were moved by it."""
+
+
+def list_shifts(registrations: Iterable[MapRegistration]) -> dict[str, tuple[float, float, float]]:
+    """Return by run the shift that was applied, x and y, and its DRMS [m]."""
+    return {
+        of.run_id: (*of.shift_xy_m, of.applied_std_m)
+        for of in registrations
+        if of.shift_xy_m is not None and of.applied_std_m is not None
+    }
 
 
 @dataclass(frozen=True, slots=True)

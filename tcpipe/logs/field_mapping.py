@@ -8,7 +8,7 @@ Which field of a role a column is, or a field of somebody's own message type, by
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from tcpipe.logs import roles
 from tcpipe.logs.expressions import FORM, Expression, ExpressionError, parse_expression, split_unit
+from tcpipe.logs.fix_quality import CODES, classify_fixes, find_status, split_codes
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
@@ -27,7 +28,8 @@ from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
-Columns = Mapping[str, NDArray[Any]]
+Array = NDArray[Any]
+Columns = Mapping[str, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,7 @@ MAPPED: dict[str, dict[str, MappedField]] = {
         "altitude": MappedField("altitude", "m"),
         **_map_std("position_covariance", ("east", "north", "up"), 3),
         "status": MappedField("status.status", "1"),
+        "quality": MappedField("fix_quality", "1"),
     },
     "gnss_velocity": {
         **{
@@ -155,17 +158,38 @@ def find_mapping_problems(
             yield f"{where}.units: {name} is in {unit!r}; expected one of {', '.join(UNITS[known[name].unit])}"
 
 
+@dataclass(frozen=True, slots=True)
+class FieldSource:
+    """What a field is made of: an expression, times a factor to its unit; of a fix quality what its codes are."""
+
+    expression: Expression
+    factor: float
+    codes: str | None
+
+    def evaluate(self, read: Callable[[str, int | None], Array], rows: int) -> Floats:
+        """Return the values, shape (rows,); ``read`` as in `Expression.evaluate`."""
+        values = np.broadcast_to(self.expression.evaluate(read), rows)
+        return self.factor * values if self.codes is None else classify_fixes(values, self.codes)
+
+
 def read_fields(
     where: str, role: str, columns: Mapping[str, str], units: Mapping[str, str], known: Collection[str]
-) -> dict[str, tuple[Expression, float]] | list[str]:
-    """Return by field the expression that the recipe gives it and the factor to its unit, or every problem.
+) -> dict[str, FieldSource] | list[str]:
+    """Return by field what the recipe makes it of, or every problem.
 
     ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none.
     """
-    found: dict[str, tuple[Expression, float]] = {}
+    found: dict[str, FieldSource] = {}
     problems: list[str] = []
     for name, text in columns.items():
-        place = f"{where}.{name}"
+        place, codes = f"{where}.{name}", None
+        if name == "quality":
+            codes, text = split_codes(text)  # noqa: PLW2901
+            if codes is None:
+                problems.append(
+                    f'{place}: state what the codes of {text} are, one of {", ".join(CODES)}: "gga: {text}"'
+                )
+                continue
         try:
             expression = parse_expression(text, known)
         except ExpressionError:
@@ -181,7 +205,7 @@ def read_fields(
             if isinstance(factor, str):
                 problems.append(f"{place}: {factor}")
             else:
-                found[name] = expression, factor
+                found[name] = FieldSource(expression, factor, codes)
     return problems or found
 
 
@@ -200,19 +224,21 @@ _CLEARLY_A_UNIT = 2
 """Characters: what is shorter at the end of a name may be something else."""
 
 
-def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, NDArray[Any]]:
+def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, Array]:
     """Return the fields of the message that a role usually has, by dotted name, from those that are mapped.
 
     What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix, zero elsewhere.
     ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
     """
     zero = np.zeros(rows)
-    made: dict[str, NDArray[Any]] = {}
+    made: dict[str, Array] = {}
     for name, field in MAPPED[role].items():
         if field.std_of is not None:
             if name in values:
                 made.setdefault(field.message, np.zeros((rows, 9 if role == "gnss" else 36)))
                 made[field.message][:, field.std_of] = values[name] ** 2
+        elif name == "quality":
+            made |= {"fix_quality": values[name], "status.status": find_status(values[name])} if name in values else {}
         elif name in values:
             made[field.message] = values[name]
         elif (role, name) in {("gnss", "altitude"), ("gnss_velocity", "up")}:
@@ -224,7 +250,7 @@ def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> d
     return made | _collect_other_fields(role, values, made, rows)
 
 
-def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, NDArray[Any]]:
+def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, Array]:
     """Return the fields of a role's message that no mapping names."""
     if role == "gnss":
         status = made["status.status"]
@@ -251,7 +277,7 @@ def find_topic(name: str, role: str, columns: Collection[str], power_type: str |
     return f"/{name}" if find_quantity(name) == alone else f"/{name}/{alone}", FLOAT_TYPES[1]
 
 
-def parse_stamps_ns(values: NDArray[Any], unit: str) -> NDArray[np.int64] | str:
+def parse_stamps_ns(values: Array, unit: str) -> NDArray[np.int64] | str:
     """Return finite numbers, shape (N,), as [ns], or what is in the way of that in words.
 
     ``unit`` is s, ms, us or ns; auto tells it by their size, since 1979.
@@ -278,7 +304,7 @@ def utc_from_gps_ns(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, NDArray[Any]] | list[str]:
+def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, Array] | list[str]:
     """Return a custom message's columns as those of the message that a role usually has, or what is wrong with the mapping.
 
     Parameters
@@ -295,11 +321,12 @@ def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) 
         return problems + found
     rows = len(columns["log_time_ns"])
     values: dict[str, Floats] = {}
-    for name, (expression, factor) in found.items():
-        unfit = [why for of in expression.operands() if (why := _find_misfit(columns[of[0]], *of))]
+    for name, of_field in found.items():
+        parts = of_field.expression.operands()
+        unfit = [why for of in parts if (why := _find_misfit(columns[of[0]], *of, may_be_text=name == "quality"))]
         problems += [f"{where}.{name}: {why}" for why in unfit]
         if not unfit:
-            values[name] = factor * np.broadcast_to(expression.evaluate(partial(_read_column, columns)), rows)
+            values[name] = of_field.evaluate(partial(_read_column, columns), rows)
     if problems:
         return problems
     stamps = {
@@ -309,9 +336,9 @@ def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) 
     return own | stamps | make_message_fields(role, values, rows)
 
 
-def _find_misfit(values: NDArray[Any], name: str, index: int | None) -> str | None:
+def _find_misfit(values: Array, name: str, index: int | None, *, may_be_text: bool) -> str | None:
     """Return why a field of a message is no number a message."""
-    if not np.issubdtype(values.dtype, np.number):
+    if not may_be_text and not np.issubdtype(values.dtype, np.number):
         return f"{name} is text; expected numbers"
     if values.ndim == 2 and (index is None or index >= values.shape[1]):
         return f"{name} is a list of {values.shape[1]} elements; expected one of them, as {name}[0]"
@@ -320,7 +347,7 @@ def _find_misfit(values: NDArray[Any], name: str, index: int | None) -> str | No
 
 def _read_column(columns: Columns, name: str, index: int | None) -> Floats:
     values = columns[name] if index is None else columns[name][:, index]
-    return values.astype(np.float64)
+    return values.astype(np.float64) if np.issubdtype(values.dtype, np.number) else values
 
 
 def _match_axes(before: str, name: str) -> dict[str, str]:
@@ -337,6 +364,7 @@ CALLED: Mapping[str, Mapping[str, str]] = {
         "east_std": r"sde",
         "north_std": r"sdn",
         "up_std": r"sdu",
+        "quality": r"q|(.*[_.])?carr(ier)?_?sol\w*|(.*[_.])?(gga|fix|gps)_?qual(ity)?",
     },
     "imu": {
         **_match_axes("w|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,15 @@ from numpy.typing import NDArray
 from tcpipe.geometry.rotation import normalize
 from tcpipe.logs import roles
 from tcpipe.logs.extrinsics import is_base
-from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, add_date, read_gga, read_over_ground
+from tcpipe.logs.fix_quality import (
+    NO_HEIGHT_M2,
+    add_quality_std,
+    classify_fixes,
+    classify_status,
+    convert_gps_fix,
+    find_status,
+)
+from tcpipe.logs.nmea import add_date, read_gga, read_over_ground
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
@@ -55,7 +64,9 @@ def list_needed_fields(type_name: str) -> tuple[str, ...]:
     return _FIELDS[type_name]
 
 
-def read_messages(columns: Columns, role: str, type_name: str) -> Readings:
+def read_messages(
+    columns: Columns, role: str, type_name: str, *, fix_std_m: Mapping[str, float] = MappingProxyType({})
+) -> Readings:
     """Return the readings of a topic that plays ``role``.
 
     Parameters
@@ -64,8 +75,13 @@ def read_messages(columns: Columns, role: str, type_name: str) -> Readings:
         arrays of str.
     role : gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, command or pose (power is read by `tcpipe.power.readings`).
     type_name : ``package/msg/Name``.
+    fix_std_m : recipe key ``read.fix_std_m``.
     """
-    return _READERS[role, type_name]({name: _mask_impossible(name, values) for name, values in columns.items()})
+    found = _READERS[role, type_name]({name: _mask_impossible(name, values) for name, values in columns.items()})
+    if role != "gnss":
+        return found
+    columns, count = add_quality_std(found.columns, fix_std_m)
+    return replace(found, columns=columns, notes=found.notes | ({"std_by_quality": count} if count else {}))
 
 
 _IMPOSSIBLE = 1e9
@@ -189,15 +205,14 @@ def _is_outside(lat_deg: Floats, lon_deg: Floats) -> Mask:
     return (np.abs(lat_deg) > 90) | (np.abs(lon_deg) > 180)
 
 
-def _read_gnss(
-    lon: Floats, lat: Floats, alt: Floats, variances: Floats, status: NDArray[Any]
-) -> dict[str, NDArray[Any]]:
+def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality: Floats) -> dict[str, NDArray[Any]]:
     return {
         "lon_deg": lon,
         "lat_deg": lat,
         "alt_m": alt,
         **{f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))},
-        "fix_status": status.astype(np.int8),
+        "fix_status": find_status(quality),
+        "fix_quality": quality,
     }
 
 
@@ -215,14 +230,13 @@ def _read_nav_sat_fix(columns: Columns) -> Readings:
     }
     fixed = ~np.any(list(drops.values()), axis=0)
     alt, unmeasured = _read_altitude(alt, fixed)
-    variances[unmeasured, 2] = _NO_HEIGHT_M2
+    variances[unmeasured, 2] = NO_HEIGHT_M2
     missing, fixes = int(np.count_nonzero(unmeasured & fixed)), int(np.count_nonzero(fixed))
     notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0]))), "without_altitude": missing}
     findings = (make_finding("altitude-missing", GNSS, missing_count=missing, fixes_count=fixes),) if missing else ()
-    return _select_rows(columns, _read_gnss(lon, lat, alt, variances, status), drops, notes=notes, findings=findings)
-
-
-_NO_HEIGHT_M2 = 1e6
+    quality = columns["fix_quality"] if "fix_quality" in columns else classify_status(status, "navsat")
+    values = _read_gnss(lon, lat, alt, variances, quality) | {"fix_status": status.astype(np.int8)}
+    return _select_rows(columns, values, drops, notes=notes, findings=findings)
 
 
 def _read_altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
@@ -243,20 +257,18 @@ def _read_nmea(columns: Columns) -> Readings:
     of_gga = {name: values[gga.row] for name, values in columns.items()}
     known = np.isfinite(gga.separation_m)
     separation = np.where(known, gga.separation_m, np.median(gga.separation_m[known]) if known.any() else 0.0)
-    std_1 = np.array([STATUS_AND_STD_OF_QUALITY.get(int(q), (-1, np.nan))[1] for q in gga.quality])
-    status = np.array([STATUS_AND_STD_OF_QUALITY.get(int(q), (-1, np.nan))[0] for q in gga.quality], np.int64)
-    horizontal = (np.where(gga.hdop > 0, gga.hdop, np.nan) * std_1) ** 2
-    variances = np.stack((horizontal, horizontal, 4 * horizontal), -1).reshape(-1, 3)
+    quality = classify_fixes(gga.quality, "gga")
     alt = gga.alt_m + separation
     drops = {
         "broken": gga.broken,
-        "no_fix": status < 0,
+        "no_fix": quality < 0,
         "not_finite": ~np.isfinite(gga.lat_deg + gga.lon_deg + alt),
         "null_island": (gga.lat_deg == 0) & (gga.lon_deg == 0),
         "outside_the_globe": _is_outside(gga.lat_deg, gga.lon_deg),
     }
     without_geoid = len(gga.row) > 0 and not known.any()
-    values = _read_gnss(gga.lon_deg, gga.lat_deg, alt, variances, status)
+    values = _read_gnss(gga.lon_deg, gga.lat_deg, alt, np.full((alt.size, 3), np.nan), quality)
+    values["dop"] = np.where(gga.hdop > 0, gga.hdop, 1.0)
     found = _select_rows(of_gga, values, drops)
     others = len(sentences) - len(gga.row)
     own_time_ns = add_date(gga.time_of_day_ns[found.row], found.log_time_ns)
@@ -473,7 +485,7 @@ def _read_pose(columns: Columns) -> Readings:
     if np.all(quat == quat[:1]):  # positions alone
         quat[:] = np.nan
     if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
-        variances[:, 2] = _NO_HEIGHT_M2
+        variances[:, 2] = NO_HEIGHT_M2
     values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
     values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), np.full(len(place), np.nan))
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
@@ -487,6 +499,10 @@ def _read_pose(columns: Columns) -> Readings:
 _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
     ("gnss", roles.NAV_SAT_FIX): _read_nav_sat_fix,
     ("gnss", roles.NMEA_SENTENCE): _read_nmea,
+    **{
+        ("gnss", type_name): lambda columns: _read_nav_sat_fix(convert_gps_fix(columns))
+        for type_name in roles.GPS_FIXES
+    },
     ("gnss_velocity", roles.NMEA_SENTENCE): _read_velocity_sentences,
     ("gnss_velocity", roles.TWIST_STAMPED): _read_velocity_twist,
     ("gnss_velocity", roles.TWIST_WITH_COVARIANCE_STAMPED): _read_velocity_twist,
@@ -544,43 +560,6 @@ _FIELDS: dict[str, tuple[str, ...]] = {
     roles.TWIST_STAMPED: (*_STAMP, *_expand_field_names("twist.linear.", "twist.angular.")),
     roles.TWIST_WITH_COVARIANCE_STAMPED: (*_STAMP, *_expand_field_names("twist.twist.linear.", "twist.twist.angular.")),
 }
-
-
-STANDARD_GRAVITY_MPS2 = 9.80665
-
-_FACTORS = {
-    "si": (1.0, 1.0),
-    "deg": (np.pi / 180.0, 1.0),
-    "g": (1.0, STANDARD_GRAVITY_MPS2),
-    "deg_g": (np.pi / 180.0, STANDARD_GRAVITY_MPS2),
-}
-
-
-def convert_imu_to_si(readings: Readings, units: str) -> Readings:
-    """Return an IMU's readings in rad/s and m/s², variances included.
-
-    ``units`` is the recipe's ``imu_units``: si, deg (deg/s and m/s²), g (rad/s and g) or deg_g (deg/s and g).
-    """
-    rate, force = _FACTORS[units]
-    columns = dict(readings.columns)
-    for prefix, factor in (("angular_velocity_", rate), ("linear_acceleration_", force)):
-        for name in [name for name in columns if name.startswith(prefix)]:
-            columns[name] = columns[name] * (factor**2 if name.endswith("_var") else factor)
-    return replace(readings, columns=columns)
-
-
-_LENGTHS = {"velocity_": 1, "velocity_var_": 2, "x_m": 1, "y_m": 1, "z_m": 1}
-"""Columns of an odometry, or how they begin, that hold lengths, and to which power."""
-
-
-def scale_odometry(readings: Readings, factor: float) -> Readings:
-    """Return an odometry's readings with all lengths times ``factor``, variances included; turns stay."""
-    columns = dict(readings.columns)
-    for name, values in readings.columns.items():
-        powers = [power for prefix, power in _LENGTHS.items() if name.startswith(prefix)]
-        if powers:
-            columns[name] = values * factor ** max(powers)
-    return replace(readings, columns=columns)
 
 
 def select_ground_velocity(readings: Readings, frame: str, topic: str) -> Readings:

@@ -20,16 +20,6 @@ Floats = NDArray[np.float64]
 
 NS_PER_DAY = 86_400_000_000_000
 
-STATUS_AND_STD_OF_QUALITY: dict[int, tuple[int, float]] = {
-    1: (0, 4.0),  # GPS
-    2: (1, 1.0),  # differential, which includes satellite-based augmentation
-    3: (0, 4.0),  # PPS
-    4: (2, 0.02),  # RTK, integers fixed
-    5: (2, 0.5),  # RTK, float
-    9: (1, 1.0),  # satellite-based augmentation (some makers)
-}
-"""GGA quality to NavSatStatus and horizontal standard deviation at HDOP 1 [m]; others (none, estimated, manual, simulated) are no fix."""
-
 KNOT_MPS = 1852.0 / 3600.0
 _VAST = 1e6
 _STATUS_OF_MODE = {"": 0, "A": 0, "P": 0, "D": 1, "R": 2, "F": 2}

@@ -51,7 +51,7 @@ OVERLAY = "/tcpipe/"
 """Topics below it are what `tcpipe overlay` made of a log: they play no role, lest a run is made of another's results."""
 
 ROLE_TYPES: dict[str, tuple[str, ...]] = {
-    "gnss": (NAV_SAT_FIX, NMEA_SENTENCE),
+    "gnss": (NAV_SAT_FIX, *GPS_FIXES, NMEA_SENTENCE),
     "imu": (IMU,),
     "wheel_odometry": _MEASURED_TWISTS,
     "visual_odometry": _MEASURED_TWISTS,
@@ -180,6 +180,8 @@ def assign_roles(
         if role not in decided.roles and role not in settled
     }
     poses, velocities = found.pop("pose", []), found.pop("gnss_velocity", [])
+    if not found.get("gnss", velocities):
+        found["gnss"] = [of for of in velocities if of[2].type_name in GPS_FIXES]
     robots = find_robot_namespaces({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
     if robots:
         decided.problems += ask_which_robot(robots)
@@ -189,7 +191,10 @@ def assign_roles(
             _decide(decided, role, candidates)
     _decide_pose(decided, poses, taken="gnss" in {*decided.roles, *decided.undecided} or "pose" in wanted)
     if "gnss_velocity" not in settled:
-        _decide_velocity(decided, velocities + _collect_nmea_topics(decided, listed.values(), ignored))
+        apart = [
+            of for of in velocities if "gnss" not in decided.roles or of[2].name not in decided.roles["gnss"].topics
+        ]
+        _decide_velocity(decided, apart + _collect_own_velocities(decided, listed.values(), ignored))
     elif "gnss_velocity" in decided.roles and "gnss" not in decided.roles:
         decided.problems.append(f"recipe read.topics.gnss_velocity: {_NO_FIXES}")
     no_motion, proposed = _find_no_motion(decided, list(listed.values()))
@@ -268,11 +273,12 @@ def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
             decided.pass_over("gnss_velocity", topic, why, reason)
 
 
-def _collect_nmea_topics(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
-    """Return the topics of NMEA sentences, which may tell places and velocities at once."""
-    rank = (ROLE_TYPES["gnss_velocity"].index(NMEA_SENTENCE),)
-    of_type = [topic for topic in topics if topic.type_name == NMEA_SENTENCE]
-    return [(rank, "", topic) for topic in of_type if _is_usable(decided, topic, ignored)]
+def _collect_own_velocities(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
+    """Return the topics of NMEA sentences, which may tell places and velocities at once, and the fixes that do."""
+    fixes = decided.roles["gnss"].topics if "gnss" in decided.roles else ()
+    both = [of for of in topics if of.type_name == NMEA_SENTENCE or (of.type_name in GPS_FIXES and of.name in fixes)]
+    rank = ROLE_TYPES["gnss_velocity"].index
+    return [((rank(topic.type_name),), "", topic) for topic in both if _is_usable(decided, topic, ignored)]
 
 
 def _take_chosen(

@@ -10,12 +10,15 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any
+from typing import Any, Literal
 
 from tcpipe.errors import RecipeError
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.robots import GENERIC, Robot
 from tcpipe.tables.findings import Finding, Severity, Subject, make_finding
+
+AutopilotKind = Literal["ulog", "dataflash"]
+"""Logs of autopilots: PX4's and ArduPilot's."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
-from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_card import DatasetCard, list_shifts
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     PatchFiles,
@@ -184,7 +184,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     run = _run(opened, directory, card, sample)
     streams = opened.read_streams(run.run_id, key=run.streams_key)
     source = open_map(*opened.map_files(sample.map))
-    made = _sample_again(sample, run, streams, source, card.recipe)
+    made = _sample_again(sample, run, streams, source, card)
     differences = tuple(_iterate_differences(open_patches(directory, card, fetched), card, sample, made))
     if differences:
         differences += tuple(_iterate_reasons(card, sample, run, source))
@@ -204,7 +204,7 @@ def _read_history(
         messages={} if streams is None else dict(_find_messages(streams, *window)),
         masks=tuple(_iterate_masks(run, *window)),
         rejected=tuple(_iterate_rejections(run, *window)),
-        map=_map(source, sample, card.recipe),
+        map=_map(source, sample, card),
         recipe_differs_in={key: of for key, of in flatten_recipe(card.recipe).items() if of != _DEFAULTS.get(key)},
         versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
         made_from="segments" if streams is None else "streams",
@@ -296,8 +296,9 @@ def _iterate_rejections(run: RunDirectory, start_ns: int, end_ns: int) -> Iterat
         yield NearbyRefusal(role, reason, count)
 
 
-def _map(source: MapFile, sample: _Sample, recipe: Recipe) -> SampleMap:
-    corners = _sample_segment(sample.values, source, recipe).footprint_xy_m.reshape(-1, 2)
+def _map(source: MapFile, sample: _Sample, card: DatasetCard) -> SampleMap:
+    known = {**sample.values, "position_std_m": 0.0}  # that of the shift is in it already
+    corners = _sample_segment(known, source, card).footprint_xy_m.reshape(-1, 2)
     px = source.grid.px_from_xy(corners)
     ends = (px.min(axis=0), px.max(axis=0)) if len(px) else (np.zeros(2), -np.ones(2))
     low, high = (np.floor(end / source.tile_px).astype(int) for end in ends)
@@ -312,15 +313,16 @@ def _map(source: MapFile, sample: _Sample, recipe: Recipe) -> SampleMap:
     )
 
 
-def _sample_segment(segment: Mapping[str, Value], source: MapFile, recipe: Recipe) -> Sampled:
-    """Sample one segment, given as a row of values."""
+def _sample_segment(segment: Mapping[str, Value], source: MapFile, card: DatasetCard) -> Sampled:
+    """Sample one segment, given as a row of values, moved as the dataset's run was."""
     row = {column.name: pa.array([segment[column.name]], column.dtype) for column in PLACED_SEGMENTS.columns}
     table = pa.Table.from_arrays(list(row.values()), schema=PLACED_SEGMENTS.arrow())
-    return sample_segments(table, source, recipe.sample, gnss_crs=recipe.read.gnss_crs)
+    shifts = list_shifts(entry for of in card.maps if of.name == source.name for entry in of.registration)
+    return sample_segments(table, source, card.recipe.sample, gnss_crs=card.recipe.read.gnss_crs, shifts=shifts)
 
 
 def _sample_again(
-    sample: _Sample, run: RunDirectory, streams: Streams | None, source: MapFile, recipe: Recipe
+    sample: _Sample, run: RunDirectory, streams: Streams | None, source: MapFile, card: DatasetCard
 ) -> tuple[Mapping[str, Value], Patches] | str:
     """Return the segment and its patch as they come out now, or why they do not.
 
@@ -330,7 +332,7 @@ def _sample_again(
         segments = run.segments()
     else:
         try:
-            segments = run_stages(streams, recipe.ingest, run_id=run.run_id)[2].table
+            segments = run_stages(streams, card.recipe.ingest, run_id=run.run_id)[2].table
         except TcpipeError as error:
             return "; ".join(error.problems)
     row = pc.index(segments.column("segment_id"), sample.sample_id).as_py()
@@ -339,10 +341,10 @@ def _sample_again(
         near = f"; the nearest begins {away_s:.3f} s away" if segments.num_rows else "; it has none now"
         return f"no segment of run {run.run_id} begins at this stamp now{near}"
     segment = segments.slice(row, 1).to_pylist()[0]
-    sampled = _sample_segment(segment, source, recipe)
+    sampled = _sample_segment(segment, source, card)
     if len(sampled.kept) == 0:
         return f"map {source.name} no longer gives a patch for it"
-    return segment, sampled.patches
+    return {**segment, "position_std_m": sampled.position_std_m.item()}, sampled.patches
 
 
 def _iterate_differences(

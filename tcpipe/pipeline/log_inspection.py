@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.labels import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
+from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SECOND_NS, SIMULATED_NS, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import RoleAssignment
@@ -24,10 +25,6 @@ from tcpipe.robots import Profiles
 from tcpipe.stages.read_roles import decide_roles, find_power_candidates, find_read_config
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
-
-if TYPE_CHECKING:
-    from tcpipe.formats.logs.table_log import TableLog
-
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -12,14 +12,16 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
+from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.integrity import compute_checksum, read_seal
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import list_raster_files
-from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
+from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, RasterOrigin, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.run_documents import remove_if_empty
+from tcpipe.pipeline.open_data import fetch_open_data
 from tcpipe.pipeline.options import AddMapOptions, Files
 from tcpipe.report.pictures import draw_quick_look, write_quick_look
 from tcpipe.store import Store, open_store
@@ -62,16 +64,24 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
     Raises
     ------
     MapError, StoreError
-        When a raster cannot be placed, the classes are not the store's, or the store cannot be written: the store is as it was.
+        When a raster cannot be had or placed, the classes are not the store's, or the store cannot be written: the store is as it was.
     """
     name, layers, categorical = options.name, options.layers or {}, options.categorical or {}
-    _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
+    _refuse_layers(layers, categorical, ortho=bool(options.ortho or options.stac), ortho_bands=options.ortho_bands)
     given = {role: getattr(options, role) for role in _ROLES}
     tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
     files = _find_files({role: value for role, value in {**given, **layers, **tables}.items() if value})
     bands = None if options.ortho_bands == "grey" else options.ortho_bands
-    with remove_if_empty(options.store):
+    with remove_if_empty(options.store), make_scratch_directory() as scratch:
         opened = open_store(options.store, create=True)
+        origins: tuple[RasterOrigin, ...] = ()
+        if options.stac is not None:
+            plan, fetched = fetch_open_data(options, opened, scratch)
+            origins, files = plan.origins, {**files, **fetched}
+        if "height" not in files:
+            raise UsageError(
+                f"map {name}: no height raster; give --height FILE, or --stac with a collection of heights"
+            )
         before = opened.map_number(name)
         inputs = MapInputs(_compute_checksums(files), options.crs, tuple(sorted(categorical)), bands)
         more = MoreLayers(
@@ -95,6 +105,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
                     agreed=_agree_classes(opened, name),
                     crs=options.crs,
                     inputs=inputs,
+                    origins=origins,
                 )
                 write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), read_seal(path))
         except StoreError:

@@ -20,6 +20,7 @@ Role = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometr
 MappedRole = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "command", "pose"]
 """Roles whose messages can be mapped; power has tables of its own, [[power_sources]]."""
 MadeFrom = Literal["imu", "wheel_odometry", "visual_odometry"]
+FixQuality = Literal["rtk_fixed", "rtk_float", "differential", "single"]
 Fraction = Annotated[float, Bounds(ge=0, le=1)]
 Deviation = Annotated[float, Bounds(ge=1e-6, le=1e3)]
 """A standard deviation or noise: a millionth is lost beside what it is added to, a thousand weighs nothing."""
@@ -77,6 +78,8 @@ class ReadConfig:
     """Sensor extrinsics by role; overrides /tf_static."""
     gnss_crs: str = "EPSG:4326"
     """Geographic CRS of the GNSS positions; RTK often comes in a national datum."""
+    fix_std_m: dict[FixQuality, Deviation] = field(default_factory=dict, metadata=LEFT_OUT)
+    """Horizontal σ of fixes without or with constant covariance [m]: rtk_fixed 0.02, rtk_float 0.5, differential 1, single 4."""
     time_source: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
     """Source of stamps by role: header, log or auto; auto uses header.stamp if it is set and follows the log time."""
     time_offset_s: dict[Role, Offset] = field(default_factory=dict)
@@ -228,6 +231,8 @@ class SampleConfig:
     """Smallest share of valid pixels of a patch."""
     max_position_std_m: Deviation = 0.10
     """Largest standard deviation of the absolute position of a sample [m]."""
+    align: bool = False
+    """Whether each run is moved by the shift at which its heights fit the map's ground; its σ counts in max_position_std_m."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "sample")

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, cast, get_args
 
+import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
@@ -21,12 +22,10 @@ from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
 from tcpipe.logs.messages import (
     LOG_TIME,
     Readings,
-    convert_imu_to_si,
     count_frames,
     find_utc_offset,
     list_needed_fields,
     read_messages,
-    scale_odometry,
     select_ground_velocity,
 )
 from tcpipe.logs.roles import RoleAssignment
@@ -97,7 +96,8 @@ def read_sources(
     for role, topic in list(arrays):
         columns = arrays.pop((role, topic))
         if role != "power":
-            readings = read_messages(columns, role, _find_type(topics[topic], role, config))
+            std_m = cast("dict[str, float]", config.fix_std_m)
+            readings = read_messages(columns, role, _find_type(topics[topic], role, config), fix_std_m=std_m)
         elif topic in power.rails:
             readings = select_power_rows(columns, power.rails[topic])
         else:
@@ -118,6 +118,43 @@ def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
     if role == "gnss_velocity" and role not in config.topics:
         return select_ground_velocity(readings, next(iter(source.frames), ""), source.topic)
     return scale_odometry(readings, config.odometry_scale[role]) if role in config.odometry_scale else readings
+
+
+_STANDARD_GRAVITY_MPS2 = 9.80665
+
+_FACTORS = {
+    "si": (1.0, 1.0),
+    "deg": (np.pi / 180.0, 1.0),
+    "g": (1.0, _STANDARD_GRAVITY_MPS2),
+    "deg_g": (np.pi / 180.0, _STANDARD_GRAVITY_MPS2),
+}
+
+
+def convert_imu_to_si(readings: Readings, units: str) -> Readings:
+    """Return an IMU's readings in rad/s and m/s², variances included.
+
+    ``units`` is the recipe's ``imu_units``: si, deg (deg/s and m/s²), g (rad/s and g) or deg_g (deg/s and g).
+    """
+    rate, force = _FACTORS[units]
+    columns = dict(readings.columns)
+    for prefix, factor in (("angular_velocity_", rate), ("linear_acceleration_", force)):
+        for name in [name for name in columns if name.startswith(prefix)]:
+            columns[name] = columns[name] * (factor**2 if name.endswith("_var") else factor)
+    return replace(readings, columns=columns)
+
+
+_LENGTHS = {"velocity_": 1, "velocity_var_": 2, "x_m": 1, "y_m": 1, "z_m": 1}
+"""Columns of an odometry, or how they begin, that hold lengths, and to which power."""
+
+
+def scale_odometry(readings: Readings, factor: float) -> Readings:
+    """Return an odometry's readings with all lengths times ``factor``, variances included; turns stay."""
+    columns = dict(readings.columns)
+    for name, values in readings.columns.items():
+        powers = [power for prefix, power in _LENGTHS.items() if name.startswith(prefix)]
+        if powers:
+            columns[name] = values * factor ** max(powers)
+    return replace(readings, columns=columns)
 
 
 def _find_type(topic: Topic, role: Role, config: ReadConfig) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import pyarrow as pa
@@ -29,6 +30,10 @@ from tcpipe.terrain.sampling import (
 )
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection
 
+Shifts = Mapping[str, tuple[float, float, float]]
+"""By run: what is added to its positions to find their ground on a map, x and y, and the DRMS of that [m]."""
+NO_SHIFTS: Shifts = MappingProxyType({})
+
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
 
@@ -38,12 +43,14 @@ class Sampled:
 
     ``kept`` are the rows of the segments that have a patch, (N,), rising on each map; all else of N is in that order. ``map_index`` says
     which map each is on. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS 84 lon, lat
-    [deg]. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,). Where pixels wait in files, those of ``patches`` are empty.
+    [deg]. ``position_std_m`` is their DRMS, (N,), with that of the run's shift. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,).
+    Where pixels wait in files, those of ``patches`` are empty.
     """
 
     kept: NDArray[np.int64]
     map_index: NDArray[np.uint8]
     patches: Patches
+    position_std_m: NDArray[np.float64]
     footprint_xy_m: NDArray[np.float64]
     footprint_lonlat_deg: NDArray[np.float64]
     lost_by: NDArray[np.uint32]
@@ -51,7 +58,13 @@ class Sampled:
 
 
 def sample_segments(
-    segments: pa.Table, source: MapReader, config: SampleConfig, *, gnss_crs: str, pool: TilePool | None = None
+    segments: pa.Table,
+    source: MapReader,
+    config: SampleConfig,
+    *,
+    gnss_crs: str,
+    pool: TilePool | None = None,
+    shifts: Shifts = NO_SHIFTS,
 ) -> Sampled:
     """Return the patches of all segments that are on the map.
 
@@ -61,6 +74,7 @@ def sample_segments(
         untraversable.
     source, pool : the map, and its tiles as `sample_patches` takes them.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
+    shifts : of runs on this map.
 
     Raises
     ------
@@ -68,12 +82,15 @@ def sample_segments(
     """
     PLACED_SEGMENTS.check(segments, more=True)
     chord_m, projection = to_floats(segments, "chord_m"), find_map_projection(source, gnss_crs)
-    start, end = (projection.forward(read_lonlat_deg(segments, name)) for name in ("start", "end"))
+    moved = (shifts.get(run_id, (0.0, 0.0, 0.0)) for run_id in segments.column("run_id").to_pylist())
+    shift_m = np.array(list(moved)).reshape(-1, 3)
+    start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m[:, :2] for name in ("start", "end"))
     frames = make_patch_frames(start, end, chord_m)
     corners = compute_footprints(frames, config.patch_m)
     lost_by = np.zeros(segments.num_rows, np.uint32)
     lost_by[count_corners_on(source.grid, corners) < (4 if config.min_valid_fraction >= 1.0 else 1)] = Loss.OUTSIDE_MAP
-    lost_by[to_floats(segments, "position_std_m") > config.max_position_std_m] = Loss.POSITION_UNCERTAIN
+    std_m = np.hypot(to_floats(segments, "position_std_m"), shift_m[:, 2])
+    lost_by[std_m > config.max_position_std_m] = Loss.POSITION_UNCERTAIN
     rows = np.flatnonzero(lost_by == 0)
     frames = frames.rows(rows)
     check_scale(frames)
@@ -85,6 +102,7 @@ def sample_segments(
         kept=kept,
         map_index=np.zeros(kept.size, np.uint8),
         patches=patches,
+        position_std_m=std_m[kept],
         footprint_xy_m=corners[kept],
         footprint_lonlat_deg=find_map_projection(source, "EPSG:4326").inverse(corners[kept]),
         lost_by=lost_by,
@@ -139,10 +157,11 @@ def sample_on_maps(
     *,
     gnss_crs: str,
     pools: Sequence[TilePool | None] | None = None,
+    shifts: Sequence[Shifts] | None = None,
 ) -> Sampled:
     """Return the patches of all segments that are on one of the maps; where maps overlap, the earlier one counts.
 
-    Parameters as `sample_segments`; ``pools`` has one a map.
+    Parameters as `sample_segments`; ``pools`` and ``shifts`` have one a map.
 
     Raises
     ------
@@ -152,9 +171,10 @@ def sample_on_maps(
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)
     waiting = np.arange(segments.num_rows)
     parts: list[Sampled] = []
-    for number, (source, pool) in enumerate(zip(sources, pools or [None] * len(sources), strict=True)):
+    each = zip(sources, pools or [None] * len(sources), shifts or [NO_SHIFTS] * len(sources), strict=True)
+    for number, (source, pool, moved) in enumerate(each):
         here = segments if len(waiting) == segments.num_rows else segments.take(pa.array(waiting))
-        found = sample_segments(here, source, config, gnss_crs=gnss_crs, pool=pool)
+        found = sample_segments(here, source, config, gnss_crs=gnss_crs, pool=pool, shifts=moved)
         known = found.lost_by != Loss.OUTSIDE_MAP  # a hole in one map outweighs lying outside the next
         lost_by[waiting[known]] = found.lost_by[known]
         place = np.full(found.kept.size, number, np.uint8)
@@ -165,6 +185,7 @@ def sample_on_maps(
         kept=np.concatenate([part.kept for part in parts]),
         map_index=np.concatenate([part.map_index for part in parts]),
         patches=join_patches([part.patches for part in parts]),
+        position_std_m=np.concatenate([part.position_std_m for part in parts]),
         footprint_xy_m=np.concatenate([part.footprint_xy_m for part in parts]),
         footprint_lonlat_deg=np.concatenate([part.footprint_lonlat_deg for part in parts]),
         lost_by=lost_by,

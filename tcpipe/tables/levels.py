@@ -383,7 +383,7 @@ LABELLED_SEGMENTS = TableSchema(
 
 PLACED_SEGMENTS = LABELLED_SEGMENTS.select_columns(
     *(f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")),
-    *("chord_m", "arc_length_m", "position_std_m"),
+    *("run_id", "chord_m", "arc_length_m", "position_std_m"),
 )
 """What sampling reads of a segment."""
 

@@ -4,10 +4,14 @@ A track's heights and the map's differ by a constant (ellipsoid against geoid, t
 the shape of the ground; the horizontal shift at which the two shapes agree best is searched over a small window, as in terrain-aided
 navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary no shift can be
 told, and none is. The track's heights are also regressed on the map's: a map in feet rises 3.28 where the track rises one.
+
+A shift that is to be applied is fitted together with a tilt of the map and a drift of the track's heights, which look like a shift on a
+smooth hill, and from the misfit itself: along slopes that are noisy a step is too short. It is determined on less ground, more honestly.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,15 +20,20 @@ from scipy.ndimage import minimum_filter
 
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
+from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_window
 
 FloatArray = NDArray[np.float64]
+Rows = NDArray[np.int64]
 
 REACH_M = 3.0
 """Shifts are searched this far each way [m]."""
 
 KNOWN_M = 0.25
 """A direction along which the shift's standard deviation is larger is not determined by the ground [m]."""
+
+TILTED_REACH_M = 4.0
+"""With a tilt they are searched this far: a shift of 3.5 m is not at the edge [m]."""
 
 _STEP_M = 0.25
 _SPACING_M = 0.5
@@ -43,6 +52,19 @@ _RIVAL_SIGMAS = 3.0
 _APART_M = 0.75
 """Ground that fits nearly as well somewhere else, this far away, does not tell where the track is [m]."""
 _RIDGE = 1e-12
+_FEW_BLOCKS = 1.26
+"""Factor of a variance from so few blocks, so that two standard deviations cover 95 % (square of the ratio of Student's t and normal)."""
+_ROUNDS, _REWEIGHTINGS, _LEAST_MISFIT_M = 6, 20, 0.01
+_DRIFT_M = 25.0
+"""Stretches of path in which the track's heights may be off by a constant of their own [m]: those of GNSS drift over tens of seconds."""
+_NEAR = 2
+"""A paraboloid is fitted to the misfits of shifts that are so many steps each way from the best."""
+_CLIFF_M = 1.0
+"""Ground that varies more among these shifts is steeper than what is driven on [m]."""
+_NORTH_M, _EAST_M = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1) * _STEP_M
+_PARABOLOID = np.linalg.pinv(
+    np.stack([np.ones_like(_EAST_M), _EAST_M, _NORTH_M, _EAST_M**2, _EAST_M * _NORTH_M, _NORTH_M**2], axis=1)
+)
 FOOT_M = 0.3048
 _ABOUT = 0.02
 _KNOWN_SCALE = 0.03
@@ -85,6 +107,7 @@ class Registration:
     directions only; ``shift_std_m`` its largest standard deviation along them, NaN where none is determined. ``height_offset_m`` is track
     minus map; ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left without and with the shift. ``significant``:
     the shift is not chance. ``at_reach``: the best shift lies at the window's edge, the true one may be larger. ``scale`` is of heights.
+    ``axis_std_m`` are the shift's standard deviations along both axes, NaN where a direction is not determined.
     """
 
     points: int
@@ -96,14 +119,27 @@ class Registration:
     significant: bool
     at_reach: bool
     scale: HeightScale
+    axis_std_m: tuple[float, float]
 
     @property
     def shift_m(self) -> float:
         """Length of the shift [m]."""
         return float(np.hypot(*self.shift_xy_m))
 
+    @property
+    def position_std_m(self) -> float:
+        """DRMS of the shift [m], NaN unless it is determined in both directions."""
+        return float(np.hypot(*self.axis_std_m))
 
-def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) -> Registration | None:
+    @property
+    def left_m(self) -> float:
+        """Misfit with the shift if that is significant, else without [m]."""
+        return self.shifted_misfit_m if self.significant else self.misfit_m
+
+
+def register_track(
+    source: MapReader, xy_m: FloatArray, height_m: FloatArray, *, with_tilt: bool = False
+) -> Registration | None:
     """Find the horizontal shift at which the map's ground fits the track's heights best.
 
     Parameters
@@ -112,6 +148,7 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     xy_m : positions of the track in the map's CRS, in the order driven, shape (N, 2) [m]; what is not finite or not on the map is passed
         over.
     height_m : their heights above any surface, shape (N,) [m].
+    with_tilt : fit a tilt of the map and a drift of the heights, too; misfits are then without both.
 
     Returns
     -------
@@ -121,19 +158,54 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
     at = np.flatnonzero(finite)[_thin_points(xy_m[finite])]
     at = at[level.grid.contains(xy_m[at])]
-    steps = round(REACH_M / _STEP_M)
+    steps = round((TILTED_REACH_M if with_tilt else REACH_M) / _STEP_M)
     shift_m = np.arange(-steps, steps + 1, dtype=np.float64) * _STEP_M
     ground_m = _sample_heights(level, xy_m[at], shift_m)
     whole = np.isfinite(ground_m).all(axis=(1, 2))
     if whole.sum() < _FEWEST_POINTS:
         return None
-    excess_m = ground_m[whole] - height_m[at][whole, None, None]
-    best = _find_least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
-    left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
-    good = left <= _OUTLIER * estimate_robust_std(left) + 1e-6  # what is not the ground: bridges, trees
-    best = _find_least(excess_m[good].var(axis=0))
-    scale = _fit_height_scale(ground_m[whole][good], height_m[at][whole][good])
-    return _refine_shift(excess_m[good], best, shift_m, scale)
+    at, ground_m = at[whole], ground_m[whole]
+    excess_m = ground_m - height_m[at][:, None, None]
+    if with_tilt:
+        good, tilt_m = _find_ground(excess_m, xy_m[at])
+        if good.sum() < _FEWEST_POINTS:
+            return None
+        ground_m -= tilt_m[:, None, None]
+    else:
+        best = _find_least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
+        left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
+        good = left <= _OUTLIER * estimate_robust_std(left) + 1e-6  # what is not the ground: bridges, trees
+    scale = _fit_height_scale(ground_m[good], height_m[at][good])
+    return _refine_shift(excess_m[good], shift_m, scale, xy_m[at][good] if with_tilt else None)
+
+
+def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Return which points are on the map's ground at the shift that fits these best, (N,), and the tilt there, (N,) [m]."""
+    middle = excess_m.shape[1] // 2
+    flat_m = excess_m - _fit_tilt(xy_m, excess_m[:, middle, middle])[:, None, None]
+    best = _find_least(np.median(np.abs(flat_m - np.median(flat_m, axis=0)), axis=0))
+    for _ in range(_ROUNDS):
+        tilt_m = _fit_tilt(xy_m, excess_m[:, *best])
+        left = excess_m[:, *best] - tilt_m
+        left = np.abs(left - np.median(left))
+        relief_m = np.ptp(_take_near(excess_m, best), axis=(1, 2))
+        # steep ground misfits where the shift is off by a step
+        good = (left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)) & (relief_m < _CLIFF_M)
+        if good.sum() < _FEWEST_POINTS:
+            break
+        before, best = best, _find_least(_flatten(excess_m[good], xy_m[good])[0].var(axis=0))
+        if best == before:
+            break
+    return good, tilt_m
+
+
+def _fit_tilt(xy_m: FloatArray, excess_m: FloatArray) -> FloatArray:
+    """Return the tilt of the plane that leaves the least absolute excess, shape (N,) [m]: a bridge or a tree does not turn it."""
+    columns, weight = np.column_stack([xy_m - xy_m.mean(axis=0), np.ones(len(xy_m))]), np.ones(len(xy_m))
+    for _ in range(_REWEIGHTINGS):
+        fitted = np.linalg.lstsq(columns * weight[:, None], excess_m * weight, rcond=None)[0]
+        weight = 1.0 / np.sqrt(np.abs(excess_m - columns @ fitted) + _LEAST_MISFIT_M)
+    return np.asarray(columns[:, :2] @ fitted[:2])
 
 
 def _thin_points(xy_m: FloatArray) -> NDArray[np.int64]:
@@ -188,35 +260,113 @@ def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray) -> HeightScale
     return HeightScale(float(products[i, j] / (squares[i, j] + _RIDGE)), std, float(explained[i, j]))
 
 
-def _refine_shift(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray, scale: HeightScale) -> Registration:
-    """Refine the best shift of the lattice by one Gauss-Newton step, and tell how sure it is by leaving stretches out."""
+def _refine_shift(
+    excess_m: FloatArray, shift_m: FloatArray, scale: HeightScale, tilted_xy_m: FloatArray | None
+) -> Registration:
+    """Refine the best shift of the lattice, and tell how sure it is by leaving stretches out; with the points a tilt and a drift, too."""
+    raw_m, blocks, edge = excess_m, _cut_stretches(len(excess_m)), 1
+    if tilted_xy_m is not None:
+        edge = _NEAR
+        excess_m, tilt, stretches = _flatten(excess_m, tilted_xy_m)
+    best = _find_least(excess_m.var(axis=0))
     last, middle = shift_m.size - 1, shift_m.size // 2
-    i, j = (min(max(index, 1), last - 1) for index in best)
+    i, j = (min(max(index, edge), last - edge) for index in best)
     east, north = excess_m[:, i, j + 1] - excess_m[:, i, j - 1], excess_m[:, i + 1, j] - excess_m[:, i - 1, j]
     slope = np.stack([east, north], axis=1) / (2.0 * _STEP_M)
     slope -= slope.mean(axis=0)
     unshifted, left = (excess_m[:, a, b] - excess_m[:, a, b].mean() for a, b in ((middle, middle), (i, j)))
-    step_m, covariance = _step(slope, left)
+    if tilted_xy_m is None:
+        step_m, covariance = _step(slope, left)
+    else:
+        step_m, covariance, blocks = _descend(
+            _take_near(excess_m, (i, j)), tilt, _group_stretches(tilted_xy_m, stretches)
+        )
     variances, axes = np.linalg.eigh(covariance)
     known = axes[:, variances < KNOWN_M**2]
-    if not _is_distinct(excess_m, (i, j), known, shift_m):
+    if not _is_distinct(excess_m, (i, j), known, shift_m, blocks):
         known = axes[:, :0]
     step_m = known @ np.clip(known.T @ step_m, -_STEP_M, _STEP_M)
     shifted = left + slope @ step_m
     fitted = known @ known.T @ np.array([shift_m[j], shift_m[i]]) + step_m
     weight = float(((known.T @ fitted) ** 2 / variances[: known.shape[1]]).sum())
-    gain, sigmas = _compute_gain(unshifted, shifted)
+    gain, sigmas = _compute_gain(unshifted, shifted, blocks)
+    axis_std_m = np.sqrt(np.diag(covariance)) if known.shape[1] == len(axes) else np.full(len(axes), np.nan)
     return Registration(
         points=len(excess_m),
         shift_xy_m=(float(fitted[0]), float(fitted[1])),
         shift_std_m=float(np.sqrt(variances[known.shape[1] - 1])) if known.size else float("nan"),
-        height_offset_m=-float(excess_m[:, i, j].mean()),
+        height_offset_m=-float(raw_m[:, i, j].mean()),
         misfit_m=float(unshifted.std()),
         shifted_misfit_m=float(shifted.std()),
         significant=weight > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
         at_reach=bool(known.size) and (i, j) != best,
         scale=scale,
+        axis_std_m=(float(axis_std_m[0]), float(axis_std_m[1])),
     )
+
+
+def _take_near(values: FloatArray, best: tuple[int, int]) -> FloatArray:
+    """Return the values of shifts near the best one, shape (N, K, K)."""
+    i, j = (min(max(index, _NEAR), values.shape[1] - 1 - _NEAR) for index in best)
+    return values[:, i - _NEAR : i + _NEAR + 1, j - _NEAR : j + _NEAR + 1]
+
+
+def _flatten(excess_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, list[Rows]]:
+    """Return the excess without drift and tilt, the columns of a tilt, (N, 2), and the rows of stretches whose means are zero.
+
+    Stretches are `_DRIFT_M` long, shorter where there would be too few to leave some out.
+    """
+    path_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
+    stretches = np.array_split(np.arange(len(xy_m)), max(_BLOCKS, round(path_m / _DRIFT_M)))
+    stretches = [rows for rows in stretches if rows.size]
+    flat_m, tilt = (
+        np.concatenate([values[rows] - values[rows].mean(axis=0) for rows in stretches]) for values in (excess_m, xy_m)
+    )
+    return _remove_tilt(flat_m, tilt), tilt, stretches
+
+
+def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
+    """Return values, shape (N, ...), less the least-squares multiples of the columns of a tilt, shape (N, 2)."""
+    flat = values.reshape(len(values), -1)
+    fitted = np.linalg.lstsq(tilt, flat - flat.mean(axis=0), rcond=None)[0]
+    return np.asarray((flat - tilt @ fitted).reshape(values.shape))
+
+
+def _group_stretches(xy_m: FloatArray, stretches: Sequence[Rows]) -> list[list[Rows]]:
+    """Return stretches in blocks, along the path and by place: errors of GNSS are alike in time, those of the map in place."""
+    centre_m = np.stack([xy_m[rows].mean(axis=0) for rows in stretches])
+    east, north = np.floor(centre_m - centre_m.min(axis=0)).astype(np.int64).T
+    orders = (np.arange(len(centre_m)), np.argsort(compute_morton(east, north), kind="stable"))
+    return [
+        [np.concatenate([stretches[row] for row in block]) for block in np.array_split(order, _BLOCKS)]
+        for order in orders
+    ]
+
+
+def _descend(
+    excess_m: FloatArray, tilt: FloatArray, groupings: Sequence[list[Rows]]
+) -> tuple[FloatArray, FloatArray, list[Rows]]:
+    """Return the step (2,) [m] from the middle of shifts, (N, K, K), to the least misfit, its covariance, and the blocks that gave it.
+
+    Of the groupings of rows the one counts that gives the larger covariance; it is added to what independent errors would give.
+    """
+    step_m, curvature, least = _find_bottom(excess_m, tilt)
+    found = []
+    for blocks in groupings:
+        without = [_find_bottom(np.delete(excess_m, rows, axis=0), np.delete(tilt, rows, axis=0))[0] for rows in blocks]
+        found.append(_estimate_covariance(np.stack(without)))
+    most = int(np.argmax([np.trace(covariance) for covariance in found]))
+    independent = 2.0 * least / len(excess_m) * np.linalg.inv(curvature)
+    is_bottom = bool((np.linalg.eigvalsh(curvature) > _RIDGE).all())
+    return step_m, _FEW_BLOCKS * found[most] + independent if is_bottom else np.eye(2) / _RIDGE, groupings[most]
+
+
+def _find_bottom(excess_m: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return the step [m] to the bottom of a paraboloid through the squared misfits, its second derivatives, and the least misfit."""
+    misfit = (_remove_tilt(excess_m, tilt) ** 2).sum(axis=0)
+    _, east, north, east2, both, north2 = _PARABOLOID @ misfit.ravel()
+    curvature = np.array([[2.0 * east2, both], [both, 2.0 * north2]]) + _RIDGE * np.eye(2)
+    return -np.linalg.solve(curvature, [east, north]), curvature, float(misfit.min())
 
 
 def _step(slope: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -235,27 +385,31 @@ def _step(slope: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
     return step_m, np.linalg.inv(total) * (left + slope @ step_m).var() + _estimate_covariance(np.stack(without))
 
 
-def _is_distinct(excess_m: FloatArray, best: tuple[int, int], known: FloatArray, shift_m: FloatArray) -> bool:
+def _is_distinct(
+    excess_m: FloatArray, best: tuple[int, int], known: FloatArray, shift_m: FloatArray, blocks: Sequence[Rows]
+) -> bool:
     """Tell whether every other shift that fits best around it, away along the known directions, fits clearly worse."""
     variance = excess_m.var(axis=0)
     north, east = np.meshgrid(shift_m - shift_m[best[0]], shift_m - shift_m[best[1]], indexing="ij")
     away = np.linalg.norm(np.stack([east, north], axis=-1) @ known, axis=-1) >= _APART_M
     rivals = np.argwhere(away & (variance == minimum_filter(variance, 3, mode="nearest")))
     left = excess_m[:, *best] - excess_m[:, *best].mean()
-    return all(_compute_gain(excess_m[:, a, b] - excess_m[:, a, b].mean(), left)[1] > _RIVAL_SIGMAS for a, b in rivals)
+    return all(
+        _compute_gain(excess_m[:, a, b] - excess_m[:, a, b].mean(), left, blocks)[1] > _RIVAL_SIGMAS for a, b in rivals
+    )
 
 
-def _compute_gain(unshifted: FloatArray, shifted: FloatArray) -> tuple[float, float]:
+def _compute_gain(unshifted: FloatArray, shifted: FloatArray, blocks: Sequence[Rows]) -> tuple[float, float]:
     """Return by how much the log of the mean squared misfit falls, and over how many of its standard deviations."""
     squares = np.stack([unshifted**2, shifted**2])
     gain = np.log(squares[0].sum() / squares[1].sum())
-    parts = np.stack([squares[:, block].sum(axis=1) for block in _cut_stretches(len(shifted))], axis=1)
+    parts = np.stack([squares[:, block].sum(axis=1) for block in blocks], axis=1)
     sums = squares.sum(axis=1, keepdims=True) - parts
     std = np.sqrt(_estimate_covariance(np.log(sums[0] / sums[1])[:, None])[0, 0])
     return float(gain), float(gain / max(std, 1e-12))
 
 
-def _cut_stretches(count: int) -> list[NDArray[np.int64]]:
+def _cut_stretches(count: int) -> list[Rows]:
     return np.array_split(np.arange(count), _BLOCKS)
 
 

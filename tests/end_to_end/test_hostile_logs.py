@@ -13,6 +13,7 @@ from pathlib import Path
 import lz4.frame
 import pytest
 import zstandard
+from autopilot_files import DataFlash, Ulog
 
 START_NS = 1_700_000_000_000_000_000
 MOST_SECONDS, MOST_BYTES = 20, 1 << 30
@@ -151,7 +152,32 @@ def linked(path):
     os.close(at)
 
 
+def ulog(*formats, data=b"", names=None):
+    """Write formats, a subscription to each of the names, and data."""
+    log = Ulog()
+    for text in formats:
+        log.message("F", text.encode())
+    for number, name in enumerate(names or [text.partition(":")[0] for text in formats]):
+        log.subscribe(name, number % 65_536)
+    return lambda path: path.write_bytes(log.bytes() + data)
+
+
+def ulog_data(number):
+    return struct.pack("<HBHQ", 10, 68, number, 1)
+
+
+def dataflash_format(number):
+    return b"\xa3\x95\x80" + struct.pack("<BB84s", number % 256, 2 + number % 3, b"a" * 84)
+
+
+def dataflash(data):
+    log = DataFlash()
+    log.format("ABC", "QB", "TimeUS,I")
+    return lambda path: path.write_bytes(log.bytes() + data)
+
+
 LISTS = "A[] a\n" + "=" * 80 + "\nMSG: acme_msgs/A\nuint8[] b\n"
+MANY = [f"a{number}:uint64_t timestamp;" for number in range(11_000)]
 WIDE = "".join(f"int8 f{number}\n" for number in range(9000))
 COMPUTED = "id INTEGER PRIMARY KEY, topic_id, timestamp, data GENERATED ALWAYS AS (zeroblob(900000000))"
 TOPIC = "INSERT INTO topics VALUES (0, '/t', 'a/msg/A', 'cdr')"
@@ -177,6 +203,17 @@ HOSTILE = {
     "files": (directory("", 4200), "bags of up to 4096 are read"),
     "names of files": (directory("rosbag2_bagfile_information:\n  relative_file_paths:\n" + "  - a\n" * 5000), "names 5000 files"),
     "links": (linked, ""),
+    "lists.ulg": (ulog("a:b[60000] b;", "b:c[60000] c;", "c:double[60000] d;"), "longer than any can be"),
+    "itself.ulg": (ulog("a:uint64_t timestamp;a[2] a;"), "formats inside formats"),
+    "formats.ulg": (ulog(*(f"a{n}:uint64_t timestamp;b b;" for n in range(3000)), "b:" + "int8_t[9] " + "x;"), ""),
+    "columns.ulg": (ulog(*(f"a{n}:" + "".join(f"int8_t x{i};" for i in range(5000)) for n in range(60))), "200000 columns"),
+    "topics.ulg": (ulog(*MANY, data=b"".join(map(ulog_data, range(11_000)))), "more than 10000 topics"),
+    "pieces.ulg": (ulog("a:uint64_t timestamp;", data=(ulog_data(0) + b"D") * 1_500_000), "a record is damaged"),
+    "heads.ulg": (ulog("a:uint64_t timestamp;", data=b"D" * 10_000_000), "the file ends inside"),
+    "unknown.ulg": (ulog(*(["a:uint64_t timestamp;"] * 2), names=[f"b{n}" for n in range(300_000)]), "is damaged"),
+    "heads.bin": (dataflash(b"\xa3\x95\x81" * 3_000_000), "no valid time"),
+    "pieces.bin": (dataflash((b"\xa3\x95\x81" + bytes(9) + b"\xa3\x95\x81" + bytes(9) + b"x") * 700_000), "a record is damaged"),
+    "formats.bin": (dataflash(b"".join(map(dataflash_format, range(100_000)))), ""),
 }  # fmt: skip
 
 

@@ -1,7 +1,8 @@
 """Coverage-guided fuzzing of what reads logs: whatever the bytes, the reader refuses or sets aside by name, and never tells two stories.
 
 By hand: ``python tests/fuzz/fuzz_log_reading.py TARGET [--seconds 600] [--corpus DIR]``; TARGET is ``containers`` (the record walks of
-.mcap and .bag, the pages of .db3), ``plans`` (decoding plans, against rosbags' row by row) or ``definitions`` (message definitions).
+.mcap and .bag, the pages of .db3), ``autopilots`` (.ulg and ArduPilot's .bin), ``plans`` (decoding plans, against rosbags' row by row)
+or ``definitions`` (message definitions).
 What breaks is written to the working directory as ``crash-…``: add it to ``test_fuzz_log_reading.py``. Needs atheris.
 """
 
@@ -24,6 +25,7 @@ if __name__ == "__main__":
         import tcpipe.formats.logs.log_file  # noqa: F401
 
 import numpy as np
+from autopilot_files import Drive, write_dataflash, write_ulog
 from mcap.writer import CompressionType, IndexType
 from random_messages import ROS1, ROS2, random_messages, write_bag, write_mcap, write_rosbag2
 from rosbags.rosbag1 import Writer as BagWriter
@@ -31,7 +33,9 @@ from rosbags.rosbag1 import Writer as BagWriter
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.logs.log_part import MessageBlock
+from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError, TypeLibrary
 from tcpipe.tables.findings import Finding
 
@@ -79,7 +83,7 @@ def read_container(data: bytes) -> None:
             return
 
 
-def _told(log: Log, names: list[str]) -> tuple[dict[str, int], set[Finding]]:
+def _told(log: Log | TableLog, names: list[str]) -> tuple[dict[str, int], set[Finding]]:
     """Return the number of rows of topics and the findings."""
     tables = log.tables(names)
     for name, table in tables.items():
@@ -116,6 +120,25 @@ def containers(directory: Path) -> Iterator[bytes]:
         database.execute("PRAGMA page_size = 512")
         database.execute("VACUUM")
     yield path.read_bytes()
+
+
+# ---------------------------------------------------------------- autopilots
+def read_autopilot(data: bytes) -> None:
+    """Read a log of an autopilot twice: the same rows, in the order of time."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as directory:  # noqa: S108
+        path = Path(directory, "log")
+        path.write_bytes(data)
+        try:
+            with open_single_log(path) as log, open_single_log(path) as again:
+                assert _told(log, list(log.topics)) == _told(again, list(again.topics))
+        except LogError:
+            return
+
+
+def autopilots(directory: Path) -> Iterator[bytes]:
+    """Yield a short drive as both autopilots log it."""
+    for write in (write_ulog, write_dataflash):
+        yield write(directory / "autopilot", Drive(12.0, rate_hz=50)).read_bytes()[:_MOST_BYTES]
 
 
 # ---------------------------------------------------------------- decoding plans
@@ -228,6 +251,7 @@ def definitions(_directory: Path) -> Iterator[bytes]:
 
 
 TARGETS = {
+    "autopilots": Target(read_autopilot, autopilots),
     "containers": Target(read_container, containers),
     "plans": Target(read_messages, plans),
     "definitions": Target(read_definition, definitions),

@@ -10,7 +10,7 @@ import pytest
 
 from tcpipe.cli import cli
 from tcpipe.formats.logs.log_joining import AnyLog, open_logs
-from tcpipe.formats.logs.table_log import TableLog
+from tcpipe.formats.logs.table_log import open_tables
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, load_recipe
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import Recipe
@@ -58,14 +58,14 @@ def test_fomo_and_drive_map_the_columns_that_their_publishers_write(tmp_path: Pa
     (tmp_path / "gt.txt").write_text(
         "".join(f"{1760456485 + k / 10} 255855.3 5242729.3 643.6 0 0 0 1\n" for k in range(20))
     )
-    assert played(fomo, TableLog(tmp_path, fomo.tables)) == {"pose", "wheel_odometry", "command", "power"}
+    assert played(fomo, open_tables(tmp_path, fomo.tables)) == {"pose", "wheel_odometry", "command", "power"}
     logged = ["cmd_vel_x", "cmd_vel_omega", *(f"icp_pos_{axis}" for axis in "xyz"), *(f"imu_{axis}" for axis in "xyz")]
     logged += [f"imu_acceleration_{axis}" for axis in "xyz"] + [f"{side}_wheel_{what}" for what in VI for side in SIDES]
     times = [str(1721335359000000000 + k * 50_000_000) for k in range(20)]
     frame = pl.DataFrame({"ros_time": times} | {name: ["0.5"] * 20 for name in logged})
     for file in ("icp", "frame"):
         frame.write_parquet(tmp_path / f"{file}.parquet")
-    assert played(drive, TableLog(tmp_path, drive.tables)) == {"pose", "imu", "command", "power"}
+    assert played(drive, open_tables(tmp_path, drive.tables)) == {"pose", "imu", "command", "power"}
 
 
 def test_rellis_plays_its_roles_by_the_topics_of_its_readme() -> None:
@@ -115,14 +115,14 @@ def test_fau_and_borealtc_map_the_columns_that_are_published(tmp_path: Path) -> 
     fau, borealtc = (load_recipe(PIPELINES / f"{name}.toml") for name in ("fau", "borealtc"))
     fixes, seconds = (fau.tables[name] for name in ("gnss", "imu"))
     for table, head, row in (
-        (fixes, ",".join(("timestamp (ns)", *fixes.columns.values())), "26.37,-80.1,2.6,4"),
+        (fixes, "timestamp (ns),latitude (deg),longitude (deg),alt_msl (m),fix_quality", "26.37,-80.1,2.6,4"),
         (seconds, ",".join(("timestamp (ns)", "Power (w)", *seconds.columns.values())), "53.4" + ",0.1" * 10),
     ):
         path = tmp_path / table.file
         path.parent.mkdir(parents=True)
         rows = (f"{1763501392569776384 + k * 10**8},{row}\n" for k in range(30))
         path.write_text(f"{head}\n{''.join(rows)}", encoding="utf-8")
-    assert played(fau, TableLog(tmp_path, fau.tables)) == {"gnss", "imu", "power"}
+    assert played(fau, open_tables(tmp_path, fau.tables)) == {"gnss", "imu", "power"}
     (tmp_path / "imu_03.csv").write_text(
         "time,wx,wy,wz,ax,ay,az\n" + "".join(f"{k / 100},0,0,0,0,0,9.8\n" for k in range(99))
     )

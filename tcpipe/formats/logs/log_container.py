@@ -13,8 +13,11 @@ from tcpipe.formats.logs.log_part import FetchedFile, LogPart
 from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompress_file
 from tcpipe.formats.logs.sqlite_file import SqlitePart
+from tcpipe.logs.topics import AutopilotKind
 
-WANTED = "expected an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
+WANTED = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg or ArduPilot's .bin"
+_AUTOPILOTS: dict[bytes, AutopilotKind] = {b"ULog\x01\x12\x35": "ulog", b"\xa3\x95\x80\x80\x59": "dataflash"}
+"""How their logs begin; DataFlash's with the format of formats."""
 _KNOWN_MAGIC = (
     (b"PK\x03\x04", "a zip archive"),
     (b"\x1f\x8b", "a gzip file"),
@@ -48,6 +51,12 @@ def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | No
         raise LogError(f"{given}: not a log: {held}{_describe_other_file(path, magic)}; {WANTED}")
     stack.callback(part.close)
     return part
+
+
+def find_autopilot(path: Path) -> AutopilotKind | None:
+    """Return ``ulog`` or ``dataflash`` where a file begins like a log of an autopilot, None elsewhere."""
+    magic = _read_magic(path, None) if path.is_file() else b""
+    return next((kind for start, kind in _AUTOPILOTS.items() if magic.startswith(start)), None)
 
 
 def find_container(path: Path, fetched: FetchedFile | None) -> str:

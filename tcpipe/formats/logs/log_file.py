@@ -18,7 +18,7 @@ import pyarrow as pa
 from tcpipe.errors import LogError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.arrow_columns import TopicTable
-from tcpipe.formats.logs.log_container import WANTED, find_container, open_part
+from tcpipe.formats.logs.log_container import WANTED, find_autopilot, find_container, open_part
 from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
@@ -34,8 +34,9 @@ from tcpipe.logs.topics import Damage, Topic, find_damage, split_notes
 from tcpipe.progress import Meter
 from tcpipe.tables.findings import Finding
 
+AUTOPILOT_SUFFIXES = (".ulg", ".bin")
 _READ_BY_RANGE = (".mcap", ".bag")
-LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd")
+LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd", *AUTOPILOT_SUFFIXES)
 
 BATCH_BYTES = 1 << 25
 """About how much a piece of a log takes in memory."""
@@ -452,9 +453,20 @@ def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
             found.append((Path(entry.path), True))
         elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
             continue
-        elif entry.name.lower().endswith(LOG_SUFFIXES) and (entry.is_symlink() or entry.is_file()):
+        elif (
+            entry.name.lower().endswith(LOG_SUFFIXES)
+            and (entry.is_symlink() or entry.is_file())
+            and not _is_other_binary(Path(entry.path))
+        ):
             found.append((Path(entry.path), False))
     return found
+
+
+def _is_other_binary(path: Path) -> bool:
+    """Return whether a .bin is anything but a log: many programs write files of that name; one that cannot be read may be one."""
+    with suppress(LogError):
+        return path.suffix.lower() == ".bin" and find_autopilot(path) is None
+    return False
 
 
 def _is_directory(entry: os.DirEntry[str]) -> bool:

@@ -12,19 +12,19 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeAlias
+from typing import Self, TypeAlias
 
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.formats.logs.log_container import find_autopilot
+from tcpipe.formats.logs.log_file import AUTOPILOT_SUFFIXES, Log, is_log_file, open_log
+from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import Mappings, find_table_run
+from tcpipe.formats.object_storage import format_path, is_url, lay_out_objects
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
-
-if TYPE_CHECKING:
-    from tcpipe.formats.logs.table_log import TableLog
 
 _PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
 _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
@@ -157,14 +157,24 @@ def open_logs(
     return joined if earlier or len(logs) > 1 else logs[0]
 
 
-def open_single_log(path: Path | str, *, message_definitions: Path | None, tables: Mappings | None) -> Log | TableLog:
-    """Open one log: a folder that is no bag, or a table of a run, is one of tables, where ``tables`` says what they hold."""
+def open_single_log(
+    path: Path | str, *, message_definitions: Path | None = None, tables: Mappings | None = None
+) -> Log | TableLog:
+    """Open one log: an autopilot's; a folder that is no bag, or a table of a run, as ``tables`` say what they hold; else as `open_log`."""
+    with ExitStack() as stack:
+        here = path
+        if is_url(path) and format_path(path).lower().endswith(AUTOPILOT_SUFFIXES):
+            here, _ = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=()))
+        if not is_url(here) and (kind := find_autopilot(Path(here))):
+            from tcpipe.formats.logs.autopilot_log import open_autopilot_log  # noqa: PLC0415  only where one is read
+
+            return open_autopilot_log(Path(here), kind, stack.pop_all())
     if tables and isinstance(path, Path):
         run = find_table_run(path, tables) if path.is_file() else None
         if run or (path.is_dir() and not is_one_bag(path)):
-            from tcpipe.formats.logs.table_log import TableLog  # noqa: PLC0415  polars only where a table is read
+            from tcpipe.formats.logs.table_log import open_tables  # noqa: PLC0415  polars only where a table is read
 
-            return TableLog(run.folder, run.mappings, run.files) if run else TableLog(path, tables)
+            return open_tables(run.folder, run.mappings, run.files) if run else open_tables(path, tables)
     return open_log(path, message_definitions=message_definitions)
 
 

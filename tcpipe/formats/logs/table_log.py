@@ -10,22 +10,19 @@ no header), what is comment. A cell that is no number where one is wanted is cou
 
 from __future__ import annotations
 
-import hashlib
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import polars as pl
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
+from tcpipe.formats.logs.message_tables import TableLog, TopicMessages, make_message_table, make_stamp_fields
 from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
 from tcpipe.logs.expressions import split_unit
 from tcpipe.logs.field_mapping import (
@@ -37,97 +34,34 @@ from tcpipe.logs.field_mapping import (
     read_fields,
     utc_from_gps_ns,
 )
-from tcpipe.logs.topics import Damage, Topic, find_damage
+from tcpipe.logs.topics import Damage, Topic
 from tcpipe.power.sources import FLOAT_TYPES
 from tcpipe.recipe import TableMapping
-from tcpipe.tables.arrays import number_column
 
 _GPS_TIME = "GPST"
 """What RTKLIB calls a column of GPS time."""
-_HASH_BYTES = 1 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class _Read:
-    """A table that was read: its topic, messages, and what is damaged in it."""
+def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = None) -> TableLog:
+    """Read the mapped tables of a folder, of which ``files`` are the log's, by default all.
 
-    topic: Topic
-    messages: pa.Table
-    damage: list[Damage]
-
-
-class TableLog:
-    """A folder of mapped tables, read. It has no file open."""
-
-    container = "tables"
-    outline = ""
-    """Tables have no index, and are hashed."""
-    is_known_by_outline = False
-
-    def __init__(self, path: Path, mappings: Mappings, files: Sequence[Path] | None = None) -> None:
-        """Read the tables of a folder, of which ``files`` are the log's, by default all.
-
-        `LogError` has a line for each thing in which the mapping and the folder do not agree.
-        """
-        self.path = path
-        problems: list[str] = []
-        read: list[_Read] = []
-        for name, mapping in mappings.items():
-            found = _read_table(path, name, mapping)
-            if isinstance(found, _Read):
-                read.append(found)
-            else:
-                problems += found
-        problems += _find_clock_mismatch(read)
-        if problems:
-            raise LogError(*(f"{path}: {problem}" for problem in problems))
-        self._tables = {found.topic.name: found.messages for found in read}
-        self.topics = {found.topic.name: found.topic for found in read}
-        """Every mapped table by its topic's name."""
-        self.findings = find_damage(damage for found in read for damage in found.damage)
-        self._files = list_table_files(path) if files is None else files
-
-    def __enter__(self) -> Self:
-        """Return the log."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Do nothing: no file is open."""
-
-    def close(self) -> None:
-        """Do nothing: no file is open."""
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the log's tables together, mapped or not."""
-        return sum(file.stat().st_size for file in self._files)
-
-    def sha256(self) -> str:
-        """Return the SHA-256 of all tables of the log, mapped or not, one after the other, by name."""
-        digest = hashlib.sha256()
-        for file in self._files:
-            with file.open("rb") as stream:
-                while block := stream.read(_HASH_BYTES):
-                    digest.update(block)
-        return digest.hexdigest()
-
-    def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
-        """Return the messages of several topics; `LogError` where one is not mapped."""
-        wanted = list(topics)
-        if unknown := [name for name in wanted if name not in self._tables]:
-            raise LogError(
-                f"{self.path}: no table is mapped to {', '.join(unknown)}; there are {', '.join(self.topics)}"
-            )
-        return {name: self._tables[name] for name in wanted}
-
-    def batches(self, topics: Iterable[str]) -> Iterator[dict[str, pa.Table]]:
-        """Yield the messages of several topics, at once."""
-        yield self.tables(topics)
+    `LogError` has a line for each thing in which the mapping and the folder do not agree.
+    """
+    problems: list[str] = []
+    read: list[TopicMessages] = []
+    for name, mapping in mappings.items():
+        found = _read_table(path, name, mapping)
+        if isinstance(found, TopicMessages):
+            read.append(found)
+        else:
+            problems += found
+    problems += _find_clock_mismatch(read)
+    if problems:
+        raise LogError(*(f"{path}: {problem}" for problem in problems))
+    return TableLog(path, "tables", read, list_table_files(path) if files is None else files)
 
 
-def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[str]:
+def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages | list[str]:
     """Return a table's messages, or every problem of its mapping."""
     where = f"recipe tables.{name}"
     role = mapping.role or name
@@ -149,8 +83,9 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
             problems.append(f"{where}.stamp: {mapping.file} has no column {stamp}; it has {', '.join(names)}")
         if isinstance(fields, list) or problems:
             return problems
-        used = [column for of, _ in fields.values() for column, _ in of.operands()]
-        cells = read_cells(path, stamp=stamp, columns=used)
+        used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
+        numbers = [column for name, columns in used.items() if name != "quality" for column in columns]
+        cells = read_cells(path, stamp=stamp, columns=numbers, words=used.get("quality", ()))
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
@@ -163,10 +98,8 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
     if empty:
         return empty
-    values = {
-        field: factor * np.broadcast_to(of.evaluate(lambda column, _: cells.columns[column]), len(cells.stamp))
-        for field, (of, factor) in fields.items()
-    }
+    rows = len(cells.stamp)
+    values = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
     source = mapping.make_power_source(name)
     read_as = find_topic(name, role, mapping.columns, source.type if source else None)
     return _read_messages((*read_as, role), mapping, cells, values, stamp_ns)
@@ -192,7 +125,7 @@ def _read_messages(
     cells: Cells,
     values: Mapping[str, NDArray[np.float64]],
     stamp_ns: NDArray[np.int64],
-) -> _Read:
+) -> TopicMessages:
     """Return a table as the messages of its topic, type and role, in order of time, and what of it is lost."""
     topic, kind, role = read_as
     lost = int(np.count_nonzero(~cells.stamp_known))
@@ -209,29 +142,15 @@ def _read_messages(
         order, stamp_ns = np.flatnonzero(cells.stamp_known)[by_time], stamp_ns[by_time]
     values = {field: value[order] for field, value in values.items()}
     if kind in FLOAT_TYPES:
-        columns = {"data": next(iter(values.values()))}
+        table = make_message_table(stamp_ns, {"data": next(iter(values.values()))})
     else:
-        second, rest = np.divmod(stamp_ns, 1_000_000_000)
-        columns = {"header.stamp.sec": second, "header.stamp.nanosec": rest}
-        columns |= make_message_fields(role, values, stamp_ns.size)
-    table = pa.table(
-        {
-            "log_time_ns": number_column(stamp_ns),
-            "publish_time_ns": number_column(stamp_ns),
-            **{column: _to_arrow(value) for column, value in columns.items()},
-        }
-    )
+        fields = make_message_fields(role, values, stamp_ns.size)
+        table = make_message_table(stamp_ns, {**make_stamp_fields(stamp_ns), **fields})
     span = (int(stamp_ns[0]), int(stamp_ns[-1]))
-    return _Read(Topic(topic, kind, stamp_ns.size, *span, "table", ""), table, damage)
+    return TopicMessages(Topic(topic, kind, stamp_ns.size, *span, "table", ""), lambda: table, damage)
 
 
-def _to_arrow(values: NDArray[np.float64]) -> pa.Array:
-    if values.ndim == 1:
-        return number_column(values)
-    return pa.FixedSizeListArray.from_arrays(number_column(values.ravel()), values.shape[1])
-
-
-def _find_clock_mismatch(read: Iterable[_Read]) -> Iterator[str]:
+def _find_clock_mismatch(read: Iterable[TopicMessages]) -> Iterator[str]:
     """Yield a line for tables that have no time in common with the longest: they are on another clock, or of another drive."""
     spans = {found.topic.name: (found.topic.start_ns or 0, found.topic.end_ns or 0) for found in read}
     if not spans:
@@ -279,13 +198,16 @@ def read_column_names(path: Path) -> list[str]:
     return _scan(path).collect_schema().names()
 
 
-def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
-    """Read a column of stamps and columns of numbers; every other column is passed over. `LogError`: the file cannot be read as a table."""
-    wanted = list(dict.fromkeys(columns))
+def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[str] = ()) -> Cells:
+    """Read a column of stamps, columns of numbers and of ``words`` or numbers; every other column is passed over.
+
+    `LogError`: the file cannot be read as a table.
+    """
+    wanted = [name for name in dict.fromkeys(columns) if name not in words]
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            frame = _collect_columns(path, [stamp, *(name for name in wanted if name != stamp)], numbers=wanted)
+            frame = _collect_columns(path, [*dict.fromkeys([stamp, *wanted, *words])], numbers=wanted)
             stamps = frame[stamp]
             stamps = _parse_times(stamps) if stamps.dtype == pl.String else stamps
             if is_time := stamps.dtype.is_temporal():
@@ -302,7 +224,8 @@ def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
         made.fill_null(0).to_numpy(),
         (made.is_not_null() & made.is_finite()).to_numpy() if not whole else made.is_not_null().to_numpy(),
         is_time,
-        {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()},
+        {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()}
+        | {name: frame[name].to_numpy() for name in words},
         texts,
         tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in said)),
     )

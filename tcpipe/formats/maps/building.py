@@ -15,7 +15,7 @@ from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, Use
 from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
-from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
+from tcpipe.formats.maps.map_facts import MapFacts, MapInputs, RasterOrigin
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
@@ -80,6 +80,7 @@ def build_map(
     crs: str | None = None,
     pixel_size_m: float | None = None,
     inputs: MapInputs | None = None,
+    origins: Sequence[RasterOrigin] = (),
 ) -> MapFacts:
     """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
 
@@ -93,7 +94,7 @@ def build_map(
         the terrain raster names its values, those names say which class each is.
     crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
     pixel_size_m : side of a map pixel [m]; None takes the finest raster's.
-    inputs : what the caller wants to know the map by later; kept in its facts.
+    inputs, origins : what the caller wants to know the map by later, and where its rasters are from; kept in its facts.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def build_map(
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
-            facts = _make_facts(grid, layers, origin, inputs or MapInputs())
+            facts = replace(_make_facts(grid, layers, origin, inputs or MapInputs()), origins=tuple(origins))
             writer.finish(facts, {role: _set_range(source) for role, source in layers.items()})
             write_checksums(half)
     return facts

@@ -51,7 +51,7 @@ _METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters
 _METRES |= {"cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "mm": 0.001, "dm": 0.1, "km": 1000.0}
 _METRES |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0}
 
-_CONFIG = {
+GDAL_CONFIG = {
     "GDAL_CACHEMAX": 256,  # [MB] decoded blocks: a strip of a wide raster is wanted by many windows
     "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",  # what lies beside is asked for by name, as `_refuse_beside` does
     "GDAL_VRT_ENABLE_PYTHON": "NO",
@@ -165,7 +165,7 @@ class RasterTiles:
         except RasterioError as error:
             raise MapError(
                 f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
-                f"{_describe_error(error)}"
+                f"{describe_error(error)}"
             ) from error
         if tile.use == "classes":
             return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
@@ -202,9 +202,9 @@ def _read_grey(
 
 @contextmanager
 def open_raster_tiles() -> Iterator[RasterTiles]:
-    """Read tiles, with GDAL set up as `_CONFIG` says."""
+    """Read tiles, with GDAL set up as `GDAL_CONFIG` says."""
     pool = RasterTiles()
-    with rasterio.Env(**_CONFIG):
+    with rasterio.Env(**GDAL_CONFIG):
         try:
             yield pool
         finally:
@@ -219,7 +219,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
     MapError : it is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
     """
     use = use or USES[role]
-    with rasterio.Env(**_CONFIG):
+    with rasterio.Env(**GDAL_CONFIG):
         source = _check_source(path)
         with _open_as(source) as dataset:
             _refuse_unplaced(dataset, path)
@@ -255,7 +255,7 @@ def list_raster_files(path: Path) -> tuple[Path, ...]:
     ------
     MapError : it is no raster of a kind that is read.
     """
-    with rasterio.Env(**_CONFIG):
+    with rasterio.Env(**GDAL_CONFIG):
         return _check_source(path).files
 
 
@@ -298,25 +298,28 @@ def _list_plain_files(path: Path, driver: str) -> tuple[Path, ...]:
     """Return a raster's files, itself first; refuse one that names others elsewhere, has such beside it, or does not fit into memory."""
     _refuse_beside(path)
     with _open_as(Source(path, driver, ())) as dataset:
-        if any(dataset.tags(ns=domain) for domain in _REDIRECTIONS):
-            raise MapError(
-                f"{path}: names another file for its overviews, which tcpipe does not open; write it again: {_rewrite(path)}"
-            )
-        block = max(
-            rows * cols * np.dtype(dtype).itemsize
-            for (rows, cols), dtype in zip(dataset.block_shapes, dataset.dtypes, strict=True)
-        )
-        block *= dataset.count if dataset.profile.get("interleave") == "pixel" else 1
-        if block > _MAX_BLOCK_BYTES:
-            raise MapError(
-                f"{path}: kept in blocks of {block / 1e6:.0f} MB, at most {_MAX_BLOCK_BYTES // 10**6}; "
-                f"write it in tiles: {_rewrite(path)} -co TILED=YES -co BIGTIFF=IF_SAFER"
-            )
+        check_layout(dataset, str(path), f"write it again: {_rewrite(path)}")
         files = {Path(name) for name in dataset.files}
     strangers = sorted(str(file) for file in files if file.parent != _make_absolute(path).parent)
     if strangers:
         raise MapError(f"{path}: refers to {strangers[0]}, which is not in the same directory; {_rewrite(path)}")
     return (path, *sorted(path.with_name(file.name) for file in files if file.name != path.name))
+
+
+def check_layout(dataset: Any, where: str, remedy: str) -> None:
+    """Raise `MapError` for a raster that names another file for its overviews, or whose blocks do not fit into memory."""
+    if any(dataset.tags(ns=domain) for domain in _REDIRECTIONS):
+        raise MapError(f"{where}: names another file for its overviews, which tcpipe does not open; {remedy}")
+    block = max(
+        rows * cols * np.dtype(dtype).itemsize
+        for (rows, cols), dtype in zip(dataset.block_shapes, dataset.dtypes, strict=True)
+    )
+    block *= dataset.count if dataset.profile.get("interleave") == "pixel" else 1
+    if block > _MAX_BLOCK_BYTES:
+        raise MapError(
+            f"{where}: kept in blocks of {block / 1e6:.0f} MB, at most {_MAX_BLOCK_BYTES // 10**6}; "
+            f"{remedy} -co TILED=YES -co BIGTIFF=IF_SAFER"
+        )
 
 
 def _refuse_beside(path: Path) -> None:
@@ -351,7 +354,7 @@ def _open_as(source: Source) -> Any:
             return rasterio.open(_make_absolute(source.path), driver=source.driver)
         except RasterioError as error:
             raise MapError(
-                f"{source.path}: not a raster that GDAL can read; the file is damaged: {_describe_error(error)}"
+                f"{source.path}: not a raster that GDAL can read; the file is damaged: {describe_error(error)}"
             ) from error
 
 
@@ -360,7 +363,8 @@ def _make_absolute(path: Path) -> Path:
     return path.absolute()
 
 
-def _describe_error(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
+    """Return the first line of what GDAL says."""
     return str(error.__cause__ or error).splitlines()[0][:200]
 
 
@@ -562,7 +566,7 @@ def write_cog(
 def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
     """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols). `MapError`: it cannot be read."""
     try:
-        with rasterio.Env(**_CONFIG), _open_as(_check_source(path)) as dataset:
+        with rasterio.Env(**GDAL_CONFIG), _open_as(_check_source(path)) as dataset:
             return np.asarray(dataset.read(list(bands)))
     except RasterioError as error:
-        raise MapError(f"{path}: cannot be read; the file is damaged ({_describe_error(error)})") from error
+        raise MapError(f"{path}: cannot be read; the file is damaged ({describe_error(error)})") from error

@@ -37,6 +37,39 @@ class MapInputs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RasterOrigin:
+    """Where a raster of a map was taken from, of open data; the checksum of what was taken is among `MapInputs`."""
+
+    layer: str
+    url: str
+    """Without a query."""
+    item: str
+    date: str
+    """When it was surveyed, as the catalogue has it; empty where it does not."""
+    resolution: str
+    """Of a pixel, with the unit of its CRS."""
+    vertical_datum: str | None = None
+    """What heights refer to; None where the catalogue's entry does not say."""
+    licence: str
+    to_read_bytes: int
+    """Of the part that was taken, as it is stored there."""
+    version: str = ""
+    """Of the whole raster as its server names it: ETag or time of change."""
+    checksum: str | None = None
+    """Multihash of the whole raster as the catalogue has it."""
+
+
+def origin_lines(origins: Sequence[RasterOrigin]) -> list[str]:
+    """Return where rasters are from, a line for each, and the licences."""
+    lines = [
+        f"{of.layer:8s} {of.date[:10] or 'no date'}, {of.resolution}, {of.to_read_bytes / 1e6:.2f} MB: {of.url}"
+        + (f" (heights above {of.vertical_datum or 'an unknown datum'})" if of.layer == "height" else "")
+        for of in origins
+    ]
+    return lines + [f"licence: {text}" for text in dict.fromkeys(of.licence for of in origins)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapFacts:
     """What building a map found; a map keeps it in its attributes."""
 
@@ -55,6 +88,8 @@ class MapFacts:
     classes_from: str
     """``file``, ``names`` of the terrain raster's values, ``store`` or ``default``."""
     inputs: MapInputs
+    origins: tuple[RasterOrigin, ...] = field(default=(), metadata=LEFT_OUT)
+    """Of rasters that were taken from open data."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +125,7 @@ def map_lines(of: MapSummary) -> list[str]:
     for layer in of.layers:
         line = f"{layer:{width}s} {_format_percent(of.covered[layer]):>5s} covered, from {of.sources[layer]}"
         lines.append(line + _format_detail(layer, of))
-    return lines
+    return lines + origin_lines(of.origins)
 
 
 def _format_detail(layer: str, of: MapSummary) -> str:

@@ -30,6 +30,7 @@ from tcpipe.formats.dataset_card import (
     Shard,
     SplitResult,
     group_dataset_findings,
+    list_shifts,
 )
 from tcpipe.formats.dataset_files import (
     Drawer,
@@ -203,6 +204,7 @@ class SampleTable:
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
         columns |= {name: values[at] for name, values in self.sampled.patches.columns().items()}
+        columns["position_std_m"] = self.sampled.position_std_m[at]
         columns["geometry"] = make_points(centres := self._centres_deg(at))
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
         if not self.has_terrain:
@@ -274,10 +276,19 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     segments, distance_by_reason_m, unusable = _pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
     ranks = _rank_segments(segments, seed=recipe.split.seed)
-    sampled, slot, spool = sample_all_segments(
-        segments, ranks, inputs.maps, recipe.sample, gnss_crs=recipe.read.gnss_crs, workers=workers, directory=directory
-    )
     sources = tuple(open_map(*of) for of in inputs.maps())
+    registered = [register_runs(inputs.runs, source, recipe) for source in sources]
+    shifts = [list_shifts(of) for of, _ in registered]
+    sampled, slot, spool = sample_all_segments(
+        segments,
+        ranks,
+        inputs.maps,
+        recipe.sample,
+        gnss_crs=recipe.read.gnss_crs,
+        shifts=shifts,
+        workers=workers,
+        directory=directory,
+    )
     lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
         raise DatasetError(
@@ -292,10 +303,9 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     split = assigned.split
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
-    registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
-    removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe)
+    removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
     kept = np.flatnonzero(split != EXCLUDED)
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(

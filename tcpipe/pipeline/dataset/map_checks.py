@@ -23,12 +23,13 @@ from tcpipe.motion.distance_breakdown import (
     sum_lengths_m,
 )
 from tcpipe.motion.row_sections import number_pieces
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import Recipe, SampleConfig
+from tcpipe.stages.sample import Shifts
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
-from tcpipe.terrain.projection import Projection
-from tcpipe.terrain.registration import Registration, register_track
+from tcpipe.terrain.projection import Projection, compute_geoid_height
+from tcpipe.terrain.registration import TILTED_REACH_M, Registration, register_track
 from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
@@ -43,8 +44,10 @@ _REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_le
 """Reason of each metre of a track; losses at sampling and to the split's buffer are one entry."""
 _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
 
-_Ground = tuple[MapFile, Projection]
-"""A map, and the projection of places onto it."""
+_DATUM = "map-height-datum"
+
+_Ground = tuple[MapFile, Projection, Shifts]
+"""A map, the projection of places onto it, and how far runs are moved there."""
 
 _Spans = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]
 """Start and end [ns] of segments, in order, and whether each is used."""
@@ -55,33 +58,59 @@ def register_runs(
 ) -> tuple[tuple[MapRegistration, ...], list[Finding]]:
     """Return the map's registration against each run that crosses enough of it, and findings on misfits.
 
-    Rows of a track count that are certain enough to be sampled. `MapError` if the map's heights are in feet.
+    Rows of a track count that are certain enough to be sampled. With ``sample.align`` a registration says whether its shift is applied, and
+    findings why not. `MapError` if the map's heights are in feet.
     """
     projection = find_map_projection(source, recipe.read.gnss_crs)
     registrations, findings = list[MapRegistration](), list[Finding]()
     for run in runs:
-        registration, expected_m = _register(run, source, projection, max_std_m=recipe.sample.max_position_std_m)
+        registration, expected_m, is_on_map = _register(run, source, projection, recipe.sample)
+        reason = _find_obstacle(registration, expected_m, recipe.sample) if recipe.sample.align else "not wanted"
+        if registration is not None and registration.scale.is_feet():
+            raise MapError(_describe_feet(registration, run.run_id, source.name))
+        if recipe.sample.align and reason and is_on_map:
+            names = {"map": source.name, "reason": reason}
+            findings.append(make_finding("map-not-aligned", Subject("run", run.run_id), names=names))
         if registration is None:
             continue
-        if registration.scale.is_feet():
-            raise MapError(_describe_feet(registration, run.run_id, source.name))
-        registrations.append(_make_map_registration(run.run_id, registration, expected_m))
-        findings += _find_shift(registration, run.run_id, source.name)
+        registrations.append(_make_map_registration(run.run_id, registration, expected_m, is_applied=not reason))
+        findings += _find_shift(registration, run.run_id, source.name, is_applied=not reason)
         findings += _find_other_heights(registration, expected_m, run.run_id, source.name)
+    if recipe.sample.align:
+        west, south, east, north = projection.area_deg
+        geoid_m = compute_geoid_height((west + east) / 2.0, (south + north) / 2.0)
+        findings += _find_height_datum(registrations, source.name, geoid_m)
     return tuple(registrations), findings
 
 
 def _register(
-    run: RunDirectory, source: MapFile, projection: Projection, *, max_std_m: float
-) -> tuple[Registration | None, float]:
-    """Return the map's registration against a run, and the expected misfit [m]."""
+    run: RunDirectory, source: MapFile, projection: Projection, config: SampleConfig
+) -> tuple[Registration | None, float, bool]:
+    """Return the map's registration against a run, the expected misfit [m], and whether any of the run is on the map."""
     track = run.table("track", _COLUMNS)
     lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(track, name) for name in _COLUMNS)
-    certain: NDArray[np.bool_] = np.hypot(x_std_m, y_std_m) <= max_std_m
+    certain: NDArray[np.bool_] = np.hypot(x_std_m, y_std_m) <= config.max_position_std_m
     lonlat = np.stack([lon, lat], axis=1)[certain]
     map_error_m = read_threshold("map-heights-differ", "map_error_m")
     expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[certain] ** 2)), map_error_m)) if certain.any() else map_error_m
-    return register_track(source, projection.forward(lonlat), height_m[certain]), expected_m
+    xy_m = projection.forward(lonlat)
+    is_on_map = bool(source.grid.contains(np.where(np.isfinite(xy_m), xy_m, np.inf)).any())
+    return register_track(source, xy_m, height_m[certain], with_tilt=config.align), expected_m, is_on_map
+
+
+def _find_obstacle(found: Registration | None, expected_m: float, config: SampleConfig) -> str:
+    """Return why the shift of a run cannot be applied; "" where it can."""
+    if found is None:
+        return "too few points on the map"
+    if found.scale.is_off():
+        return "heights are scaled"
+    if found.at_reach:
+        return f"the shift may be beyond {TILTED_REACH_M:g} m"
+    if not np.isfinite(found.position_std_m):
+        return "the ground is too even"
+    if found.position_std_m > config.max_position_std_m:
+        return f"the shift is known only to {found.position_std_m:.2f} m"
+    return "heights differ" if _has_other_heights(found, expected_m) else ""
 
 
 def _describe_feet(found: Registration, run_id: str, name: str) -> str:
@@ -91,18 +120,20 @@ def _describe_feet(found: Registration, run_id: str, name: str) -> str:
     )
 
 
-def _find_shift(found: Registration, run_id: str, name: str) -> tuple[Finding, ...]:
-    """Return the finding, if any, that the map is shifted against the track."""
-    if not found.significant or found.shift_m <= read_threshold("map-shifted", "min_shift_m"):
+def _find_shift(found: Registration, run_id: str, name: str, *, is_applied: bool) -> tuple[Finding, ...]:
+    """Return the finding, if any, that the map is shifted against the track, or that the run was moved."""
+    is_far = found.significant and found.shift_m > read_threshold("map-shifted", "min_shift_m")
+    if not is_far and not is_applied:
         return ()
     east_m, north_m = found.shift_xy_m
+    is_error = not is_applied and found.shift_m >= read_threshold("map-shifted", "error_shift_m")
     finding = make_finding(
-        "map-shifted",
+        "map-aligned" if is_applied else "map-shifted",
         Subject("run", run_id),
-        severity="error" if found.shift_m >= read_threshold("map-shifted", "error_shift_m") else None,
+        severity="error" if is_error else None,
         names={"map": name},
         shift_m=found.shift_m,
-        std_m=found.shift_std_m,
+        std_m=found.position_std_m if is_applied else found.shift_std_m,
         east_m=east_m,
         north_m=north_m,
         misfit_m=found.misfit_m,
@@ -116,15 +147,33 @@ def _find_other_heights(found: Registration, expected_m: float, run_id: str, nam
     subject, names = Subject("run", run_id), {"map": name}
     if found.scale.is_off():
         return (make_finding("map-height-scale", subject, names=names, map_rise_m=1 / found.scale.value),)
-    misfit_m = found.shifted_misfit_m if found.significant else found.misfit_m
-    if misfit_m <= read_threshold("map-heights-differ", "max_misfit_ratio") * expected_m:
+    if not _has_other_heights(found, expected_m):
         return ()
-    return (make_finding("map-heights-differ", subject, names=names, misfit_m=misfit_m, expected_m=expected_m),)
+    return (make_finding("map-heights-differ", subject, names=names, misfit_m=found.left_m, expected_m=expected_m),)
 
 
-def _make_map_registration(run_id: str, found: Registration, expected_m: float) -> MapRegistration:
+def _has_other_heights(found: Registration, expected_m: float) -> bool:
+    return found.left_m > read_threshold("map-heights-differ", "max_misfit_ratio") * expected_m
+
+
+def _find_height_datum(registrations: Sequence[MapRegistration], name: str, geoid_m: float | None) -> list[Finding]:
+    """Return the finding, if any, that heights of the tracks and of the map are above different surfaces."""
+    offsets_m = np.array([of.height_offset_m for of in registrations] or [0.0])
+    offset_m, apart_m = float(np.median(offsets_m)), read_threshold(_DATUM, "max_scatter_m")
+    if abs(offset_m) < read_threshold(_DATUM, "min_offset_m") or (np.abs(offsets_m - offset_m) > apart_m).any():
+        return []
+    reason = "probably ellipsoid against geoid"
+    if geoid_m is not None:
+        is_geoid = abs(abs(offset_m) - abs(geoid_m)) <= apart_m
+        reason = f"{'' if is_geoid else 'not '}ellipsoid against geoid ({geoid_m:.1f} m there)"
+    return [make_finding(_DATUM, Subject("map", name), names={"reason": reason}, offset_m=offset_m)]
+
+
+def _make_map_registration(run_id: str, found: Registration, expected_m: float, *, is_applied: bool) -> MapRegistration:
     """Return the registration for the card: no shift where the ground cannot determine one."""
     unknown = {} if np.isfinite(found.shift_std_m) else dict.fromkeys(("shift_xy_m", "shift_std_m", "shifted_misfit_m"))
+    if is_applied:  # to a tenth of a millimetre, so that the last bits of another processor do not move a pixel
+        unknown = {"shift_xy_m": tuple(round(of, 4) for of in found.shift_xy_m), "applied_std_m": found.position_std_m}
     return convert_record(
         found,
         MapRegistration,
@@ -142,14 +191,18 @@ def find_removed_by_ground(
     used: NDArray[np.int64],
     sources: Sequence[MapFile],
     recipe: Recipe,
+    *,
+    shifts: Sequence[Shifts],
 ) -> tuple[Removal, tuple[Finding, ...]]:
     """Return metres of all runs by reason, for each class and slope, and findings where the used share is uneven.
 
     ``used`` are the rows of ``segments`` that are train, test or unseen. Of overlapping ``sources`` the first counts; maps without a
-    terrain layer give no classes.
+    terrain layer give no classes. ``shifts`` are those of the runs, by map.
     """
     grounds = [
-        (source, find_map_projection(source, recipe.read.gnss_crs)) for source in sources if "terrain" in source.layers
+        (source, find_map_projection(source, recipe.read.gnss_crs), moved)
+        for source, moved in zip(sources, shifts, strict=True)
+        if "terrain" in source.layers
     ]
     table = sources[0].classes
     names = ["off the map", "no data", *table.names().tolist()[1:]]
@@ -204,15 +257,16 @@ def _read_intervals(
     uphill = -np.degrees(to_floats(track, "pitch_rad")) * np.sign(to_floats(track, "forward_velocity_mps"))
     slope = np.searchsorted(_SLOPES_DEG, 0.5 * (uphill[1:] + uphill[:-1]))
     lonlat = np.stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")], axis=1)
-    return length_m, reason, slope, _find_classes(grounds, 0.5 * (lonlat[1:] + lonlat[:-1]))
+    return length_m, reason, slope, _find_classes(grounds, 0.5 * (lonlat[1:] + lonlat[:-1]), run.run_id)
 
 
-def _find_classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the class id under each point on the first map with one there, else as `find_classes_at`; 0 without maps."""
+def _find_classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64], run_id: str) -> NDArray[np.int64]:
+    """Return the class id under each point of a run on the first map with one there, else as `find_classes_at`; 0 without maps."""
     class_id = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
-    for source, projection in grounds:
+    for source, projection, shifts in grounds:
         unknown = class_id <= 0
-        on_map = find_classes_at(source, projection.forward(lonlat_deg[unknown]))
+        moved_m = shifts.get(run_id, (0.0, 0.0, 0.0))[:2]
+        on_map = find_classes_at(source, projection.forward(lonlat_deg[unknown]) + moved_m)
         class_id[unknown] = np.maximum(on_map, class_id[unknown])
     return class_id
 

@@ -27,7 +27,7 @@ from tcpipe.formats.parquet import make_mapped_array, move_to_file
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import Sampled, check_same_layers, sample_on_maps
+from tcpipe.stages.sample import Sampled, Shifts, check_same_layers, sample_on_maps
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
@@ -47,7 +47,7 @@ _ROW_MASK = (1 << _ROW_BITS) - 1
 _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that few batches decode a map tile."""
 
-_PLACING = ("map_index", "footprint_xy_m", "footprint_lonlat_deg")
+_PLACING = ("map_index", "position_std_m", "footprint_xy_m", "footprint_lonlat_deg")
 _SAMPLED = ("kept", "lost_by", *_PLACING)
 
 _SIZE_BYTES = 8
@@ -144,6 +144,8 @@ class _Batch:
     maps: MapPlaces
     config: SampleConfig
     gnss_crs: str
+    shifts: Sequence[Shifts]
+    """By map."""
     spool: Spool
 
 
@@ -183,12 +185,14 @@ def sample_all_segments(
     config: SampleConfig,
     *,
     gnss_crs: str,
+    shifts: Sequence[Shifts],
     workers: Workers,
     directory: Path,
 ) -> tuple[Sampled, NDArray[np.int64], Spool]:
     """Sample each of M segments from the first map with data for it; return the results, slots in the order of ``kept``, and the spool.
 
-    ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments' positions.
+    ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments' positions,
+    ``shifts`` say for each map by how much runs are moved on it.
     The results are arrays in files in ``directory``. `TcpipeError` if the map or the segments cannot be used.
     """
     sources = [open_map(*of) for of in maps()]
@@ -199,7 +203,7 @@ def sample_all_segments(
     if count := len(spool.place.files()):
         logger.info("resuming: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
-    batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, spool))
+    batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, shifts, spool))
     lost_by, slots = (make_mapped_array(directory, (segments.num_rows,), kind) for kind in (np.uint32, np.int64))
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     findings: dict[int, tuple[Finding, ...]] = {}
@@ -268,7 +272,9 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
             return sampled
         held = [_reuse_map(*of, batch.config) for of in batch.maps()]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
-        sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
+        sampled = sample_on_maps(
+            batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools, shifts=batch.shifts
+        )
         return batch.spool.write(batch.number, _sort_rows(batch.ranks[sampled.kept]), sampled)
     except TcpipeError as error:
         return error

@@ -70,9 +70,10 @@ def test_gps_time_is_18_s_ahead_since_2017_and_17_before():
 )
 def test_the_unit_of_a_column_is_stated_or_stands_in_its_name(role, field, column, stated, one):
     units = {field: stated} if stated else {}
-    ((expression, factor),) = read_fields("r", role, {field: column}, units, [column]).values()
-    assert factor == pytest.approx(one, rel=1e-12)
-    assert expression.evaluate(lambda name, _: {column: np.ones(2)}[name]).tolist() == [1.0, 1.0]
+    (source,) = read_fields("r", role, {field: column}, units, [column]).values()
+    assert source.evaluate(lambda name, _: {column: np.ones(2)}[name], 2).tolist() == pytest.approx(
+        [one] * 2, rel=1e-12
+    )
 
 
 def test_a_unit_that_is_another_quantity_s_or_not_known_is_asked_for():

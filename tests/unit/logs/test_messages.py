@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tcpipe.logs import roles
-from tcpipe.logs.messages import Readings, convert_imu_to_si, count_frames, find_utc_offset, read_messages
+from tcpipe.logs.messages import Readings, count_frames, find_utc_offset, read_messages
+from tcpipe.stages.read_sources import convert_imu_to_si
 
 S = 1_000_000_000
 N = 12
@@ -63,6 +64,7 @@ def test_fixes_are_kept_and_everything_else_is_counted_once() -> None:
 
 def test_a_covariance_that_says_nothing_is_null() -> None:
     columns = nav_sat_fix()
+    columns["status.status"][:] = 0  # says nothing either
     columns["position_covariance_type"][:4] = 0
     columns["position_covariance"][4:8] = 0.0
     columns["position_covariance"][8, 8] = -1.0
@@ -105,10 +107,10 @@ def test_gga_heights_are_ellipsoidal_and_hdop_gives_a_rough_variance() -> None:
     assert found.row.tolist() == [0, 3, 4]
     assert found.dropped == {"not_gga": 1, "no_fix": 1}
     np.testing.assert_allclose(found.columns["alt_m"], 592.3)  # the second takes the others' separation
-    assert found.notes == {"without_separation": 1}
+    assert found.notes == {"without_separation": 1, "std_by_quality": 3}
     assert found.columns["fix_status"].tolist() == [2, 2, 0]
-    np.testing.assert_allclose(found.columns["east_var_m2"], [0.01**2, np.nan, 8.0**2])
-    np.testing.assert_allclose(found.columns["up_var_m2"], [0.02**2, np.nan, 16.0**2])
+    np.testing.assert_allclose(found.columns["east_var_m2"], [0.01**2, 0.5**2, 8.0**2])
+    np.testing.assert_allclose(found.columns["up_var_m2"], [0.02**2, 1.0**2, 16.0**2])
     assert found.own_time_ns is not None
     assert (found.own_time_ns % (86_400 * S) == 45_319 * S).all()
 

@@ -17,6 +17,7 @@ OTHER = {
     "sample.patch_px": 20,
     "sample.min_valid_fraction": 0.5,
     "sample.max_position_std_m": 0.05,
+    "sample.align": True,
     "split.holdout": "sample",
     "split.holdout_tag": "season",
     "split.test_fraction": 0.4,

@@ -149,3 +149,73 @@ def test_trees_and_even_ground_say_nothing_of_the_unit():
     assert not trees.is_known
     even = register_track(site(ground=lambda x, y: 0.0 * (x + y)), xy, height).scale
     assert not even.is_known
+
+
+def random_ground(seed, scale_m=3.0, height_m=0.2):
+    """Return a function of x and y: a sum of waves in all directions, some three and some fifteen metres long over two pi."""
+    rng = np.random.default_rng(seed)
+    k = rng.normal(0.0, 1.0, (40, 2)) / np.repeat([scale_m, 5.0 * scale_m], 20)[:, None]
+    amplitude, phase = np.repeat([height_m, 6.0 * height_m], 20) / np.sqrt(10.0), rng.uniform(0.0, 2.0 * np.pi, 40)
+    return lambda x, y: sum(a * np.sin(u * x + v * y + p) for (u, v), a, p in zip(k, amplitude, phase, strict=True))
+
+
+def tilted(ground, tilt, seed):
+    east, north = tilt * np.array([np.cos(seed), np.sin(seed)])
+    return lambda x, y: ground(x, y) + east * (x - 50.0) + north * (y - 50.0)
+
+
+def register_tilted(seed, *, shift_m, tilt=0.0, noise_m=0.03, **ground):
+    """Return the registration of a drive whose height drifts, on a noisy map of 0.5 m, and the shift that was put in."""
+    grid, truth = MapGrid("EPSG:32633", 0.0, 100.0, 0.5, 200, 200), random_ground(seed, **ground)
+    x, y = np.moveaxis(grid.xy_from_px(np.stack(np.meshgrid(np.arange(200.0), np.arange(200.0)), -1)), -1, 0)
+    height = tilted(truth, tilt, seed)(x, y) + np.random.default_rng(seed).normal(0.0, noise_m, x.shape)
+    source = ArrayMap(grid, {"height": height.astype(np.float32)}, tile_px=256, height_reference_m=600.0)
+    xy, shift = drive(), shift_m * np.array([np.cos(7.0 * seed), np.sin(7.0 * seed)])
+    height = 646.2 + truth(*(xy + shift).T) + drift(len(xy), 0.02, 400, seed)
+    return register_track(source, xy, height, with_tilt=True), shift
+
+
+@pytest.mark.parametrize(("shift_m", "tilt"), [(0.0, 0.02), (0.3, 0.0), (1.0, 0.015), (3.0, 0.02)])
+def test_a_shift_is_inside_two_sigma_on_tilted_and_noisy_maps(shift_m, tilt):
+    """Twelve worlds for each shift: errors of both axes over their deviations, and no error that is large in metres."""
+    found, truth = zip(*(register_tilted(seed, shift_m=shift_m, tilt=tilt) for seed in range(12)), strict=True)
+    assert not any(of.at_reach for of in found)
+    error_m = np.array([of.shift_xy_m for of in found]) - truth
+    scaled = error_m / np.array([of.axis_std_m for of in found])
+    assert (np.abs(scaled) < 2.0).mean() >= 0.9
+    assert 0.4 < np.sqrt(np.mean(scaled**2)) < 1.4
+    assert np.linalg.norm(error_m, axis=1).max() < 0.2
+    assert np.median([of.position_std_m for of in found]) < 0.1
+    assert [of.height_offset_m for of in found] == pytest.approx([46.2] * 12, abs=0.2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_tilt_alone_is_no_shift(seed):
+    """On a hill without other relief a tilt is a shift, and on even ground everything is."""
+    for ground in (lambda x, y: 0.002 * (x**2 + y**2), lambda x, y: 0.0 * x * y, lambda x, y: 0.1 * x - 0.03 * y):
+        source, xy = site(tilted(ground, 0.015, seed), noise_m=0.02, seed=seed), drive()
+        found = register_track(source, xy, 600.0 + ground(*xy.T) + drift(len(xy), 0.02, 400, seed), with_tilt=True)
+        assert np.isnan(found.position_std_m) or found.shift_m < 2.0 * found.position_std_m
+        assert not found.position_std_m < 0.1
+
+
+def test_heights_of_other_ground_do_not_move_a_tilted_map():
+    """A bridge, a tree, and a map in which heights are a tenth larger."""
+    source, xy = site(tilted(lambda x, y: 1.1 * rolling(x, y), 0.02, 1)), drive()
+    height = 600.0 + rolling(*np.add(xy, (1.2, 0.5)).T)
+    height[1000:1600] += 4.0
+    source.arrays["height"][200:280, 100:900] += 6.0
+    found = register_track(source, xy, height, with_tilt=True)
+    assert found.shift_xy_m == pytest.approx((1.2, 0.5), abs=max(0.1, 2.0 * found.position_std_m))
+    assert found.position_std_m < 0.1
+
+
+def test_a_map_that_repeats_itself_determines_no_shift():
+    """Ridges 2.5 m apart fit a shift of 0.5 m as well as one of -2 m."""
+
+    def ridges(x, y):
+        return 0.2 * np.sin(2.0 * np.pi * x / 2.5) + 0.2 * np.sin(2.0 * np.pi * y / 2.5)
+
+    source, xy = site(ridges), drive()
+    found = register_track(source, xy, 600.0 + ridges(*np.add(xy, (0.5, 0.0)).T), with_tilt=True)
+    assert np.isnan(found.position_std_m)

@@ -9,7 +9,7 @@ from tcpipe.errors import LogError, UsageError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.log_joining import open_logs
-from tcpipe.formats.logs.table_log import TableLog
+from tcpipe.formats.logs.table_log import open_tables
 from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_toml
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
@@ -128,7 +128,7 @@ def test_all_that_a_mapping_names_in_vain_is_said_at_once(tmp_path):
         "notes": TableMapping("notes.docx", "command", columns={"linear_x": "v"}),
     }
     with pytest.raises(LogError) as caught:
-        TableLog(folder, mappings)
+        open_tables(folder, mappings)
     said = "\n".join(caught.value.problems)
     assert len(caught.value.problems) == 9
     for words in (
@@ -148,7 +148,7 @@ def test_what_cannot_be_read_of_a_row_is_damage_and_rows_are_put_in_order(tmp_pa
     lines = odometry().splitlines()
     lines[3], lines[4], lines[10], lines[20] = lines[4], lines[3], "later,1,1", lines[20].split(",")[0] + ",slow,0.1"
     folder = folder_with(tmp_path, odom="\n".join(lines))
-    log = TableLog(folder, {"wheel_odometry": WHEELS})
+    log = open_tables(folder, {"wheel_odometry": WHEELS})
     assert [describe_finding(finding) for finding in log.findings] == [
         "odom.csv: messages or rows have no valid time (1 messages lost)",
         "odom.csv: not read as numbers: column v, row 20: 'slow' (1 messages lost)",
@@ -163,10 +163,10 @@ def test_what_cannot_be_read_of_a_row_is_damage_and_rows_are_put_in_order(tmp_pa
 
 def test_a_run_is_known_by_all_tables_of_its_folder_not_by_what_is_mapped(tmp_path):
     folder = folder_with(tmp_path, odom=odometry(), other="t,a\n1,2\n")
-    one = TableLog(folder, {"wheel_odometry": WHEELS}).sha256()
-    assert TableLog(folder, {"command": TableMapping("odom.csv", columns={"linear_x": "v"})}).sha256() == one
+    one = open_tables(folder, {"wheel_odometry": WHEELS}).sha256()
+    assert open_tables(folder, {"command": TableMapping("odom.csv", columns={"linear_x": "v"})}).sha256() == one
     (folder / "other.csv").write_text("t,a\n1,3\n")
-    assert TableLog(folder, {"wheel_odometry": WHEELS}).sha256() != one
+    assert open_tables(folder, {"wheel_odometry": WHEELS}).sha256() != one
 
 
 def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_path):

@@ -5,10 +5,14 @@ import pyarrow as pa
 import pytest
 from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, segments
 
+from tcpipe import open_dataset
 from tcpipe.errors import MapError
 from tcpipe.formats.dataset_files import read_card
+from tcpipe.formats.finding_lines import describe_finding
+from tcpipe.pipeline.dataset import map_checks
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.recipe import Recipe
+from tcpipe.pipeline.explain import explain
+from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, select_findings
 from tcpipe.tables.levels import MASKED_TRACK
@@ -38,12 +42,98 @@ def winding(count=3000):
     return np.stack([14.0 * np.sin(s), 13.0 * np.cos(1.5 * s)], 1)
 
 
-def build_with(directory, track):
+def build_with(directory, track, recipe=None):
     """Build a dataset of one run with this track."""
     store = open_store(directory / "store", create=True)
     add_world(store, directory)
     add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), track=track)
-    return build_dataset(directory / "out", store=store.root, recipe=Recipe())
+    return build_dataset(directory / "out", store=store.root, recipe=recipe or Recipe())
+
+
+ALIGN = Recipe(sample=SampleConfig(align=True))
+SHIFT_M = (-1.5, 0.8)
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory):
+    """Two runs whose map lies elsewhere, and where their ground is by the map; one of them is too uncertain to be moved."""
+    directory = tmp_path_factory.mktemp("moved")
+    store = open_store(directory / "store", create=True)
+    add_world(store, directory)
+    xy, (start, end) = winding(), lanes([-6.0, 2.0], -10.0, 10.0)
+    add_run(store, "off", segments("off", start, end), track=track_at(xy, np.add(xy, SHIFT_M)))
+    short = track_at(xy[:300], np.add(xy[:300], SHIFT_M))
+    add_run(store, "short", segments("short", *lanes([6.0], -10.0, 10.0), start_ns=10**13), track=short)
+    result = build_dataset(directory / "out", store=store.root, recipe=ALIGN)
+    there = open_store(directory / "there", create=True)
+    add_world(there, directory)
+    add_run(there, "off", segments("off", np.add(start, SHIFT_M), np.add(end, SHIFT_M)))
+    build_dataset(directory / "truth", store=there.root, recipe=Recipe())
+    return directory, result
+
+
+def read_run(directory, run_id):
+    """Return a run's samples by id: its row, and its patch (channels, px, px)."""
+    found = {}
+    for split in open_dataset(directory).values():
+        for row, patch in zip(split.samples.to_pylist(), split.patches, strict=True):
+            found |= {row["sample_id"]: (row, patch)} if row["run_id"] == run_id else {}
+    return found
+
+
+def test_an_aligned_run_gets_the_patches_of_its_ground(moved):
+    directory, result = moved
+    aligned, truth = (read_run(directory / name, "off") for name in ("out", "truth"))
+    assert aligned.keys() == truth.keys()
+    assert len(aligned) == 40
+    off = [np.abs(patch - truth[name][1]).mean() for name, (_, patch) in aligned.items()]
+    assert max(off) < 0.02
+    (entry,) = (of for of in result.card.maps[0].registration if of.run_id == "off")
+    assert entry.shift_xy_m == pytest.approx(SHIFT_M, abs=0.1)
+    assert np.abs(np.subtract(entry.shift_xy_m, SHIFT_M)).max() < 2.0 * entry.applied_std_m
+    for name, (row, _) in aligned.items():
+        there = truth[name][0]
+        assert row["position_std_m"] == np.hypot(there["position_std_m"], entry.applied_std_m)
+        assert row["start_lon_deg"] != there["start_lon_deg"]  # the track stays where it was measured
+        assert row["terrain_name"] == there["terrain_name"]
+
+
+def test_the_shift_is_said_and_a_run_without_one_is_not_moved(moved):
+    directory, result = moved
+    (said,) = select_findings(result.findings, "map-aligned")
+    assert (said.subject, said.severity, said.action) == (Subject("run", "off"), "note", "corrected")
+    assert said.numbers["shift_m"] == pytest.approx(1.7, abs=0.1)
+    assert not select_findings(result.findings, "map-shifted")
+    (refused,) = select_findings(result.findings, "map-not-aligned")
+    assert refused.subject == Subject("run", "short")
+    assert result.card.verdict.position == "usable with care"
+    assert {row["position_std_m"] for row, _ in read_run(directory / "out", "short").values()} == {0.02}
+    assert refused.names["reason"] == "too few points on the map"
+    assert [of.run_id for of in result.card.maps[0].registration] == ["off"]
+    assert describe_finding(said).startswith("off: moved by 1.7")
+
+
+def test_an_aligned_sample_is_explained_by_the_same_shift(moved):
+    directory, _ = moved
+    for run_id in ("off", "short"):
+        sample_id = next(iter(read_run(directory / "out", run_id)))
+        assert explain(sample_id, dataset=directory / "out", store=directory / "store").differences == ()
+
+
+@pytest.mark.parametrize(
+    ("geoid_m", "reason"),
+    [
+        (None, "probably ellipsoid against geoid"),
+        (45.0, "ellipsoid against geoid (45.0 m there)"),
+        (20.0, "not ellipsoid against geoid (20.0 m there)"),
+    ],
+)
+def test_heights_above_the_ellipsoid_are_recognised(tmp_path, monkeypatch, geoid_m, reason):
+    monkeypatch.setattr(map_checks, "compute_geoid_height", lambda lon, lat: geoid_m if 15 < lon < 16 < lat else 0.0)
+    found = build_with(tmp_path, track_at(winding(), winding()), ALIGN)
+    (said,) = select_findings(found.findings, "map-height-datum")
+    assert (said.subject, said.severity, said.names["reason"]) == (Subject("map", "site"), "note", reason)
+    assert said.numbers["offset_m"] == pytest.approx(GEOID_M, abs=0.1)
 
 
 HEIGHTS = ("map-heights-differ", "map-height-scale")

@@ -1,0 +1,117 @@
+"""Logs whose topics are tables of messages that other files were turned into, behind the same face as a bag: topics, tables, damage."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import LogError
+from tcpipe.logs.messages import Columns
+from tcpipe.logs.topics import Damage, Topic, find_damage
+from tcpipe.tables.arrays import make_text_column, number_column
+from tcpipe.tables.findings import Finding
+
+_HASH_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessages:
+    """A topic, how its messages are made, and what of them is damaged."""
+
+    topic: Topic
+    make: Callable[[], pa.Table]
+    damage: Sequence[Damage] = ()
+
+
+class TableLog:
+    """A log whose topics are tables of messages; each is made when it is asked for."""
+
+    outline = ""
+    """There is no index; the files are hashed."""
+    is_known_by_outline = False
+
+    def __init__(
+        self,
+        path: Path,
+        container: str,
+        topics: Sequence[TopicMessages],
+        files: Sequence[Path],
+        *,
+        findings: Iterable[Finding] = (),
+        stack: ExitStack | None = None,
+    ) -> None:
+        self.path, self.container = path, container
+        self._made = {found.topic.name: found.make for found in topics}
+        self.topics = {found.topic.name: found.topic for found in topics}
+        """Every topic by name."""
+        self.findings = [*find_damage(damage for found in topics for damage in found.damage), *findings]
+        self._files, self._stack = files, stack or ExitStack()
+
+    def __enter__(self) -> Self:
+        """Return the log."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove temporary copies."""
+        self._stack.__exit__(kind, error, trace)
+
+    def close(self) -> None:
+        """Remove temporary copies."""
+        self._stack.close()
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the files together, also of tables that are not mapped."""
+        return sum(file.stat().st_size for file in self._files)
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of all files, one after the other, by name; also of tables that are not mapped."""
+        digest = hashlib.sha256()
+        for file in self._files:
+            with file.open("rb") as stream:
+                while block := stream.read(_HASH_BYTES):
+                    digest.update(block)
+        return digest.hexdigest()
+
+    def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+        """Return the messages of several topics; `LogError` where one is not in the log."""
+        return {name: table for tables in self.batches(topics) for name, table in tables.items()}
+
+    def batches(self, topics: Iterable[str]) -> Iterator[dict[str, pa.Table]]:
+        """Yield the messages of several topics, one topic after the other."""
+        wanted = list(topics)
+        if unknown := [name for name in wanted if name not in self._made]:
+            raise LogError(f"{self.path}: there is no topic {', '.join(unknown)}; there are {', '.join(self.topics)}")
+        for name in wanted:
+            yield {name: self._made[name]()}
+
+
+def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """Return the fields of a header's stamp."""
+    second, rest = np.divmod(stamp_ns, 1_000_000_000)
+    return {"header.stamp.sec": second, "header.stamp.nanosec": rest}
+
+
+def make_message_table(stamp_ns: NDArray[np.int64], columns: Columns) -> pa.Table:
+    """Return messages as a table: both log times are the stamps [ns]; columns of shape (N, k) become lists, those of bytes texts."""
+    times = {"log_time_ns": number_column(stamp_ns), "publish_time_ns": number_column(stamp_ns)}
+    return pa.table({**times, **{name: _make_column(values) for name, values in columns.items()}})
+
+
+def _make_column(values: NDArray[np.generic]) -> pa.Array:
+    if values.dtype.kind == "S":
+        return make_text_column(text.decode(errors="replace") for text in values.tolist())
+    if values.ndim == 1:
+        return number_column(values)
+    return pa.FixedSizeListArray.from_arrays(number_column(values.ravel()), values.shape[1])

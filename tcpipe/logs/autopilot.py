@@ -1,0 +1,295 @@
+"""Messages of autopilots as those that roles usually have: PX4 (its msg/ directory) and ArduPilot (LogStructure.h of its libraries).
+
+Autopilots count time from boot, and use body axes forward, right, down and north, east, down over ground; here they become forward, left,
+up and east, north, up (REP-103). base_link is the origin of the autopilot's body frame.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
+from tcpipe.logs.messages import GNSS, Columns
+from tcpipe.logs.roles import GPS_FIXES
+from tcpipe.logs.topics import AutopilotKind
+from tcpipe.tables.findings import Finding, Subject, make_finding
+
+Int64 = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Stamped = tuple[Int64, Columns]
+"""Times since boot [µs], shape (N,), and fields by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Autopilot:
+    """What an autopilot logged: messages by name (those of instances beside the first are called ``name_1`` …), and parameters."""
+
+    kind: AutopilotKind
+    messages: Mapping[str, Stamped]
+    parameters: Mapping[str, float]
+
+    def list_instances(self, name: str) -> list[str]:
+        """Return the names of all instances, the first first."""
+        return sorted(found for found in self.messages if re.fullmatch(rf"{name}(_\d+)?", found))
+
+    def find_last(self, name: str, at_us: Int64, *, within_us: int) -> Columns:
+        """Return the numbers of the last message of a name at or before each time, NaN where that is long ago; {} without any."""
+        time_us, fields = self.messages.get(name, (None, {}))
+        if time_us is None:
+            return {}
+        row = np.searchsorted(time_us, at_us, side="right") - 1
+        stale = (row < 0) | (at_us - time_us[row] > within_us)
+        numbers = {name: of for name, of in fields.items() if of.ndim == 1 and of.dtype.kind in "fiu"}
+        return {name: np.where(stale, np.nan, of[row].astype(np.float64)) for name, of in numbers.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class RoleMessages:
+    """A topic that a role can use: its type, times since boot [µs], the message's fields by dotted name, and the sensor's frame."""
+
+    topic: str
+    type_name: str
+    time_us: Int64
+    columns: Columns
+    frame: str
+
+
+def make_role_messages(log: Autopilot) -> tuple[list[RoleMessages], list[Finding]]:
+    """Return what roles can use, and findings: messages that lack fields, heights with another zero.
+
+    Of the names of a source the first counts that there is, and of its instances the first; batteries count all.
+    """
+    made: list[RoleMessages] = []
+    findings: list[Finding] = []
+    for names, topic, role, frame, convert in _SOURCES[log.kind]:
+        present = next((found for name in names.split() if (found := log.list_instances(name))), [])
+        for name in present if role == "power" else present[:1]:
+            try:
+                with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
+                    time_us, values = convert(log, name, *log.messages[name])
+            except KeyError as error:
+                what = {"role": role, "fields": str(error.args[0])}
+                findings.append(make_finding("fields-missing", Subject("topic", f"/{name}"), names=what))
+                continue
+            of_gps_fix = "speed" in values
+            type_name = GPS_FIXES[1] if of_gps_fix else MAPPED_TYPES[role]
+            columns = values if of_gps_fix else make_message_fields(role, values, len(time_us))
+            made.append(RoleMessages(f"/{name}/{topic}", type_name, time_us, columns, frame))
+    if any(of.type_name == MAPPED_TYPES["gnss"] for of in made) and _find_ellipsoidal(log) is None:
+        findings.append(make_finding("geoid-separation-missing", GNSS))
+    return made, findings
+
+
+def find_places(parameters: Mapping[str, float]) -> dict[str, tuple[float, float, float]]:
+    """Return where sensors are, forward, left and up of base_link [m], by frame, as parameters say; all zero says nothing."""
+    found: dict[str, tuple[float, float, float]] = {}
+    for frame, prefixes in _PLACES.items():
+        stated = ([parameters.get(f"{prefix}_{axis}", 0.0) for axis in "XYZ"] for prefix in prefixes.split())
+        if frd := next((place for place in stated if any(place) and np.isfinite(place).all()), None):
+            found[frame] = (frd[0], -frd[1], -frd[2])
+    return found
+
+
+_PLACES = {"gps": "EKF2_GPS_POS GPS1_POS GPS_POS1 GPS_POS", "imu": "EKF2_IMU_POS INS_POS1"}
+
+
+def find_utc_offset_us(log: Autopilot) -> int:
+    """Return what a receiver's UTC is ahead of the time since boot [µs], the median over its messages; 0 where none told the time."""
+    _, time_us, fields = _find_receiver(log)
+    if "time_utc_usec" in fields:
+        utc_us = fields["time_utc_usec"].astype(np.int64)
+        time_us = time_us + fields.get("timestamp_time_relative", np.zeros(1)).astype(np.int64)
+    else:  # week and milliseconds of GPS, which had other names before 2015
+        week, ms = (fields.get(new, fields.get(old, np.zeros(1))).astype(np.int64) for new, old in _GPS_TIME)
+        utc_us = utc_from_gps_ns((_GPS_BEGAN_MS + week * _WEEK_MS + ms) * 10**6) // 1000
+    known = (utc_us > _FIRST_US) & (utc_us < _LAST_US)
+    return int(np.median((utc_us - time_us)[known])) if known.any() else 0
+
+
+_GPS_TIME = (("GWk", "Week"), ("GMS", "TimeMS"))
+_GPS_BEGAN_MS, _WEEK_MS = 315_964_800_000, 7 * 86_400_000
+_FIRST_US, _LAST_US = 1_100_000_000 * 10**6, 4_000_000_000 * 10**6
+"""Receivers count from an epoch of their own until they know the time; no log is from before 2004."""
+
+
+_RECEIVERS = "vehicle_gps_position sensor_gps GPS"
+
+
+def _find_receiver(log: Autopilot) -> tuple[str, Int64, Columns]:
+    """Return the name and messages of the first receiver; none are as one at time 0 that tells nothing."""
+    names = [found for name in _RECEIVERS.split() for found in log.list_instances(name)]
+    return (names[0], *log.messages[names[0]]) if names else ("", np.zeros(1, np.int64), {})
+
+
+def _find_ellipsoidal(log: Autopilot) -> Floats | None:
+    """Return a receiver's heights above the ellipsoid [m], None where they are not logged: 0 throughout, or a number for unknown."""
+    name, time_us, fields = _find_receiver(log)
+    known = {**fields, **_find_accuracy(log, name, time_us)}
+    scales = {"altitude_ellipsoid_m": 1.0, "alt_ellipsoid": 1e-3, "AEl": 1.0}
+    heights = next((known[name] * scale for name, scale in scales.items() if name in known), np.zeros(1))
+    return heights if np.any(heights) and not np.any(np.abs(heights) > _HIGHEST_M) else None
+
+
+_HIGHEST_M = 1e5
+_STATUS = np.array([-1, -1, 0, 0, 1, 2, 2, -1])
+"""NavSatStatus by type of fix: none, none, 2D, 3D, differential, RTK float, RTK fixed; those beyond are no measurements."""
+_IN_3D = 3
+
+
+def _make_fix(log: Autopilot, kind: Int64, sea_m: Floats) -> Columns:
+    """Return status and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
+    ellipsoidal = _find_ellipsoidal(log)
+    height = np.where(kind >= _IN_3D, sea_m if ellipsoidal is None else ellipsoidal, np.nan)
+    return {"status": _STATUS[np.minimum(kind, len(_STATUS) - 1)], "altitude": height}
+
+
+def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[str, Floats]:
+    """Return a vector's components forward, left and up."""
+    return {
+        f"{name}_x": forward.astype(np.float64),
+        f"{name}_y": -right.astype(np.float64),
+        f"{name}_z": -down.astype(np.float64),
+    }
+
+
+# ---------------------------------------------------------------- PX4
+def _convert_px4_fix(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    if "latitude_deg" in f:
+        lat, lon, sea = f["latitude_deg"], f["longitude_deg"], f["altitude_msl_m"]
+    else:  # until 2023
+        lat, lon, sea = f["lat"] * 1e-7, f["lon"] * 1e-7, f["alt"] * 1e-3
+    accuracy = {"east_std": f["eph"], "north_std": f["eph"], "up_std": f["epv"]}
+    return time_us, {"latitude": lat, "longitude": lon, **_make_fix(log, f["fix_type"], sea), **accuracy}
+
+
+def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    known = (f["vel_ned_valid"] != 0) & (f["fix_type"] >= _IN_3D)
+    axes = {"east": f["vel_e_m_s"], "north": f["vel_n_m_s"], "up": -f["vel_d_m_s"]}
+    values = {name: np.where(known, of, np.nan) for name, of in axes.items()}
+    return time_us, values | {f"{name}_std": f["s_variance_m_s"] for name in axes}
+
+
+def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    unknown = f["accelerometer_timestamp_relative"] == np.iinfo(np.int32).max
+    force = np.where(unknown[:, None], np.nan, f["accelerometer_m_s2"])
+    return time_us, _turn_axes("angular_velocity", *f["gyro_rad"].T) | _turn_axes("linear_acceleration", *force.T)
+
+
+def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    voltage, current = f["voltage_v"], f["current_a"]  # 0 and -1 where it is not known
+    drawn = np.where(current == -1, np.nan, -current)  # negative in BatteryState
+    return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
+
+
+def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    """Return the mean of both wheels: drivers do not agree which is the left one."""
+    if "RDD_WHEEL_RADIUS" not in log.parameters:
+        raise KeyError("a wheel radius (RDD_WHEEL_RADIUS)")
+    return time_us, {"linear_x": f["wheel_speed"].mean(axis=1) * log.parameters["RDD_WHEEL_RADIUS"]}
+
+
+def _convert_px4_command(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    if (name := next((name for name in _PX4_SPEEDS if name in f), None)) is not None:
+        speed = f[name]
+    else:  # of trajectory_setpoint, which had other names until 2022
+        speed = np.hypot(*(f["velocity"].T[:2] if "velocity" in f else (f["vx"], f["vy"])))
+    turn = {**log.find_last("rover_rate_setpoint", time_us, within_us=_HELD_US), **f}
+    right = next((turn[name] for name in ("yaw_rate_setpoint", "yaw_rate", "yawspeed") if name in turn), 0.0 * speed)
+    return time_us, {"linear_x": speed, "angular_z": -np.nan_to_num(right)}
+
+
+_PX4_SPEEDS = ("speed_body_x", "forward_speed_setpoint", "speed")
+_HELD_US = 1_000_000
+
+
+# ---------------------------------------------------------------- ArduPilot
+def _find_accuracy(log: Autopilot, name: str, time_us: Int64) -> Columns:
+    """Return the accuracies that are logged beside each fix."""
+    return log.find_last(name.replace("GPS", "GPA"), time_us + _BESIDE_US, within_us=2 * _BESIDE_US)
+
+
+_BESIDE_US = 50_000
+
+
+def _convert_ardupilot_fix(log: Autopilot, name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    values = {"latitude": f["Lat"], "longitude": f["Lng"], **_make_fix(log, f["Status"], f["Alt"])}
+    if accuracy := _find_accuracy(log, name, time_us):
+        values |= {"east_std": accuracy["HAcc"], "north_std": accuracy["HAcc"], "up_std": accuracy["VAcc"]}
+    return time_us, values
+
+
+def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    """Return the fields of GPSFix, which has speed and course; its errors are those of 95 per cent."""
+    accuracy, unknown = _find_accuracy(log, name, time_us), np.full(len(time_us), np.nan)
+    error = 2.0 * accuracy.get("SAcc", unknown)
+    climb = np.where(accuracy.get("VV", unknown) == 1, -f["VZ"], np.nan)
+    status = np.where(f["Status"] >= _IN_3D, _STATUS[np.minimum(f["Status"], len(_STATUS) - 1)], -1)
+    values = {"speed": f["Spd"], "track": f["GCrs"], "climb": climb, "err_speed": error, "err_climb": error}
+    return time_us, {**values, "status.status": status}
+
+
+def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    broken = (f.get("GH", 1) == 0) | (f.get("AH", 1) == 0)
+    rate, force = ([np.where(broken, np.nan, f[f"{of}{axis}"]) for axis in "XYZ"] for of in ("Gyr", "Acc"))
+    return time_us, _turn_axes("angular_velocity", *rate) | _turn_axes("linear_acceleration", *force)
+
+
+def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    scale = 1.0 if f["Volt"].dtype.kind == "f" else 0.01  # before 2015 in hundredths
+    voltage, drawn = f["Volt"] * scale, f["Curr"] * -scale
+    return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
+
+
+def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    """Return speed and turn between two messages from the distances of the wheels, stamped in the middle."""
+    step_s = np.diff(time_us, prepend=np.nan) * 1e-6
+    speed, right_m = list[Floats](), list[float]()
+    for distance_m, prefix in ((f["Dist0"], "WENC"), (f["Dist1"], "WENC2")):
+        if log.parameters.get(f"{prefix}_TYPE", np.ptp(distance_m)):
+            speed.append(np.diff(distance_m.astype(np.float64), prepend=np.nan) / step_s)
+            right_m.append(log.parameters.get(f"{prefix}_POS_Y", 0.0))
+    if not speed or (len(speed) == 1 and right_m != [0.0]):
+        raise KeyError("a second wheel")
+    apart_m = right_m[-1] - right_m[0]
+    turn = (speed[-1] - speed[0]) / apart_m if apart_m else 0.0 * step_s
+    ahead = speed[0] - turn * right_m[0] if apart_m else np.mean(speed, axis=0)
+    return time_us - np.nan_to_num(step_s * 5e5).astype(np.int64), {"linear_x": ahead, "angular_z": turn}
+
+
+def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+    steering = log.find_last("STER", time_us, within_us=_HELD_US)
+    turn = -np.radians(np.nan_to_num(steering.get("DesTurnRate", np.zeros(len(time_us)))))
+    return time_us, {"linear_x": f["DesSpeed"], "angular_z": turn}
+
+
+_Convert = Callable[[Autopilot, str, Int64, Columns], tuple[Int64, Columns]]
+_PX4_COMMANDS = """rover_speed_setpoint rover_differential_setpoint rover_ackermann_setpoint rover_mecanum_setpoint
+differential_drive_setpoint trajectory_setpoint"""
+_SOURCES: dict[str, tuple[tuple[str, str, str, str, _Convert], ...]] = {
+    "ulog": (
+        (_RECEIVERS, "fix", "gnss", "gps", _convert_px4_fix),
+        (_RECEIVERS, "velocity", "gnss_velocity", "", _convert_px4_velocity),
+        ("sensor_combined", "imu", "imu", "imu", _convert_px4_imu),
+        ("wheel_encoders", "odometry", "wheel_odometry", "base_link", _convert_px4_wheels),
+        ("battery_status", "battery", "power", "", _convert_px4_battery),
+        (_PX4_COMMANDS, "command", "command", "", _convert_px4_command),
+    ),
+    "dataflash": (
+        (_RECEIVERS, "fix", "gnss", "gps", _convert_ardupilot_fix),
+        (_RECEIVERS, "velocity", "gnss_velocity", "", _convert_ardupilot_velocity),
+        ("IMU", "imu", "imu", "imu", _convert_ardupilot_imu),
+        ("WENC", "odometry", "wheel_odometry", "base_link", _convert_ardupilot_wheels),
+        ("BAT CURR", "battery", "power", "", _convert_ardupilot_battery),
+        ("THR", "command", "command", "", _convert_ardupilot_command),
+    ),
+}
+"""Names of messages, best first; topic, role and frame of what they become, and how."""
+
+_BESIDE = "GPA STER rover_rate_setpoint"
+CONVERTED = {name for of in _SOURCES.values() for names, *_ in of for name in names.split()} | {*_BESIDE.split()}
+"""Names of messages that are read here."""
