@@ -29,15 +29,19 @@ from tcpipe.fusion.filter_kernel import (
     allocate_steps,
     filter_ticks,
 )
-from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects, make_excursions
+from tcpipe.fusion.hypotheses import (
+    POSSIBLE,
+    ROLES,
+    Hypothesis,
+    compute_weights,
+    explain,
+    find_suspects,
+    make_excursions,
+)
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import (
-    DOPPLER,
-    GNSS,
     IMU,
     STATED_ARM_STD_M,
-    VISUAL,
-    WHEELS,
     InitialState,
     Measurements,
     select_rows,
@@ -65,13 +69,6 @@ from tcpipe.tables.findings import Subject, make_finding
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-ROLES = {
-    state.WHEELS: WHEELS,
-    state.VISUAL: VISUAL,
-    state.DOPPLER: DOPPLER,
-    state.FIX: GNSS,
-    state.ATTITUDE: GNSS,
-}
 _OF_ODOMETRY = {
     state.WHEELS: (state.WHEEL_SCALE, state.WHEEL_SLIP, state.WHEEL_LAG),
     state.VISUAL: (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG),
@@ -490,7 +487,7 @@ def _make_facts(  # noqa: PLR0917
     rows = _list_rows(m, made)
     tests = made.tests
     nis, verdicts = {}, {}
-    for role in {ROLES[kind]: None for kind in rows}:
+    for role in dict.fromkeys(ROLES[kind] for kind in rows):
         kinds = [kind for kind in rows if ROLES[kind] == role]
         taken = np.concatenate([tests.nis[tests.verdict[:, kind] == ACCEPTED, kind] for kind in kinds])
         nis[role] = float(taken.mean()) / state.SIZES[kinds[0]] if taken.size else None

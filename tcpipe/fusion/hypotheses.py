@@ -23,12 +23,20 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.event_candidates import EventCandidate, TurnJump
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
-from tcpipe.fusion.measurements import VISUAL, WHEELS
+from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS
 from tcpipe.fusion.parameters import Event
 from tcpipe.fusion.ticks import Pass, Ticks
 
 Floats = NDArray[np.float64]
 
+ROLES = {
+    state.WHEELS: WHEELS,
+    state.VISUAL: VISUAL,
+    state.DOPPLER: DOPPLER,
+    state.FIX: GNSS,
+    state.ATTITUDE: GNSS,
+}
+"""Sensors by the kind of their measurements."""
 POSSIBLE = (
     *range(state.ARM, state.FIX_OFFSET + 3),
     state.WHEEL_SCALE,
@@ -133,7 +141,6 @@ _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
 }
 _VARYING = GaussMarkov(0.1**2, 5.0)
 """A scale that changes by a tenth with slope, ground or load."""
-_ODOMETRIES = {state.WHEELS: WHEELS, state.VISUAL: VISUAL}
 _COSTS = {
     "offset": 12.0,
     "antenna": 40.0,
@@ -177,7 +184,7 @@ class Hypothesis:
 
     def alter_noise(self, noise: NoiseModel) -> NoiseModel:
         """Return the noise of the sensors as it is under all changes."""
-        roles = [_ODOMETRIES[change.role] for change in self.changes if change.kind == "varies"]
+        roles = [ROLES[change.role] for change in self.changes if change.kind == "varies"]
         varying = {role: replace(noise.odometries[role], scale=_VARYING) for role in roles}
         return replace(noise, odometries={**noise.odometries, **varying})
 
@@ -253,7 +260,8 @@ def explain(
             best = top
             if (change := top.changes[-1]).kind == "pose" and change.size < _CARRIED_M:
                 # Such a step is one of the fixes, which err before or after it; if neither is more likely, around it.
-                around, *sides = (_add(top, each) for each in _list_wanders(change.first, change.size, size, period_s))
+                wanders = _list_wanders(change.first, change.size, size, period_s)
+                around, *sides = (replace(top, changes=(*top.changes[:-1], each)) for each in wanders)
                 begin = min(c.first for c in around.changes)
                 likely = [compute_evidence(run(each, begin, last).tests, gates, begin, last) for each in sides]
                 best = around if abs(likely[0] - likely[1]) < _SIDE else sides[int(np.argmax(likely))]
@@ -290,11 +298,6 @@ def _drop_changes(
         if lost < _SURELY:
             best, tests = replace(others, score=best.score - lost), rest
     return best, tests
-
-
-def _add(hypothesis: Hypothesis, change: Change) -> Hypothesis:
-    """Return a hypothesis with another change in place of its last."""
-    return replace(hypothesis, changes=(*hypothesis.changes[:-1], change))
 
 
 def _list_wanders(tick: int, off_m: float, size: int, period_s: float) -> Iterator[Change]:
@@ -338,7 +341,7 @@ def _list_changes(suspect: Suspect, suspects: Sequence[Suspect], tests: Tests, p
     """Yield single changes that could explain a suspect."""
     size = tests.verdict.shape[0]
     role, first, last = suspect.role, suspect.first, None if suspect.last >= size else suspect.last
-    for odometry in _ODOMETRIES:
+    for odometry in (state.WHEELS, state.VISUAL):
         yield Change("varies", odometry, first)
     if role != state.FIX:
         if role == state.ATTITUDE:

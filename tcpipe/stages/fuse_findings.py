@@ -153,9 +153,9 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
 
 
 def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
-    """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off or a scale varies."""
+    """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
     merged: list[ChangeFacts] = []
-    changes = (each for section in facts.stretches for each in section.changes)
+    changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
     for change in sorted(changes, key=lambda each: (each.role, each.kind, each.start_ns)):
         before = merged[-1] if merged else change
         if merged and (before.role, before.kind) == (change.role, change.kind) and change.start_ns <= before.end_ns:
@@ -165,9 +165,6 @@ def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
             merged.append(change)
     for change in sorted(merged, key=lambda each: each.start_ns):
         subject = Subject("role", change.role)
-        if change.kind == "varies":
-            yield make_finding("odometry-scale-varies", subject, variation_fraction=change.size)
-            continue
         names = {"change": CHANGES[change.kind]}
         yield make_finding(
             "sensor-changed", subject, span_s=_find_span_s(change, first_ns), names=names, off_m=change.size
@@ -267,10 +264,11 @@ def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Str
             yield make_finding("odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=std)
     # That of wheels always varies: they slip.
     camera = parameters.get("camera scale")
-    is_found = any(each.kind == "varies" and each.role == VISUAL for of in facts.stretches for each in of.changes)
-    variation = 0.0 if camera is None or is_found else max(camera.variation, default=0.0)
-    if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
-        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=variation)
+    varies = {} if camera is None else {VISUAL: max(camera.variation, default=0.0)}
+    varies |= {each.role: each.size for of in facts.stretches for each in of.changes if each.kind == "varies"}
+    for role, variation in varies.items():
+        if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
+            yield make_finding("odometry-scale-varies", Subject("role", role), variation_fraction=variation)
 
 
 def _is_contradicted(found: ParameterFacts, least: float) -> bool:

@@ -35,26 +35,14 @@ def counts(**said):
     return {"invalid": 0, "repeated": 0, "variances_replaced": 0} | said
 
 
-def test_changes_of_one_kind_that_overlap_are_one_finding_and_a_scale_that_varies_is_its_own():
-    def change(kind, start_s, end_s, size=0.0, role="gnss"):
-        return ChangeFacts(kind, role, round(start_s * 1e9), round(end_s * 1e9), size)
+def test_changes_of_one_kind_that_overlap_are_one_finding():
+    def change(kind, start_s, end_s, size):
+        return ChangeFacts(kind, "gnss", round(start_s * 1e9), round(end_s * 1e9), size)
 
-    first = (change("wander", 5, 45, 0.3), change("antenna", 30, 60), change("wander", 40, 80, 0.7))
-    second = (change("wander", 90, 95, 0.1), change("varies", 91, 99, 0.08, "visual_odometry"))
-    findings = warned(FusionInputs(PLACE), stretch(changes=first), stretch(changes=second))
-    told = [(each.code, each.subject.name, each.span_s) for each in findings if each.code != "initial-yaw-uncertain"]
-    assert told == [
-        ("sensor-changed", "gnss", (5.0, 80.0)),
-        ("sensor-changed", "gnss", (30.0, 60.0)),
-        ("sensor-changed", "gnss", (90.0, 95.0)),
-        ("odometry-scale-varies", "visual_odometry", None),
-    ]
-    assert [each.numbers.get("off_m", each.numbers.get("variation_fraction")) for each in findings] == [
-        0.7,
-        0.0,
-        0.1,
-        0.08,
-    ]
+    first = (change("wander", 5, 45, 0.3), change("antenna", 30, 60, 0.2), change("wander", 40, 80, 0.7))
+    findings = warned(FusionInputs(PLACE), stretch(changes=first), stretch(changes=(change("wander", 90, 95, 0.1),)))
+    found = [(each.span_s, each.numbers["off_m"]) for each in findings if each.code == "sensor-changed"]
+    assert found == [((5.0, 80.0), 0.7), ((30.0, 60.0), 0.2), ((90.0, 95.0), 0.1)]
 
 
 def test_stretches_add_up_and_their_innovations_are_averaged_by_count():
