@@ -1,6 +1,8 @@
 """Autopilot logs against the tools of their makers, pyulog and pymavlink; and what roles get of them against numbers written by hand."""
 
 import json
+import struct
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from installed_command import tcpipe as run_tcpipe
 from shared_data import shared_data
 
 import tcpipe
+from tcpipe.errors import RoleError
 from tcpipe.formats.logs.autopilot_records import read_records
 from tcpipe.logs.topics import split_notes
 from tcpipe.recipe import ReadConfig
@@ -252,6 +255,29 @@ def test_wheels_of_px4_need_a_radius(tmp_path):
         ]
     log.parameter("RDD_WHEEL_RADIUS", 0.125)
     assert read_one(log, tmp_path / "a.ulg", "/wheel_encoders/odometry")["twist.twist.linear.x"] == 1.875
+
+
+@pytest.mark.parametrize("letter", ["n", "a", "B", "f", "q"])
+def test_fields_of_another_kind_than_they_should_be_break_nothing(tmp_path, letter):
+    fields = {
+        "GPS": "Status,GMS,GWk,Lat,Lng,Alt,Spd,GCrs,VZ", "GPA": "HAcc,VAcc,SAcc,VV,AEl", "IMU": "GyrX,GyrY,GyrZ,AccX,AccY,AccZ,GH",
+        "BAT": "Volt,Curr", "WENC": "Dist0,Dist1", "THR": "DesSpeed", "STER": "DesTurnRate", "PARM": "Name,Value", "DSF": "Dp",
+    }  # fmt: skip
+    log, rng = DataFlash(), np.random.default_rng(1)
+    for name, listed in fields.items():
+        labels = ",".join(listed.split(",")[: 3 if letter == "a" else None])  # a message has 255 bytes at most
+        log.format(name, "Q" + letter * len(labels.split(",")), f"TimeUS,{labels}")
+        size = struct.calcsize(log.codes[name][1]) - 8
+        for second in range(20):
+            log.parts.append(
+                b"\xa3\x95" + bytes([log.codes[name][0]]) + struct.pack("<Q", second * 10**6) + rng.bytes(size)
+            )
+    (tmp_path / "a.bin").write_bytes(log.bytes())
+    with tcpipe.read_log(tmp_path / "a.bin") as opened:
+        assert opened.tables(opened.topics).keys() >= {f"/{name}" for name in fields}
+        assert ("/IMU/imu" in opened.topics) == (letter in "Bfq")
+        with suppress(RoleError):  # most are no measurements
+            read_run(opened, ReadConfig(), robot=None, known=Profiles({}, ()))
 
 
 # ---------------------------------------------------------------- from the command to labels
