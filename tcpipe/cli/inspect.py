@@ -234,9 +234,7 @@ def _print_tables(found: InspectedTables) -> None:
         print_line(line)
     print_line("")
     print_line(
-        "proposed recipe, from the names of the columns; check units and stamps:"
-        if found.recipe
-        else "no column has a known name"
+        "proposed recipe ('tcpipe init --from PATH' writes it):" if found.recipe else "no column has a known name"
     )
     for line in found.recipe.splitlines():
         print_line(line)

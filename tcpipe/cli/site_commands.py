@@ -7,7 +7,16 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, complete_scenarios, json_option, quiet_option, seed_option
+from tcpipe.cli.options import (
+    LOG,
+    OUTPUT_DIRECTORY,
+    complete_scenarios,
+    json_option,
+    msgdef_option,
+    quiet_option,
+    robot_option,
+    seed_option,
+)
 from tcpipe.cli.output import print_json, print_line, print_lines, show_progress
 from tcpipe.errors import UsageError
 
@@ -30,20 +39,34 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
 
 @click.command()
 @click.argument("directory", default=".", type=OUTPUT_DIRECTORY, metavar="[DIR]")
-def init(directory: str) -> None:
-    """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out."""
+@click.option(
+    "--from", "source", type=LOG, metavar="PATH", help="A log, or a folder of tables, whose content the recipe states."
+)
+@robot_option()
+@msgdef_option
+def init(directory: str, *, source: str | None, robot: str | None, msgdef: str | None) -> None:
+    """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out.
+
+    With --from: what tcpipe finds in PATH (roles, columns, units, power, mounting), with a value of each; what you have to decide is
+    commented out.
+    """
     from tcpipe.formats.atomic import clear_beside, write_text
     from tcpipe.formats.recipe_toml import FILE_NAME, format_commented_toml
+    from tcpipe.pipeline.proposals import propose_recipe
 
     path = Path(directory) / FILE_NAME
+    proposed = source and propose_recipe(source, robot=robot, message_definitions=Path(msgdef) if msgdef else None)
+    text = proposed.toml() if proposed else format_commented_toml()
     clear_beside(path)
-    if not path.exists():
-        write_text(path, format_commented_toml())
-        print_line(f"wrote {path}")
-    elif path.is_file() and path.read_bytes() == format_commented_toml().encode():
+    if path.is_file() and path.read_bytes() == text.encode():
         print_line(f"nothing to do: {path} exists")
-    else:
+    elif path.exists():
         raise UsageError(f"{path}: exists with other content; it is never overwritten")
+    else:
+        write_text(path, text)
+        print_line(f"wrote {path}")
+    if proposed:
+        print_lines(proposed)
 
 
 @click.command()

@@ -8,7 +8,7 @@ Which field of a role a column is, or a field of somebody's own message type, by
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -20,12 +20,9 @@ from numpy.typing import NDArray
 from tcpipe.logs import roles
 from tcpipe.logs.expressions import FORM, Expression, ExpressionError, parse_expression, split_unit
 from tcpipe.logs.fix_quality import CODES, classify_fixes, find_status, split_codes
-from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
-from tcpipe.recipe.suggestions import suggest
-from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
 Array = NDArray[Any]
@@ -360,7 +357,7 @@ CALLED: Mapping[str, Mapping[str, str]] = {
     "gnss": {
         "latitude": r"(.*[_.])?lat(itude)?",
         "longitude": r"(.*[_.])?(lon(gitude)?|lng|long)",
-        "altitude": r"(.*[_.])?(alt(itude)?|height|h)",
+        "altitude": r"(.*[_.])?(alt(itude)?|height|h)(_?(msl|hae|ellipsoid(al)?))?",
         "east_std": r"sde",
         "north_std": r"sdn",
         "up_std": r"sdu",
@@ -381,8 +378,6 @@ CALLED: Mapping[str, Mapping[str, str]] = {
 }
 """What is called how, as patterns of names in lower case without a unit; the likelier role first."""
 
-_PROPOSED = ("gnss", "imu")
-"""Roles whose fields are called so that nothing else is taken for them."""
 _DEEPEST = 4
 _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
 """No receiver's message is longer or has more numbers; one that is made to hurt does not cost minutes."""
@@ -398,25 +393,8 @@ def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}
 
 
-def propose_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterator[Finding]:
-    """Yield a finding for each message type that no role knows and whose fields are called as those of a role that nothing can play.
-
-    ``settled`` are roles that are played, or that the recipe speaks of; what a definition in the log does not tell cannot be proposed.
-    """
-    held = [of for of in topics if of.message_count != 0 and of.problem is None and not of.name.startswith(OVERLAY)]
-    types = {topic.type_name for topic in held}
-    for role in _PROPOSED:
-        if role in settled or types & set(ROLE_TYPES[role]):
-            continue
-        for topic in held:
-            if found := match_field_names(role, _list_number_fields(topic)):
-                remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: found}})
-                names = {"role": role, "type": topic.type_name}
-                yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
-
-
-def _list_number_fields(topic: Topic) -> list[str]:
-    """Return the dotted names of a message's first numbers; none where its definition cannot be read or is far too long."""
+def list_number_fields(topic: Topic) -> list[str]:
+    """Return the dotted names of a message's first numbers, ``[]`` behind a list; none without a definition."""
     if len(topic.definition) > _LONGEST_BYTES:
         return []
     try:
@@ -427,8 +405,10 @@ def _list_number_fields(topic: Topic) -> list[str]:
 
 def _iterate_below(messages: Mapping[str, FieldTypes], type_name: str, prefix: str = "") -> Iterator[str]:
     for name, of in messages.get(type_name, ()):
-        dotted = f"{prefix}{name}"
-        if of.length is None and of.name in BASE_TYPES - {"string", "wstring"}:
+        dotted = f"{prefix}{name}{'' if of.length is None else '[]'}"
+        if dotted.count("[]") > 1:
+            continue
+        if of.name in BASE_TYPES - {"string", "wstring"}:
             yield dotted
-        elif of.length is None and dotted.count(".") < _DEEPEST:
+        elif dotted.count(".") < _DEEPEST:
             yield from _iterate_below(messages, of.name, f"{dotted}.")

@@ -7,7 +7,7 @@ MAVLink (GPS_FIX_TYPE), sensor_msgs/NavSatStatus, gps_common/GPSStatus. A ground
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,13 @@ def split_codes(text: str) -> tuple[str | None, str]:
         return codes.strip(), column.strip()
     named = (codes for codes, pattern in _CODES_OF_NAMES.items() if re.fullmatch(pattern, text.lower()))
     return next(named, None), text
+
+
+def find_quality(names: Iterable[str]) -> list[str]:
+    """Return the first name that may be a fix quality, with the codes that are likeliest: ``gga: quality``; [] where none is."""
+    likely = {"gga": r"(.*[_.])?(qual(ity)?|mode|fix_?(type|mode))", "navsat": r"(.*[_.])?status"}
+    found = [f"{codes}: {name}" for codes, of in likely.items() for name in names if re.fullmatch(of, name.lower())]
+    return found[:1]
 
 
 def classify_fixes(values: Array, codes: str) -> Floats:

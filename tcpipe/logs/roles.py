@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
+from tcpipe.logs.power_fields import SIDES
 from tcpipe.logs.topics import (
     LISTED,
     Topic,
@@ -92,6 +93,8 @@ class RoleAssignment:
     transforms: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Roles that several topics could be used as, and these."""
 
     @property
     def static_transforms(self) -> tuple[str, ...]:
@@ -115,7 +118,7 @@ class _Decisions:
     """By role and topic, the reason why one that holds data was not taken, though nobody asked for that."""
     problems: list[str] = field(default_factory=list)
     ambiguous: list[str] = field(default_factory=list)
-    recipe_lines: list[str] = field(default_factory=list)
+    choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
     undecided: set[str] = field(default_factory=set)
 
     def pass_over(self, role: str, topic: Topic, why: str, reason: str) -> None:
@@ -212,6 +215,7 @@ def assign_roles(
             *proposed,
             *find_undecodable(listed.values(), {of for types in decided.types.values() for of in types}),
         ),
+        decided.choices,
     )
 
 
@@ -346,7 +350,6 @@ _OTHER_IMU = re.compile(r"odom|zed|camera|realsense|t265|d435|d455|oak|ouster|os
 _WHEEL = re.compile(r"wheel|velocity|base|platform|drive|diff|encoder|odom")
 _COMMAND = re.compile(r"cmd|command|commands|cmdvel")
 _HUMAN_OR_PLANNER = re.compile(r"joy|teleop|nav|move|interactive|marker|key|web|rc$|auto|external|smooth|safe|raw")
-_SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr"})
 
 
 def _find_role_word(pattern: re.Pattern[str], name: str) -> str | None:
@@ -510,7 +513,7 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
         decided.ambiguous.append(
             f"role {role} is ambiguous, {len(first)} topics could be used: {format_topics(topics)}"
         )
-        decided.recipe_lines.append(_format_recipe_line(role, names))
+        decided.choices[role] = names
         decided.undecided.add(role)
         return
     decided.roles[role] = PlayedRole(role, names, topics[0].type_name, why)
@@ -540,8 +543,8 @@ def _are_sides(names: Sequence[str]) -> bool:
     if len(names) == 1:
         return True
     split = [re.split(r"([/_\-.]+)", name.lower()) for name in names]
-    bare = {tuple("" if word in _SIDES else word for word in words) for words in split}
-    sides = {tuple(word for word in words if word in _SIDES) for words in split}
+    bare = {tuple("" if word in SIDES else word for word in words) for words in split}
+    sides = {tuple(word for word in words if word in SIDES) for words in split}
     return len(bare) == 1 and len(sides) == len(names) and () not in sides
 
 
@@ -554,7 +557,8 @@ def _format_recipe_line(role: str, names: Sequence[str]) -> str:
 
 def _list_questions(decided: _Decisions) -> list[str]:
     head = RecipeFragment({"read.topics": {}}).toml()
-    how = ["decide in the recipe (tcpipe.toml), for example:", head, *decided.recipe_lines]
+    lines = (_format_recipe_line(role, names) for role, names in decided.choices.items())
+    how = ["decide in the recipe (tcpipe.toml), for example:", head, *lines]
     return [*decided.ambiguous, *how] if decided.ambiguous else []
 
 

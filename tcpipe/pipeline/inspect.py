@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError
+from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, has_card
 from tcpipe.formats.json_files import convert_record
@@ -20,11 +19,9 @@ from tcpipe.formats.logs.table_folders import find_table_logs, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.logs.field_mapping import CALLED, match_field_names
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_remote_logs
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.checking import as_toml
 from tcpipe.store import Store, is_store, run_at
 from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
 
@@ -178,7 +175,7 @@ def _inspect_logs_or_tables(
     logs = [*list_logs_below(path), *(files[0] for files in find_table_logs(path, recipe.tables))]
     if logs or not (tables := list_table_files(path)):
         return _inspect_logs_at(logs, path, ask)
-    return propose_tables(path, tables)
+    return _inspect_tables(path, tables)
 
 
 def _inspect_logs_at(
@@ -253,59 +250,11 @@ class InspectedTables:
     """TOML; "" where no column has a known name."""
 
 
-_COMMAND = re.compile(r"cmd|command|joy")
-_BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
-_STAMP = re.compile(r"t|stamp|.*time(stamp)?.*|gpst|utc|date")
+def _inspect_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
+    from tcpipe.pipeline.table_proposals import propose_tables, read_columns  # noqa: PLC0415  polars only where a table is read
 
-
-def propose_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
-    """Return the columns of each table, why some cannot be read, and a recipe for the rest."""
-    from tcpipe.formats.logs.table_log import read_column_names  # noqa: PLC0415  polars only where a table is read
-
-    columns: dict[str, tuple[str, ...]] = {}
-    problems: dict[str, str] = {}
-    for file in files:
-        name = file.relative_to(folder).as_posix()
-        try:
-            columns[name] = tuple(read_column_names(file))
-        except LogError as error:
-            problems[name] = str(error)
+    columns, problems = read_columns(folder, files)
+    found = propose_tables(folder, files)
     return InspectedTables(
-        path=str(folder), columns=columns, problems=problems, recipe="\n".join(_iterate_recipe_lines(columns))
+        path=str(folder), columns=columns, problems=problems, recipe=found.toml() if found.lines else ""
     )
-
-
-def _iterate_recipe_lines(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of the recipe; of two tables for one role the second is a comment."""
-    taken: set[str] = set()
-    for file, names in columns.items():
-        role, found = _match_role(file, names)
-        if role is None:
-            continue
-        stamp = next((name for name in names if _STAMP.fullmatch(name.lower())), names[0])
-        alone = role == "power" and len(found) == 1
-        table = re.sub(r"\W+", "_", Path(file).stem) if alone else role
-        kind = "power of drives" if alone else "power of a battery" if role == "power" else role
-        once = role == "power" and alone and "power of a battery" not in taken
-        again = "" if once or role not in taken else "# "
-        taken |= {role, kind}
-        yield from ("", f"# {role} is taken already; one of both:") if again else ("",)
-        yield f"{again}[tables.{table}]"
-        yield from (f'{again}role = "power"',) if alone else ()
-        yield f"{again}file = {as_toml(file)}"
-        yield f"{again}columns = {{ {', '.join(f'{field} = {as_toml(name)}' for field, name in found.items())} }}"
-        yield f"{again}stamp = {as_toml(stamp)}"
-
-
-def _match_role(file: str, names: Sequence[str]) -> tuple[str | None, dict[str, str]]:
-    """Return the role that a table plays by its columns, and which column is which field."""
-    for role in CALLED:
-        if (role in ("command", "wheel_odometry")) and (role == "command") != bool(_COMMAND.search(file.lower())):
-            continue
-        found = match_field_names(role, names)
-        if found and (role != "power" or len(found) == 2):
-            return role, found
-    for quantity, word in _BARE.items():
-        if word.search(Path(file).stem.lower()) and len(names) == 2:
-            return "power", {quantity: names[1]}
-    return None, {}

@@ -22,7 +22,8 @@ from tcpipe.pipeline.log_sources import find_damaged_log, find_total_loss
 from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
 from tcpipe.robots import Profiles
-from tcpipe.stages.read_roles import decide_roles, find_power_candidates, find_read_config
+from tcpipe.stages.proposals import find_proposals
+from tcpipe.stages.read_roles import decide_roles, find_read_config
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 
@@ -124,7 +125,7 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
     lost = find_total_loss(log.topics.values(), damage)
     findings = (
         *(() if lost else cast.findings),
-        *find_power_candidates(log, cast, config),
+        *find_proposals(log, cast, config, known),
         *_find_simulated_time(log.topics.values()),
         *_find_slow_power(log, cast, recipe, known),
         *find_damaged_log(damage, Subject("log", str(log.path))),

@@ -149,7 +149,7 @@ def find_sources(
                     paths.setdefault(str(path), [(path, place)])
             else:
                 above = Path(entry)
-                for files in _find_logs_at(above, tables or {}):
+                for files in find_logs_at(above, tables or {}):
                     found = [(_as_named(path), _place_in(path, above)) for path in files]
                     paths.setdefault(_resolve_path(files[0], folders), found)
         except LogError as error:
@@ -172,7 +172,7 @@ def find_sources(
     return FoundLogs(sources, problems, transient)
 
 
-def _find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
+def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
     """Return the files of each log at or below a path, mapped tables among them; `LogError` where there is none."""
     if of_tables := find_table_logs(path, tables) if tables else []:
         return [*((log,) for log in (list_logs_below(path) if path.is_dir() else ())), *of_tables]
@@ -185,7 +185,7 @@ def _find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
                 *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
             ) from None
         if path.is_dir() and (held := list_table_files(path)):
-            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): map them in the recipe; tcpipe inspect proposes how"
+            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): 'tcpipe init --from {path}' writes a recipe for them"
             raise LogError(*error.problems, hint) from None
         raise
 

@@ -26,6 +26,7 @@ from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
+from tcpipe.pipeline.log_sources import find_logs_at
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import decide_roles, find_read_config
@@ -172,7 +173,7 @@ def preflight(
 
     Parameters
     ----------
-    log : a minute or more, of any container, or the URL of one; all of it is read.
+    log : a minute or more, of any container, or the URL of one; all of it is read. Of a folder of logs the first.
     recipe, robot, message_definitions : as `tcpipe.pipeline.ingest.ingest` takes them.
 
     Raises
@@ -181,6 +182,8 @@ def preflight(
     """
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)
+    if isinstance(path, Path) and path.is_dir():
+        path = find_logs_at(path, recipe.tables)[0][0]
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as found:
         seen = replace(inspect_log(found, recipe, robot, full=False), path=format_path(log))
         topics = tuple(found.topics.values())

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import isfinite
 from typing import Any, TypeAlias
 
 from tcpipe.errors import RecipeError
@@ -64,6 +66,84 @@ class RecipeFragment:
 
 def _format_lines(keys: Keys) -> list[str]:
     return [f"{name} = {as_toml(value)}" for name, value in keys.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class ProposedLine:
+    """One line of a recipe that is proposed for a log; one that a person has to decide is a comment.
+
+    ``table`` is the dotted name of its table, "" for keys before all tables; ``note`` is a value of the log, or what there is to decide.
+    """
+
+    table: str
+    key: str
+    value: TomlValue
+    note: str = ""
+    is_certain: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class ProposedRecipe:
+    """The recipe that is proposed for a log: the comment above it, its lines, and a path to try it on."""
+
+    head: Sequence[str]
+    lines: Sequence[ProposedLine]
+    log: str
+
+    def __str__(self) -> str:
+        """Return what is left to do."""
+        decisions = sum(not line.is_certain for line in self.lines)
+        left = f"{decisions} comments in it are yours to decide; " if decisions else ""
+        return f"{left}then: tcpipe preflight {shlex.quote(self.log)}"
+
+    def toml(self) -> str:
+        """Return the file. The head of a table of decisions alone is a comment too, except below ``read``, where it may be empty."""
+        what = "Comments below it need a decision: remove the # and correct the value."
+        text = ["# Proposed by tcpipe init --from. " + what, *(f"# {line}".rstrip() for line in self.head)]
+        tables = dict.fromkeys(line.table for line in sorted(self.lines, key=lambda line: bool(line.table)))
+        for table in tables:
+            mine = [line for line in self.lines if line.table == table]
+            is_open = any(line.is_certain for line in mine) or table.startswith("read.")
+            text += ["", *([f"{'' if is_open else '# '}[{table}]"] if table else [])]
+            for line in mine:
+                note = f"  # {' '.join(line.note.split())}" if line.note else ""
+                text.append(f"{'' if line.is_certain else '# '}{line.key} = {as_toml(line.value)}{note}")
+        return "\n".join(text) + "\n"
+
+
+def propose_lines(
+    tables: Mapping[str, Keys | Sequence[Keys]], notes: Mapping[str, str], doubt: str
+) -> Iterator[ProposedLine]:
+    """Yield the lines of a remedy's tables; ``notes`` are by the name of a key or an array, ``doubt`` is what they leave to a person."""
+    for table, keys in tables.items():
+        if not isinstance(keys, Mapping):
+            yield ProposedLine("", table, keys, "; ".join(filter(None, [notes.get(table), doubt])), not doubt)
+            continue
+        for key, value in keys.items():
+            inner = (
+                {f"{key}.{name}": text for name, text in value.items()} if isinstance(value, Mapping) else {key: value}
+            )
+            for name, text in inner.items():
+                yield ProposedLine(table, name, text, notes.get(name.rpartition(".")[2], doubt), not doubt)
+
+
+def propose_extrinsics(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLine]:
+    """Yield the lines that place sensors, by role and frame: nobody but a person knows where they are mounted."""
+    for role, frame in frames:
+        turn = {} if role == "gnss" else {"rpy_rad": [0.0, 0.0, 0.0]}
+        note = f"measure it from base_link: nothing places {frame or 'it'}"
+        yield ProposedLine("read.extrinsics", role, {"xyz_m": [0.0, 0.0, 0.0], **turn}, note, is_certain=False)
+
+
+def propose_quality(table: str, key: str, source: str) -> ProposedLine:
+    """Return the line of a fix quality whose codes no name states."""
+    note = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_common or words"
+    return ProposedLine(table, key, source, note, is_certain=False)
+
+
+def format_first(values: Iterable[float]) -> str:
+    """Return the first number that is not zero, as a sample."""
+    return f"{next((value for value in map(float, values) if value and isfinite(value)), 0.0):.7g}"
 
 
 def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:

@@ -19,8 +19,9 @@ from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import LogReader, gather_messages
+from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_power, remove_repeats
-from tcpipe.stages.read_roles import decide_roles, find_power_candidates
+from tcpipe.stages.read_roles import decide_roles
 from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
 from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
 from tcpipe.tables.findings import Finding, Severity, StageReport, Subject, make_finding, read_threshold
@@ -43,7 +44,8 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     # 1. Which topic is used as which role, from the topic list alone.
     assignment = decide_roles(config, log.topics.values(), robot, known=known)
     if assignment.problems:
-        raise RoleError(*assignment.problems, findings=assignment.findings)
+        proposals = find_proposals(log, assignment, config, known)
+        raise RoleError(*assignment.problems, findings=(*assignment.findings, *proposals))
     # 2. Messages to SI columns; what cannot be used is counted.
     played = dict.fromkeys(topic for role in assignment.roles.values() for topic in role.topics)
     lists = {topic: list_power_lists(log.topics[topic].type_name, known.power_sources) for topic in played}
@@ -71,7 +73,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     findings = (
         *report.findings,
         *find_missing_roles({*streams, "power"} if power.is_rejected else streams.keys()),
-        *find_power_candidates(log, assignment, config),
+        *find_proposals(log, assignment, config, known),
         *unread,
         *unplaced,
         *find_repeats(repeats),

@@ -184,22 +184,13 @@ def place_sensors(
     *,
     config: ReadConfig,
 ) -> tuple[dict[str, Sensor], list[Finding]]:
-    """Return each role's sensor, and findings: frames that nothing places, topics with several frames.
-
-    /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
-    """
+    """Return each role's sensor, and findings: frames that nothing places, topics with several frames."""
     of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
     frame_of = {role: next(iter(found[0].frames), "") for role, found in of_role.items() if found}
-    open_frames = {
-        frame
-        for role, frame in frame_of.items()
-        if role not in config.extrinsics and role not in _WITHOUT_PLACE and not is_base(frame)
-    }
-    tree = _build_tree(log, tables, assignment, open_frames)
     sensors: dict[str, Sensor] = {}
     findings: list[Finding] = []
-    for role, frame in frame_of.items():
-        pose, placed_by = _place(role, frame, tree, config)
+    for role, (pose, placed_by) in place_frames(log, tables, assignment, frame_of, config).items():
+        frame = frame_of[role]
         subject, several = Subject("role", role), of_role[role][0].frames
         if role not in _WITHOUT_PLACE and len(several) > 1:
             names = {"frame": frame, "frames": ", ".join(several)}
@@ -219,6 +210,26 @@ def place_sensors(
             time_source=timelines[of_role[role][0].key].source,
         )
     return sensors, findings
+
+
+def place_frames(
+    log: LogReader,
+    tables: Mapping[str, pa.Table],
+    assignment: RoleAssignment,
+    frame_of: Mapping[Role, str],
+    config: ReadConfig,
+) -> dict[Role, tuple[Pose, str]]:
+    """Return by role where its frame is in base_link, and what says so.
+
+    /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
+    """
+    open_frames = {
+        frame
+        for role, frame in frame_of.items()
+        if role not in config.extrinsics and role not in _WITHOUT_PLACE and not is_base(frame)
+    }
+    tree = _build_tree(log, tables, assignment, open_frames)
+    return {role: _place(role, frame, tree, config) for role, frame in frame_of.items()}
 
 
 def _build_tree(

@@ -26,6 +26,7 @@ PRINTERS = {
     "tcpipe/pipeline/diff.py",
     "tcpipe/pipeline/maps.py",
     "tcpipe/pipeline/plan.py",
+    "tcpipe/pipeline/proposals.py",
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
     "tcpipe/pipeline/report.py",

@@ -1,0 +1,147 @@
+"""Which fields of a message, or columns of a table, are voltage, current and power of what drives, by what they are called."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from tcpipe.logs.expressions import split_unit
+
+SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr", "bl", "br"})
+
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_QUANTITIES = {
+    "voltage": re.compile(r"volt(age|s)?|voltages|v(bat|batt|in|bus|pack)"),
+    "current": re.compile(r"curr?(ent)?s?|amp(ere)?s?|i(bat|batt|in|bus|pack)"),
+    "power": re.compile(r"power|watts?"),
+}
+_UNITS = {
+    "V": ("voltage", 1.0), "mV": ("voltage", 0.001), "A": ("current", 1.0), "mA": ("current", 0.001), "W": ("power", 1.0),
+    "mW": ("power", 0.001), "kW": ("power", 1000.0),
+}  # fmt: skip
+_SUPPLY = re.compile(
+    r"bat|batt|battery|bms|pack|bus|supply|input|in|main|dc|source|vin|iin|[vi](bat|batt|in|bus|pack)|esc"
+)
+_DRIVES = re.compile(r"drives?|drivers?|motors?|wheels?|traction")
+_OTHER = re.compile(
+    r"min|max|limit|set|setpoint|target|cmd|command|commanded|desired|ref|nominal|rated|full|capacity|charge|percent(age)?|soc|temp|temperature|"
+    r"cells?|status|fault|error|id|iq|vd|vq|per|pred|true|std|cov|variance|health|design|supply_?status|technology|mode|button|acc|lin|ang|vel"
+)
+_PHASE = re.compile(r"phase|motors?|q|d|rms")
+
+
+_TURNS = ("rpm", "rad/s", "deg/s")
+
+
+@dataclass(frozen=True, slots=True)
+class PowerFields:
+    """What is read together: each rail's fields by quantity, with the factor that the unit in its name states, and what is unclear."""
+
+    rails: tuple[Mapping[str, str], ...]
+    scales: Mapping[str, float]
+    doubt: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Named:
+    name: str
+    quantity: str
+    scale: float
+    core: tuple[str, ...]
+    """Words that say neither quantity nor side."""
+    side: tuple[str, ...]
+
+
+def split_words(name: str) -> list[str]:
+    """Return the words of a name in lower case: at capitals, digits and signs."""
+    return [word.lower() for word in _WORDS.findall(name)]
+
+
+def split_sides(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return a name's words without sides and numbers, and those."""
+    words = split_words(name)
+    of_side = tuple(word for word in words if word in SIDES or word.isdigit())
+    return tuple(word for word in words if word not in of_side), of_side
+
+
+def match_power_fields(names: Iterable[str]) -> PowerFields | None:
+    """Return the voltage and current, or the power, among fields; None where neither a current nor a power is.
+
+    Fields whose names differ by sides or numbers alone belong together: each at its own voltage where there are as many, else added.
+    """
+    named = [found for name in names if (found := _read_name(name))]
+    watt, amp, volt = ([of for of in named if of.quantity == what] for what in ("power", "current", "voltage"))
+    drawn, others = _choose(amp or watt)
+    if not drawn:
+        return None
+    quantity = drawn[0].quantity
+    volt, _ = _choose([of for of in volt if of.core == drawn[0].core] or volt)
+    by_side = {of.side: of.name for of in volt}
+    if quantity == "power":
+        rails: list[dict[str, str]] = [{"power": " + ".join(of.name for of in drawn)}]
+    elif len(drawn) > 1 and all(of.side in by_side for of in drawn):
+        rails = [{"voltage": _of_one(by_side[of.side]), "current": of.name} for of in drawn]
+    else:
+        rails = [{"current": " + ".join(of.name for of in drawn)}]
+        rails = [{"voltage": _of_one(volt[0].name)} | rails[0]] if volt else rails
+    used = [*drawn, *(volt if "voltage" in rails[0] else [])]
+    scales = {of.quantity: of.scale for of in used if of.scale != 1.0}
+    return PowerFields(tuple(rails), scales, _find_doubt(drawn, others))
+
+
+def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
+    """Return the forward velocity as the mean of those of both sides, and the turn rate for a track of 0.5 m; {} without.
+
+    Turn rates of wheels are no velocities.
+    """
+    speeds = [name for name in names if {"vel", "velocity", "speed"} & set(split_words(name))]
+    sides = {"l", "left", "r", "right", "fl", "fr", "rl", "rr"}
+    sided = [name for name in speeds if sides & set(split_words(name)) and split_unit(name)[1] not in _TURNS]
+    left = [name for name in sided if {"l", "left", "fl", "rl"} & set(split_words(name))]
+    if not left or 2 * len(left) != len(sided) or len({split_sides(name)[0] for name in sided}) != 1:
+        return {}
+    right = [name for name in sided if name not in left]
+    turn = f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)} / 0.5"
+    return {"linear_x": f"({' + '.join([*left, *right])}) / {len(sided)}", "angular_z": turn}
+
+
+def _read_name(name: str) -> _Named | None:
+    bare, unit, _ = split_unit(name.replace("`", "").removesuffix("[]"))
+    (core, side), own = split_sides(bare), split_words(bare.rpartition(".")[2])
+    quantity = next((what for word in reversed(own) for what, of in _QUANTITIES.items() if of.fullmatch(word)), None)
+    measured, scale = _UNITS.get(unit or "", (quantity, 1.0))
+    of_rail = any(_SUPPLY.fullmatch(word) or _DRIVES.fullmatch(word) for word in core)
+    quantity = quantity or (measured if of_rail and scale != 1.0 else None)  # a "wheel_v" alone is a velocity
+    if quantity is None or measured != quantity or any(_OTHER.fullmatch(word) for word in own):
+        return None
+    rest = tuple(word for word in core if not any(of.fullmatch(word) for of in _QUANTITIES.values()))
+    return _Named(name, quantity, scale, rest, side)
+
+
+def _choose(named: Sequence[_Named]) -> tuple[list[_Named], list[_Named]]:
+    """Return the fields that belong together, those of the supply first, and the others that could be meant as well."""
+    groups: dict[tuple[str, ...], list[_Named]] = {}
+    for of in named:
+        groups.setdefault(of.core, []).append(of)
+    ranked = sorted(groups.values(), key=_rank)
+    return (ranked or [[]])[0], [of for group in ranked[1:] if _rank(group) == _rank(ranked[0]) for of in group]
+
+
+def _rank(group: Sequence[_Named]) -> tuple[bool, bool]:
+    """Return whether the fields are not named like the supply, and whether they are named like a motor."""
+    supply, phase = (any(of.fullmatch(word) for word in group[0].core) for of in (_SUPPLY, _PHASE))
+    return not supply, phase
+
+
+def _of_one(name: str) -> str:
+    """Return the first element of a list: the sum of voltages is none."""
+    return name.replace("[]", "[0]")
+
+
+def _find_doubt(drawn: Sequence[_Named], others: Sequence[_Named]) -> str:
+    if others:
+        return f"{', '.join(of.name for of in others)} could be meant as well"
+    if _rank(drawn) == (True, True):
+        return "uncomment if these are drawn from the battery; currents of motor phases are larger"
+    return ""

@@ -1,0 +1,135 @@
+"""The recipe that a log, or a folder of tables, proposes: what is found in it, with a value of each, and what a person has to decide."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from tcpipe.errors import UsageError
+from tcpipe.formats.finding_lines import format_number
+from tcpipe.formats.logs.log_file import list_logs_below
+from tcpipe.formats.logs.log_joining import open_single_log
+from tcpipe.formats.logs.rosbag2 import is_one_bag
+from tcpipe.formats.logs.table_folders import is_table, list_table_files
+from tcpipe.formats.object_storage import format_path, is_url
+from tcpipe.formats.recipe_toml import load_profiles
+from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, list_number_fields
+from tcpipe.logs.fix_quality import find_quality
+from tcpipe.logs.messages import LOG_TIME, count_frames
+from tcpipe.logs.roles import TWIST, TWIST_STAMPED, RoleAssignment
+from tcpipe.power.sources import Columns, find_sources, list_power_lists, read_rails
+from tcpipe.recipe import ReadConfig, Recipe, Role
+from tcpipe.recipe.suggestions import (
+    ProposedLine,
+    ProposedRecipe,
+    format_first,
+    propose_extrinsics,
+    propose_lines,
+    propose_quality,
+)
+from tcpipe.robots import Profiles
+from tcpipe.stages.message_arrays import make_message_arrays
+from tcpipe.stages.proposals import find_proposals
+from tcpipe.stages.read_roles import decide_roles
+from tcpipe.stages.read_sources import place_frames
+from tcpipe.tables.findings import Finding
+
+if TYPE_CHECKING:
+    from tcpipe.formats.logs.log_file import Log
+    from tcpipe.formats.logs.message_tables import TableLog
+
+
+def propose_recipe(
+    path: Path | str, *, robot: str | None = None, message_definitions: Path | None = None
+) -> ProposedRecipe:
+    """Return the recipe that a log proposes, or the first of a folder's, or the tables in a folder.
+
+    Raises
+    ------
+    LogError, UsageError : there is nothing to read.
+    """
+    path = path if is_url(path) else Path(path)
+    if isinstance(path, Path) and (is_table(path.name) or (path.is_dir() and not is_one_bag(path))):
+        logs = list_logs_below(path) if path.is_dir() else []
+        if not logs:
+            from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
+
+            folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
+            found = propose_tables(folder, files)
+            if not found.lines:
+                raise UsageError(f"{path}: it contains no log, and no table with columns of known names", *found.head)
+            return found
+        path = logs[0]
+    with open_single_log(path, message_definitions=message_definitions, tables=None) as log:
+        return _propose_for_log(log, robot, format_path(path))
+
+
+def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> ProposedRecipe:
+    config, known = ReadConfig(), load_profiles(Recipe())
+    assigned = decide_roles(config, log.topics.values(), robot, known=known)
+    proposals = find_proposals(log, assigned, config, known)
+    used = {name: role for role, names in assigned.choices.items() for name in names}
+    used |= {name: role.name for role in assigned.roles.values() for name in role.topics}
+    used |= {of.subject.name: of.names["role"] for of in proposals if of.code == "role-proposed"}
+    types = {name: log.topics[name].type_name for name in used}
+    tables = log.tables(list(dict.fromkeys([*used, *assigned.static_transforms])))
+    lists = {name: list_power_lists(kind, known.power_sources) for name, kind in types.items()}
+    columns = {name: make_message_arrays(tables[name], lists[name]) for name in used if name in tables}
+    frames: dict[Role, str] = {}
+    for name, of in columns.items():
+        frames.setdefault(cast("Role", used[name]), next(iter(count_frames(of, types[name])), ""))
+    places = place_frames(log, tables, assigned, frames, config)
+    head = ["", f"robot: {assigned.robot}, {assigned.robot_why}"]
+    for role in assigned.roles.values():
+        pose, by = places.get(cast("Role", role.name), (None, ""))
+        place = f"; at {np.round(pose.xyz_m, 3).tolist()} m ({by})" if pose and by == "tf_static" else ""
+        samples = {
+            name: _sample(columns.get(name, {}), types[name], name, role.name, (assigned, known))
+            for name in role.topics
+        }
+        head += [f"{role.name}: {name}{sample}{place}" for name, sample in samples.items()]
+    decided = {*assigned.roles, *assigned.choices}
+    lacking = [role for role in ("gnss", "imu", "wheel_odometry", "power", "command") if role not in decided]
+    head += [f"not found: {', '.join(lacking)}"] if lacking else []
+    lines = [*_iterate_questions(assigned, log)]
+    for finding in proposals:
+        low = {
+            name[4:]: format_number(name, value) for name, value in finding.numbers.items() if name.startswith("low_")
+        }
+        ends = (f"{text} to {format_number(name, finding.numbers[f'high_{name}'])}" for name, text in low.items())
+        notes = {**finding.names, "power_sources": ", ".join(ends)}
+        for remedy in finding.remedies:
+            lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
+        if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
+            fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
+            lines += [propose_quality("read.fields", "gnss.quality", of) for of in fields]
+    unplaced = [(role, frames[role]) for role, (_, by) in places.items() if by == "assumed"]
+    return ProposedRecipe([*head, "", "These need no line."], [*lines, *propose_extrinsics(unplaced)], path)
+
+
+def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterator[ProposedLine]:
+    """Yield the lines for roles that several topics could be used as, and for a command that no name shows."""
+    for role, names in assigned.choices.items():
+        others = " or ".join(f'["{name}"]' for name in names[1:])
+        yield ProposedLine("read.topics", role, [names[0]], f"or {others}", is_certain=False)
+    twists = [name for name in assigned.left_out if log.topics[name].type_name in (TWIST, TWIST_STAMPED)]
+    if twists and not {"command"} & {*assigned.roles, *assigned.choices}:
+        yield ProposedLine("read.topics", "command", twists[:1], "if it commands the velocity", is_certain=False)
+
+
+def _sample(columns: Columns, kind: str, topic: str, role: str, by: tuple[RoleAssignment, Profiles]) -> str:
+    """Return how many messages a topic has, and values by what its role needs."""
+    assigned, known = by
+    count = f", {len(columns[LOG_TIME])} messages" if columns else ""
+    if role == "power":
+        platform = known.robots[assigned.robot].platform
+        choices = find_sources(kind, topic, known.power_sources, platform=platform, husky_power="battery")
+        rails = [] if isinstance(choices, Finding) else read_rails(columns, choices[0], topic)
+        read = [] if isinstance(rails, Finding) else rails
+        return count + "".join(f", {format_first(of.voltage_volt)} V, {format_first(of.current_amp)} A" for of in read)
+    needed = [(name, of.message) for name, of in MAPPED[role].items() if of.needed and of.message in columns]
+    named = needed[-3:] if kind == MAPPED_TYPES[role] else []  # of an IMU the accelerations, which show gravity
+    return count + "".join(f", {name} {format_first(columns[message])}" for name, message in named)

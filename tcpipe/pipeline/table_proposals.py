@@ -1,0 +1,235 @@
+"""What the tables in a folder could be read as: roles, columns and stamps by name, judged by their values; polars is loaded here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.table_log import read_cells, read_column_names
+from tcpipe.formats.object_storage import format_path
+from tcpipe.logs.expressions import split_unit
+from tcpipe.logs.field_mapping import MAPPED, STAMP_UNITS, match_field_names, parse_stamps_ns, read_fields
+from tcpipe.logs.fix_quality import find_quality
+from tcpipe.logs.power_fields import match_power_fields, match_sided_velocities
+from tcpipe.power.sources import RailReadings, find_rejection
+from tcpipe.recipe.suggestions import (
+    ProposedLine,
+    ProposedRecipe,
+    TomlValue,
+    format_first,
+    propose_extrinsics,
+    propose_quality,
+)
+from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, judge_fields
+
+Floats = NDArray[np.float64]
+
+_COMMAND = re.compile(r"cmd|command|joy")
+_BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
+_STAMP = re.compile(r"t|stamp|.*time(stamp|string)?|gpst|utc|date")
+_PLAIN = re.compile(r"[A-Za-z_]\w*")
+_NUMBER = re.compile(r"\d+(?=\D*$)")
+_FASTEST_MPS = 15.0
+_OVER_TRACK = "/ 0.5"
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """A table, or one of several alike of as many runs: ``file`` as the recipe names it, and its stamps."""
+
+    file: str
+    path: Path
+    names: Sequence[str]
+    stamp: str
+    stamp_unit: str
+    """What the recipe has to state, "" where nothing."""
+    is_absolute: bool
+    """Whether its stamps count from 1970."""
+    span_ns: tuple[int, int]
+    rows: int
+    """Number of different stamps."""
+
+    def overlap_ns(self, other: _Table) -> int:
+        """Return the time that two tables have in common."""
+        if self.is_absolute != other.is_absolute:
+            return 0
+        return max(min(self.span_ns[1], other.span_ns[1]) - max(self.span_ns[0], other.span_ns[0]), 0)
+
+
+def read_columns(folder: Path, files: Sequence[Path]) -> tuple[dict[str, tuple[str, ...]], dict[str, str]]:
+    """Return by file what its columns are called, and why some cannot be read."""
+    columns: dict[str, tuple[str, ...]] = {}
+    problems: dict[str, str] = {}
+    for file in files:
+        name = file.relative_to(folder).as_posix()
+        try:
+            columns[name] = tuple(read_column_names(file))
+        except LogError as error:
+            problems[name] = str(error)
+    return columns, problems
+
+
+def propose_tables(folder: Path, files: Sequence[Path]) -> ProposedRecipe:
+    """Return the recipe for the tables that have known names: of several for a role, that which covers the drive of the others best."""
+    columns, problems = read_columns(folder, files)
+    roles: dict[str, list[tuple[_Table, list[ProposedLine]]]] = {}
+    for name, path in _group_files(folder, [folder / file for file in columns]).items():
+        if table := _read_table(name, path, columns[path.relative_to(folder).as_posix()]):
+            for role, lines in _iterate_roles(table):
+                roles.setdefault(role, []).append((table, lines))
+    ranked = [of for candidates in roles.values() for of in sorted(candidates, key=lambda of: -of[0].rows)[:1]]
+    head, lines, log = [*problems.values()], list[ProposedLine](), folder
+    for role, candidates in roles.items():
+        first = ranked[0][0]
+        candidates.sort(key=lambda of: (-of[0].overlap_ns(first), -of[0].rows))
+        table, mine = candidates[0]
+        apart = "" if table.overlap_ns(first) else "no time in common with the others: another clock, or another drive"
+        lines += [replace(line, note=f"{line.note}: {apart}", is_certain=False) for line in mine] if apart else mine
+        log = table.path if "*" in table.file else log
+        head += [f"{other.file}, {other.rows} rows, could be {role} as well" for other, _ in candidates[1:]]
+    lines += propose_extrinsics((role, "") for role in roles if role in ("gnss", "imu", "pose"))
+    return ProposedRecipe(head, lines, format_path(log))
+
+
+def _group_files(folder: Path, files: Sequence[Path]) -> dict[str, Path]:
+    """Return by the name for the recipe the largest of files that are called alike; with a * where they differ by a number.
+
+    Numbers tell runs apart only where every table has one: else they may be those of motors.
+    """
+    numbered = {file: _NUMBER.sub("*", file.name) for file in files}
+    alike = [{file.name for file, name in numbered.items() if name == each} for each in set(numbered.values())]
+    of_runs = len(alike) > 1 and all(len(names) > 1 for names in alike)
+    named: dict[str, list[Path]] = {}
+    for file in files:
+        named.setdefault(numbered[file] if of_runs else file.name, []).append(file)
+    return {
+        name if len(group) > 1 else group[0].relative_to(folder).as_posix(): max(
+            group, key=lambda of: of.stat().st_size
+        )
+        for name, group in named.items()
+    }
+
+
+def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
+    """Return a table with the stamps that suit best: those since 1970, of these the finest; None where there are none."""
+    found: list[tuple[tuple[bool, int, bool], _Table]] = []
+    for stamp in [name for name in names if _STAMP.fullmatch(split_unit(name)[0].lower())] or names[:1]:
+        cells = read_cells(path, stamp=stamp, columns=[])
+        known, unit = cells.stamp[cells.stamp_known], split_unit(stamp)[1] or ""
+        if known.size < 2:
+            continue
+        stated = ""
+        stamp_ns = known if cells.stamp_is_time else parse_stamps_ns(known, "auto")
+        if is_absolute := not isinstance(stamp_ns, str):
+            span_ns = int(stamp_ns.min()), int(stamp_ns.max())
+        else:
+            step = float(np.median(np.diff(known)))  # ten rows in a minute at least, in the coarsest unit that fits
+            fitting = (of for of, ns in reversed(STAMP_UNITS.items()) if 0 < step * ns / 1e9 <= 6.0)
+            stated = "" if unit in STAMP_UNITS else next(fitting, "none")
+            factor = STAMP_UNITS.get(stated or unit, 0)
+            span_ns = int(known.min() * factor), int(known.max() * factor)
+        rows = len(np.unique(known))
+        made = _Table(file, path, names, stamp, stated, is_absolute, span_ns, rows)
+        if stated != "none":
+            found.append(((is_absolute, rows, not cells.stamp_is_time), made))  # texts are often cut to seconds
+    return max(found, key=lambda of: of[0])[1] if found else None
+
+
+def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
+    """Yield the lines for each role that a table has columns for; a speed or place beside fixes or wheels was computed from them."""
+    is_command = _COMMAND.search(table.file.lower())
+    commands = [name for name in table.names if is_command or _COMMAND.search(name.lower())]
+    measured = [name for name in table.names if name not in commands]
+    found = {"gnss": match_field_names("gnss", measured), "imu": match_field_names("imu", measured)}
+    found["command"] = match_field_names("command", commands)
+    if not found["gnss"]:
+        sided = match_sided_velocities([_quote(name) for name in measured])
+        found["wheel_odometry"] = match_field_names("wheel_odometry", measured) or sided
+        found["pose"] = {} if found["wheel_odometry"] else match_field_names("pose", measured)
+    for role, columns in found.items():
+        if columns and (lines := _make_lines(table, role, role, columns)):
+            yield role, lines
+    yield from _iterate_power(table)
+
+
+def _quote(name: str) -> str:
+    return name if _PLAIN.fullmatch(name) else f"`{name}`"
+
+
+def _iterate_power(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
+    matched = match_power_fields([_quote(name) for name in table.names])
+    rails, doubt = (matched.rails, matched.doubt) if matched else ((), "")
+    named = [name for name, word in _BARE.items() if word.search(table.path.stem.lower()) and len(table.names) == 2]
+    found = {f"power_{number}" if len(rails) > 1 else "power": rail for number, rail in enumerate(rails, 1)}
+    if named and not found:
+        found = {re.sub(r"\W+", "_", table.path.stem): {named[0]: table.names[1]}}
+    for name, rail in found.items():
+        columns = {
+            of: text.strip("`") if text.count("`") == 2 and text[0] == text[-1] else text for of, text in rail.items()
+        }
+        if lines := _make_lines(table, name, "power", columns, doubt):
+            yield name, lines
+
+
+def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str], doubt: str = "") -> list[ProposedLine]:
+    """Return the lines of a table's mapping; [] where its values cannot be what its columns are called."""
+    values = _read_values(table, role, columns)
+    mapped = {of: text for of, text in columns.items() if of in values}
+    if not mapped or any(of not in mapped for of, known in MAPPED[role].items() if known.needed):
+        return []
+    doubt = doubt or _find_doubt(role, mapped, values)
+    if doubt == _IMPOSSIBLE:
+        return []
+    keys: dict[str, tuple[TomlValue, str]] = {"role": ("power", "")} if name != role else {}
+    keys |= {"file": (table.file, doubt), "stamp": (table.stamp, "")}
+    keys |= {"stamp_unit": (table.stamp_unit, "by its steps")} if table.stamp_unit else {}
+    samples = {of: "" if of == "quality" else format_first(values[of]) for of in mapped}
+    keys |= {f"columns.{of}": (text, samples[of]) for of, text in mapped.items()}
+    head = f"tables.{name}"
+    lines = [ProposedLine(head, key, value, note, is_certain=not doubt) for key, (value, note) in keys.items()]
+    if mapped.get("angular_z", "").endswith(_OVER_TRACK):
+        lines[-1] = replace(lines[-1], note="state the track width in place of 0.5 m", is_certain=False)
+    if role == "gnss" and "quality" not in mapped:
+        lines += [propose_quality(head, "columns.quality", of) for of in find_quality(table.names)]
+    if role == "power" and set(mapped) == {"current"}:
+        lines += [ProposedLine(head, of, volt, NO_VOLTAGE, is_certain=False) for of, volt in NOMINAL.items()]
+    return lines
+
+
+def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[str, Floats]:
+    """Return the values of columns by field, in its unit; without those that hold no number."""
+    fields = read_fields("", role, columns, {}, table.names)
+    if isinstance(fields, list):
+        return {}
+    used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
+    numbers = [column for name, named in used.items() if name != "quality" for column in named]
+    cells = read_cells(table.path, stamp=table.stamp, columns=numbers, words=used.get("quality", ()))
+    rows = len(cells.stamp)
+    found = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
+    return {name: values for name, values in found.items() if np.isfinite(values).any()}
+
+
+_IMPOSSIBLE = "impossible"
+
+
+def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats]) -> str:
+    """Return what the values leave unclear, and correct ``mapped`` by the factors that they show."""
+    if role in ("gnss", "imu"):
+        judged, doubt = judge_fields(role, mapped, values)
+        factors = {of: text.removeprefix(mapped[of]) for of, text in judged.items()}
+        held = {of: f"{_quote(mapped[of])}{factor}" if factor else mapped[of] for of, factor in factors.items()}
+        mapped.clear()
+        mapped.update(held)
+        return doubt
+    if role == "power" and "power" not in values:
+        volt, amp = (values.get(of, np.full(1, np.nan)) for of in ("voltage", "current"))
+        return _IMPOSSIBLE if find_rejection(RailReadings("", volt, amp), "", {}) else ""
+    speed = values.get("linear_x", np.zeros(1))
+    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > _FASTEST_MPS
+    return "its largest values are no m/s: state the unit" if is_fast else ""

@@ -1,0 +1,271 @@
+"""What a log could be read as by a recipe: fixes, inertial measurements and power in messages that no rule knows, judged by their values.
+
+`tcpipe inspect`, `preflight`, `ingest` and `init --from` all have it from here. A proposal whose values cannot be what its names say is not
+made; one that the values do not settle says in ``doubt`` what remains to be checked.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.logs.field_mapping import list_number_fields, match_field_names
+from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
+from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
+from tcpipe.logs.topics import Topic
+from tcpipe.power.sources import (
+    FLOAT_TYPES,
+    Columns,
+    find_quantity,
+    find_rejection,
+    is_of_drives,
+    list_power_lists,
+    make_rail_name,
+    read_rails,
+    reject_power,
+)
+from tcpipe.recipe import ReadConfig
+from tcpipe.recipe.suggestions import Keys, format_first, suggest
+from tcpipe.robots import PowerSource, Profiles
+from tcpipe.stages.message_arrays import LogReader, make_message_arrays
+from tcpipe.tables.findings import Finding, Subject, make_finding
+
+Floats = NDArray[np.float64]
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+_GRAVITY_MPS2 = 9.80665
+_UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
+"""What no name says of a current."""
+
+
+def find_proposals(
+    log: LogReader, assignment: RoleAssignment, config: ReadConfig, known: Profiles
+) -> tuple[Finding, ...]:
+    """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of."""
+    free = [topic for topic in log.topics.values() if _is_free(topic, config)]
+    settled = {*assignment.roles, *config.topics}
+    power = () if "power" in settled else _propose_power(log, free, known)
+    return (*_propose_roles(log, free, settled), *power)
+
+
+def _is_free(topic: Topic, config: ReadConfig) -> bool:
+    readable = topic.problem is None and topic.message_count != 0
+    return readable and topic.name not in config.ignore_topics and not topic.name.startswith(OVERLAY)
+
+
+def read_columns(log: LogReader, topic: str, in_lists: Iterable[str] = ()) -> Columns:
+    """Return a topic's messages by field; {} where they cannot be decoded."""
+    tables = log.tables([topic])
+    return make_message_arrays(tables[topic], [*in_lists]) if topic in tables else {}
+
+
+_PROPOSED = ("gnss", "imu")
+"""Roles whose fields are called so that nothing else is taken for them."""
+
+
+def _propose_roles(log: LogReader, free: Sequence[Topic], settled: set[str]) -> Iterator[Finding]:
+    """Yield a finding for each message type that no role knows and whose fields are called as those of a role that nothing can play."""
+    types = {topic.type_name for topic in free}
+    for role in _PROPOSED:
+        if role in settled or types & set(ROLE_TYPES[role]):
+            continue
+        for topic in free:
+            fields = [name for name in list_number_fields(topic) if "[]" not in name]
+            if found := match_field_names(role, fields):
+                columns = read_columns(log, topic.name)
+                if not set(found.values()) <= set(columns):
+                    continue
+                mapped, doubt = judge_fields(role, found, {name: columns[of] for name, of in found.items()})
+                remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: mapped}})
+                names = {field: format_first(columns[of]) for field, of in found.items() if field != "quality"}
+                names |= {"role": role, "type": topic.type_name, **({"doubt": doubt} if doubt else {})}
+                yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
+
+
+def judge_fields(role: str, found: Mapping[str, str], columns: Columns) -> tuple[dict[str, str], str]:
+    """Return what each field is taken from, with the factor that its values show, and what they leave open.
+
+    ``found`` are the names that are matched, ``columns`` their values by field.
+    """
+    values = {name: np.asarray(of, np.float64) for name, of in columns.items()}
+    values = {name: of[np.isfinite(of) & (of != 0.0)] for name, of in values.items()}
+    if role == "gnss":
+        return _judge_fixes(dict(found), values)
+    if role == "imu":
+        return _judge_imu(dict(found), values)
+    return dict(found), ""
+
+
+def _largest(values: Floats) -> float:
+    return float(np.abs(values).max()) if values.size else np.nan
+
+
+def _judge_fixes(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dict[str, str], str]:
+    latitude, longitude = (_largest(values[name]) for name in ("latitude", "longitude"))
+    doubt = ""
+    is_whole = not any(np.any(values[name] % 1.0) for name in ("latitude", "longitude"))
+    if is_whole and 90.0 < latitude <= 90e7 and longitude <= 180e7:  # as in u-blox' messages, whose heights are in mm
+        found |= {name: f"{found[name]} * 1e-7" for name in ("latitude", "longitude")}
+        found |= {"altitude": f"{found['altitude']} * 0.001"} if "altitude" in found else {}
+        values = {**values, "altitude": values.get("altitude", np.zeros(0)) * 0.001}
+    elif not (latitude <= 90.0 and longitude <= 180.0):
+        doubt = f"latitudes to {latitude:.6g} are no degrees: convert them"
+    elif latitude <= np.pi / 2 and longitude <= np.pi:
+        doubt = "check that these are degrees: the values could be radians"
+    if "altitude" in found and not (values["altitude"].size and _largest(values["altitude"]) < 9000.0):
+        del found["altitude"]
+    return found, doubt
+
+
+def _judge_imu(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dict[str, str], str]:
+    """Judge by gravity: the median of each axis is what a robot that drives about feels."""
+    acceleration = [name for name in found if name.startswith("linear")]
+    felt = float(np.sqrt(sum(np.median(values[name]) ** 2 if values[name].size else 0.0 for name in acceleration)))
+    if abs(felt - 1.0) < 0.1:
+        return found | {name: f"{found[name]} * {_GRAVITY_MPS2}" for name in acceleration}, ""
+    near = abs(felt - _GRAVITY_MPS2) < 1.0
+    return found, "" if near else f"the acceleration at rest is {felt:.3g}, not 9.81 m/s²: check axes and units"
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """Topics that could be power together: the tables that read them, the range of their values, and what is unclear."""
+
+    topics: tuple[str, ...]
+    sources: tuple[Keys, ...]
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    doubt: str = ""
+
+
+def _propose_power(log: LogReader, free: Sequence[Topic], known: Profiles) -> Iterator[Finding]:
+    """Yield what could be power in a log without a power topic: bare numbers, then messages of the user's own, then torques."""
+    told = {*known.types(), *(of for types in ROLE_TYPES.values() for of in types)}
+    own = [topic for topic in free if topic.type_name not in told]
+    found = [*_find_bare(log, free)] or [*_find_own(log, own)] or [*_find_joints(log, free)]
+    found.sort(key=lambda of: bool(of.doubt))
+    for best in found[:1]:
+        rivals = [name for of in found[1:] if not of.doubt for name in of.topics]
+        doubt = best.doubt or (f"{', '.join(rivals)} could be meant as well" if rivals else "")
+        topics = [name for of in found for name in of.topics]
+        names = {"topics": ", ".join(topics), **({"doubt": doubt} if doubt else {})}
+        used = list(dict.fromkeys(str(keys["topic"]) for keys in best.sources if "topic" in keys))
+        used = used or (
+            [*best.topics] if len(best.topics) > 1 else []
+        )  # one topic of a type that is known needs no name
+        chosen: dict[str, Keys | Sequence[Keys]] = {"read.topics": {"power": used}} if used else {}
+        recipe = {**chosen, "power_sources": best.sources}
+        remedies = suggest("use", recipe) if best.sources else ()
+        subject = Subject("role", "power")
+        yield make_finding(
+            "power-candidates", subject, names=names, remedies=remedies, topics_count=len(topics), **best.numbers
+        )
+
+
+_THOUSANDTHS = {"voltage-in-millivolts": "voltage_scale", "current-in-milliamperes": "current_scale"}
+
+
+def _judge_source(log: LogReader, topic: Topic, keys: Keys, numbers: dict[str, float]) -> Keys | None:
+    """Return a power source with the factors that make its values plausible, and add their range to ``numbers``; None where none does."""
+    made: dict[str, Any] = {**keys}
+    columns = read_columns(log, topic.name, list_power_lists(topic.type_name, [PowerSource(**made)]))
+    for _ in range(3):
+        found = read_rails(columns, [PowerSource(**made)], topic.name) if columns else []
+        if isinstance(found, Finding) or not found:
+            return None
+        rail = found[0]
+        why = find_rejection(rail, topic.name, columns)
+        scale = _THOUSANDTHS.get(why.names["reason"], "") if why else ""
+        if scale in {"", *made}:
+            break
+        made[scale] = 0.001
+    drawn = ("current_amp", "watt" if "power" in made else "amp")
+    for values, unit in ((getattr(rail, name), unit) for name, unit in (("voltage_volt", "volt"), drawn)):
+        known = values[np.isfinite(values)]
+        if why is None and known.size and ("voltage" in made or unit != "volt"):
+            why = None if known.any() else reject_power(topic.name, "no-numbers")
+            numbers[f"low_{unit}"] = min(numbers.get(f"low_{unit}", np.inf), float(known.min()))
+            numbers[f"high_{unit}"] = max(numbers.get(f"high_{unit}", -np.inf), float(known.max()))
+    return made if why is None else None
+
+
+def _find_bare(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
+    """Yield what topics of bare numbers make: rails of voltage and current, or powers, or currents without a voltage."""
+    numbers = dict[str, float]()
+    judged: dict[str, list[Keys]] = {"voltage": [], "current": [], "power": []}
+    for topic in free:
+        is_watt = bool(_WATT & set(split_words(topic.name.rpartition("/")[2])))
+        what = (find_quantity(topic.name) or ("power" if is_watt else "")) if topic.type_name in FLOAT_TYPES else ""
+        unsettled = _UNSETTLED if what == "power" else {"rail": make_rail_name(topic.name), "sign": "auto"}
+        keys = {"type": topic.type_name, "topic": topic.name, what: "data", **unsettled}
+        if what and (found := _judge_source(log, topic, keys, numbers)):
+            judged[what].append(found)
+    sources, doubt = _pair_rails(judged["voltage"], judged["current"]), "uncomment if these feed the drives"
+    if not sources and judged["power"]:
+        alike = split_sides(str(judged["power"][0]["topic"]))[0]
+        sources = [keys for keys in judged["power"] if split_sides(str(keys["topic"]))[0] == alike]
+    elif not sources and not judged["voltage"]:
+        sources, doubt = [{**keys, **NOMINAL} for keys in judged["current"]], NO_VOLTAGE
+    if topics := [str(keys["topic"]) for of in judged.values() for keys in of]:
+        yield _Candidate(tuple(topics), tuple(sources), numbers, doubt)
+
+
+_WATT = {"power", "watt", "watts"}
+NOMINAL: Keys = {"nominal_voltage_volt": 24.0}
+NO_VOLTAGE = "nothing is a voltage: state that of the battery"
+
+
+def _pair_rails(voltages: Sequence[Keys], currents: Sequence[Keys]) -> list[Keys]:
+    """Return each rail's voltage and current: called alike, or all currents at the only voltage; of drives alone where some are."""
+    by_rail = {keys["rail"]: keys for keys in voltages}
+    used: list[Keys] = []
+    for keys in [of for of in currents if is_of_drives(str(of["topic"]))] or currents:
+        voltage = by_rail.get(keys["rail"]) or (voltages[0] if len(voltages) == 1 else None)
+        if voltage is None:
+            return []
+        used += [{**voltage, "rail": keys["rail"]}, keys]
+    return used
+
+
+def _find_own(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
+    """Yield the messages of the user's own that hold voltage and current, or power; topics of a type that differ by side are summed."""
+    groups: dict[tuple[str, tuple[str, ...]], list[Topic]] = {}
+    for topic in own:
+        groups.setdefault((topic.type_name, split_sides(topic.name)[0]), []).append(topic)
+    for (type_name, _), group in groups.items():
+        matched = match_power_fields(list_number_fields(group[0]))
+        if matched is None or (len(matched.rails) > 1 and len(group) > 1):
+            continue
+        scales = {f"{what}_scale": factor for what, factor in matched.scales.items()}
+        numbers, doubt, sources = dict[str, float](), matched.doubt, list[Keys]()
+        for rail in matched.rails:
+            named = {"rail": rail["current"]} if len(matched.rails) > 1 else {}
+            lacks_voltage = not {"voltage", "power"} & set(rail)
+            doubt = NO_VOLTAGE if lacks_voltage else doubt
+            assumed = NOMINAL if lacks_voltage else {}
+            keys: Keys | None = {"type": type_name, **named, **rail, **scales, **_UNSETTLED, **assumed}
+            for topic in group:
+                keys = keys and _judge_source(log, topic, keys, numbers)
+            sources += [keys] if keys else []
+        if len(sources) == len(matched.rails):
+            yield _Candidate(tuple(topic.name for topic in group), tuple(sources), numbers, doubt)
+
+
+_DRIVING = re.compile(r".*(wheel|drive|motor|track|axle)(?!.*steer).*")
+
+
+def _find_joints(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
+    """Yield the joint states that have efforts and velocities of what drives."""
+    for topic in free:
+        columns = read_columns(log, topic.name, ["name[]"]) if topic.type_name == JOINT_STATE else {}
+        names = [str(name) for name in np.unique(columns.get("name[]", np.zeros(0, "U1"))).tolist()]
+        wheels = "|".join(re.escape(name) for name in names if _DRIVING.fullmatch(name.lower()))
+        if wheels and all(np.any(np.nan_to_num(columns.get(of, np.zeros(1)))) for of in ("velocity", "effort")):
+            keys: Keys = {"type": topic.type_name, "joints": wheels, "sign": "auto"}
+            yield _Candidate(
+                (topic.name,), (keys,), doubt="uncomment if efforts are torques [N m]: mechanical power alone"
+            )

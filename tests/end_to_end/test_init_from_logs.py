@@ -1,0 +1,194 @@
+"""A robot that nobody knows: ``init --from`` its log, at most two lines edited, and ``ingest`` gives labels with energy.
+
+Six robots, of one simulated drive each; their energies are compared with those of the same drive in messages that tcpipe knows.
+"""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from changed_drives import NAMES, Drive, make
+from click.testing import CliRunner
+
+from tcpipe.cli import cli
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
+from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
+from tcpipe.store import Store
+
+ESC = "std_msgs/Header header\nfloat32 voltage\nfloat32 current\nint32 rpm\nfloat32 temperature\n"
+SOLUTION = "std_msgs/Header header\nfloat64 lat\nfloat64 lon\nfloat32 height\nuint8 quality\n"
+WHEELS = [f"{end}_{side}_wheel_joint" for end in ("front", "rear") for side in ("left", "right")]
+HUSKY = {"gnss": "[0.1, 0.0, 0.9]", "imu": "[0.05, -0.1, 0.3], rpy_rad = [3.1416, 0.0, 1.5708]"}
+"""Where the simulated robot's sensors sit, as somebody would measure it."""
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return make()
+
+
+@pytest.fixture(scope="module")
+def known_joule(drive, tmp_path_factory):
+    """The energy of the drive's segments by its own power message."""
+    directory = tmp_path_factory.mktemp("known")
+    write_mcap(directory / "run.mcap", drive.messages)
+    run("ingest", directory / "run.mcap", "--store", directory / "store")
+    return energy_joule(directory / "store")
+
+
+def run(*words):
+    return CliRunner().invoke(cli, [str(word) for word in words], standalone_mode=False)
+
+
+def energy_joule(store):
+    (found,) = Store(store).runs()
+    segments = found.segments()
+    assert segments.num_rows > 15
+    return segments["energy_joule"].to_numpy(zero_copy_only=False).sum()
+
+
+def renamed(drive, *without):
+    """The messages of a robot whose topics no profile knows."""
+    names = {name: name.replace("/a200_0000/", "/").replace("platform/", "") for name in NAMES.values()}
+    return [replace(stream, topic=names[stream.topic]) for stream in drive.without(*without).messages]
+
+
+def stamped(stamp_ns, **columns):
+    stamps = {"sec": (stamp_ns // 10**9).astype(np.int32), "nanosec": (stamp_ns % 10**9).astype(np.uint32)}
+    return {**{f"header.stamp.{name}": of for name, of in stamps.items()}, **columns}
+
+
+def power_at(drive, every=10):
+    rows = slice(None, None, every)
+    truth = drive.truth
+    return tuple(values[rows] for values in (truth.stamp_ns, truth.voltage_volt, truth.current_amp, truth.right_share))
+
+
+def watts(drive):
+    stamp_ns, volt, amp, _ = power_at(drive)
+    return [
+        *renamed(drive, "power"),
+        MessageStream("/base/power_w", "std_msgs/msg/Float32", stamp_ns, {"data": volt * amp}),
+    ]
+
+
+def escs(drive):
+    stamp_ns, volt, amp, right = power_at(drive)
+    each = []
+    for number, share in enumerate((right, right, 1.0 - right, 1.0 - right)):
+        columns = stamped(stamp_ns, voltage=volt, current=amp * share / 2)
+        each.append(MessageStream(f"/esc_{number}/status", "esc_msgs/msg/EscStatus", stamp_ns, columns, definition=ESC))
+    return [*renamed(drive, "power"), *each]
+
+
+def vescs(drive):
+    stamp_ns, volt, amp, right = power_at(drive)
+    joule = np.diff(stamp_ns, prepend=stamp_ns[0]) / 1e9 * volt * amp
+    sides = []
+    for side, share in (("right", right), ("left", 1.0 - right)):
+        drawn, given = (np.cumsum(np.maximum(sign * joule * share, 0.0)) / 3600 for sign in (1, -1))
+        values = {"voltage_input": volt, "current_input": amp * share, "current_motor": 3 * amp * share}
+        values |= {"energy_drawn": drawn, "energy_regen": given}
+        columns = stamped(stamp_ns, **{f"state.{name}": of for name, of in values.items()})
+        sides.append(MessageStream(f"/{side}/core", "vesc_msgs/msg/VescStateStamped", stamp_ns, columns))
+    return [*renamed(drive, "power"), *sides]
+
+
+def joints(drive):
+    stamp_ns, volt, amp, _ = power_at(drive)
+    speed = np.interp(stamp_ns, drive.truth.stamp_ns, drive.truth.wheel_velocity_mps) / 0.165
+    torque = np.maximum(volt * amp, 0.0) / np.where(np.abs(speed) > 0.05, speed, np.inf) / len(WHEELS)
+    columns = stamped(stamp_ns, velocity=np.stack([speed] * 4, 1), effort=np.stack([torque] * 4, 1))
+    stream = MessageStream("/joint_states", "sensor_msgs/msg/JointState", stamp_ns, columns, {"name": WHEELS})
+    return [*renamed(drive, "power"), stream]
+
+
+def own_fixes(drive):
+    (fixes,) = (stream for stream in drive.messages if stream.topic == NAMES["gnss"])
+    columns = {name: fixes.columns[name] for name in fixes.columns if name.startswith("header.stamp")}
+    names = {"lat": "latitude", "lon": "longitude", "height": "altitude"}
+    columns |= {name: fixes.columns[of] for name, of in names.items()}
+    columns["quality"] = np.where(fixes.columns["status.status"] < 0, 0, 4).astype(np.uint8)
+    frame = {"header.frame_id": fixes.constants["header.frame_id"]}
+    own = MessageStream(
+        "/rtk/solution", "acme_gnss/msg/Solution", fixes.log_time_ns, columns, frame, definition=SOLUTION
+    )
+    return [*renamed(drive, "gnss"), own]
+
+
+def unplaced(drive):
+    return [stream for stream in renamed(drive) if "tf" not in stream.topic]
+
+
+def followed(text, *, removing):
+    """The recipe with the lines that a person edits, and how many these are."""
+    lines, edited = text.splitlines(), 0
+    for number, line in enumerate(lines):
+        key = re.match(r"# ([\w.]+) = ", line)
+        if key and key[1] in removing:
+            edited += 1
+            place = HUSKY.get(key[1])
+            lines[number] = f"{key[1]} = {{ xyz_m = {place} }}" if place else line.removeprefix("# ")
+    return "\n".join(lines) + "\n", edited
+
+
+@pytest.mark.parametrize(
+    ("robot", "removing", "tolerance"),
+    [
+        (watts, ("power", "power_sources"), 0.03),
+        (escs, (), 0.03),
+        (vescs, (), 0.03),
+        (joints, ("power_sources",), 0.1),
+        (own_fixes, ("gnss.quality",), 0.03),
+        (unplaced, ("gnss", "imu"), 0.03),
+    ],
+)
+def test_an_unknown_robot_needs_two_lines(drive, known_joule, tmp_path, *, robot, removing, tolerance):
+    log, recipe = tmp_path / "run.mcap", tmp_path / "tcpipe.toml"
+    write_mcap(log, robot(drive))
+    assert run("init", tmp_path, "--from", log).exit_code == 0
+    proposed = recipe.read_text()
+    everything = re.sub(r"^# (?=\[|\w+(\.\w+)* = )", "", proposed, flags=re.MULTILINE)
+    parse_recipe(parse_toml(everything), where="every comment removed")
+    text, edited = followed(proposed, removing=removing)
+    assert edited == len(removing) <= 2
+    recipe.write_text(text)
+    done = run("ingest", log, "--store", tmp_path / "store", "--recipe", recipe)
+    assert "energy usable" in done.output or "energy usable with care" in done.output
+    assert "[no-gnss]" not in done.output
+    assert energy_joule(tmp_path / "store") == pytest.approx(known_joule, rel=tolerance)
+
+
+def test_inspect_preflight_and_init_propose_the_same(drive, tmp_path):
+    log = tmp_path / "run.mcap"
+    write_mcap(log, escs(drive))
+    told = [run(command, log).output for command in ("inspect", "preflight")]
+    (tmp_path / "acme_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "acme_msgs" / "msg" / "Other.msg").write_text("float32 data\n")
+    call = ("init", tmp_path, "--from", log, "--robot", "generic", "--msgdef", tmp_path)
+    run(*call)
+    values = parse_toml((tmp_path / "tcpipe.toml").read_text())
+    for output in told:
+        lines = [line.strip() for line in output.splitlines()]
+        first = lines.index("[read.topics]")
+        block = parse_toml("\n".join(line for line in lines[first:] if line.startswith("[") or " = " in line))
+        assert {name: block[name] for name in ("power_sources", "read")} == values
+    again = run(*call)
+    assert "nothing to do" in again.output
+
+
+def test_currents_of_motors_are_for_a_person_to_decide(drive, tmp_path):
+    stamp_ns, volt, amp, right = power_at(drive)
+    definition = "std_msgs/Header header\nuint16 bus_mv\nint32[2] motors_ma\n"
+    milliamps = (1000 * np.stack([amp * right, amp * (1 - right)], 1)).astype(np.int32)
+    columns = stamped(stamp_ns, bus_mv=(1000 * volt).astype(np.uint16), motors_ma=milliamps)
+    own = MessageStream("/rover/motors", "rover_msgs/msg/Motors", stamp_ns, columns, definition=definition)
+    write_mcap(tmp_path / "run.mcap", [*Drive(drive.truth, drive.messages).without("power").messages, own])
+    run("init", tmp_path, "--from", tmp_path / "run.mcap")
+    (line,) = (of for of in (tmp_path / "tcpipe.toml").read_text().splitlines() if "power_sources" in of)
+    assert line.startswith("# power_sources = ")
+    (source,) = parse_toml(line.removeprefix("# "))["power_sources"]
+    given = {name: source[name] for name in ("voltage", "voltage_scale", "current", "current_scale")}
+    assert given == {"voltage": "bus_mv", "voltage_scale": 0.001, "current": "motors_ma[]", "current_scale": 0.001}
+    assert "motor" in line.partition("#")[2].partition("#")[2]

@@ -1,0 +1,127 @@
+"""What the tables of a folder propose: names and values decide together, and what they leave open is a comment."""
+
+import numpy as np
+import pytest
+
+from tcpipe.errors import UsageError
+from tcpipe.formats.logs.table_log import TableLog
+from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
+from tcpipe.pipeline.proposals import propose_recipe
+
+ROWS = 60
+UTC_S = 1_763_501_392.0
+
+
+def write(path, **columns):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = [name.replace("__", " ") for name in columns]
+    values = [np.broadcast_to(of, ROWS).tolist() for of in columns.values()]
+    lines = [",".join(names), *(",".join(map(str, row)) for row in zip(*values, strict=True))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def proposed(folder):
+    """The recipe as it is written, and with every comment of a line removed."""
+    text = propose_recipe(folder).toml()
+    bare = "\n".join(
+        line.removeprefix("# ") if " = " in line or line.startswith("# [") else line for line in text.splitlines()
+    )
+    return parse_toml(text), parse_recipe(parse_toml(bare), where="every comment removed"), text
+
+
+SECONDS = np.arange(ROWS) / 10
+WALL_NS = ((UTC_S + SECONDS) * 1e9).astype(np.int64)
+FIXES = {"latitude__(deg)": 26.372 + 1e-6 * np.arange(ROWS), "longitude__(deg)": -80.1 + 1e-6 * np.arange(ROWS)}
+INERTIAL = {**dict.fromkeys(("wx", "wy"), 0.01), "wz": 0.1, "ax": 0.2, "ay": -0.1, "az": 9.8}
+
+
+def test_stamps_since_1970_go_before_those_from_the_start_and_texts_cut_to_seconds(tmp_path):
+    text = np.array([f"2025-11-18 21:29:{52 + int(second)}" for second in SECONDS])
+    write(
+        tmp_path / "a" / "gps.csv",
+        **{"timestamp__(sec)": SECONDS, "timestring": text, "timestamp__(ns)": WALL_NS},
+        **FIXES,
+        alt_msl=2.6,
+    )
+    write(tmp_path / "b" / "power.csv", timestring=text, stamp_ns=WALL_NS, **{"Power__(w)": 50 + SECONDS})
+    values, recipe, _ = proposed(tmp_path)
+    assert values["tables"]["gnss"]["stamp"] == "timestamp (ns)"
+    assert values["tables"]["gnss"]["columns"]["altitude"] == "alt_msl"
+    assert values["tables"]["power"] == {"file": "b/power.csv", "stamp": "stamp_ns", "columns": {"power": "Power (w)"}}
+    topics = TableLog(tmp_path, recipe.tables).topics
+    assert {name: topic.message_count for name, topic in topics.items()} == {"/gnss": ROWS, "/power": ROWS}
+
+
+def test_numbered_files_are_runs_and_both_sides_are_one_robot(tmp_path):
+    for number in ("00", "01"):
+        write(tmp_path / f"imu_{number}.csv", time=SECONDS, **INERTIAL)
+        write(tmp_path / f"pro_{number}.csv", time=SECONDS, curL=2.0 + SECONDS, curR=3.0 + SECONDS, velL=0.2, velR=0.3)
+    values, recipe, text = proposed(tmp_path)
+    tables = values["tables"]
+    assert {name: of["file"] for name, of in tables.items()} == {
+        "imu": "imu_*.csv",
+        "wheel_odometry": "pro_*.csv",
+        "power": "pro_*.csv",
+    }
+    assert {of["stamp_unit"] for of in tables.values()} == {"s"}
+    assert tables["wheel_odometry"]["columns"] == {"linear_x": "(velL + velR) / 2"}
+    assert tables["power"]["columns"] == {"current": "curL + curR"}
+    assert recipe.tables["wheel_odometry"].columns["angular_z"] == "(velR - velL) / 1 / 0.5"
+    assert recipe.tables["power"].nominal_voltage_volt == 24.0
+    assert text.count("\n# columns.angular_z") == text.count("\n# nominal_voltage_volt") == 1
+
+
+def test_numbers_of_motors_are_no_runs(tmp_path):
+    write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES)
+    for motor in (1, 2):
+        write(tmp_path / f"motor_{motor}.csv", time=SECONDS + UTC_S, voltage=24.0 + SECONDS, current=1.0 + SECONDS)
+    assert "*" not in propose_recipe(tmp_path).toml()
+
+
+@pytest.mark.parametrize(
+    ("latitude", "expected"), [(4704.1, "is no"), (0.82, "radians"), (470_612_345.0, ""), (47.06, "")]
+)
+def test_latitudes_that_are_no_degrees_are_for_a_person(tmp_path, latitude, expected):
+    longitude = latitude / 3
+    rows = np.arange(ROWS)
+    write(
+        tmp_path / "gps.csv",
+        time=SECONDS + UTC_S,
+        lat=np.round(latitude + rows) if latitude > 1e6 else latitude + 1e-6 * rows,
+        lon=np.round(longitude + rows) if latitude > 1e6 else longitude + 1e-6 * rows,
+    )
+    values, recipe, text = proposed(tmp_path)
+    assert ("tables" in values) is not bool(expected)
+    if latitude > 1e6:
+        assert recipe.tables["gnss"].columns["latitude"] == "lat * 1e-7"
+    assert all(word in text.lower() for word in expected.replace("is no", "no degrees").split(" ") if expected)
+
+
+def test_a_speed_and_a_place_beside_fixes_are_computed_from_them(tmp_path):
+    write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES, speed=0.5, x=SECONDS, y=SECONDS)
+    assert set(proposed(tmp_path)[0]["tables"]) == {"gnss"}
+
+
+def test_what_cannot_be_power_is_not_proposed(tmp_path):
+    write(
+        tmp_path / "log.csv",
+        time=SECONDS + UTC_S,
+        v=0.5 + 0 * SECONDS,
+        battery_voltage=0.0,
+        battery_current=0.0,
+        energy_per_m=3.0,
+    )
+    assert set(proposed(tmp_path)[0]["tables"]) == {"wheel_odometry"}
+
+
+def test_commands_and_velocities_of_one_table_are_told_apart(tmp_path):
+    write(tmp_path / "log.csv", time=SECONDS + UTC_S, cmd_vel_x=1.0, odom_vel_x=0.9)
+    tables = proposed(tmp_path)[0]["tables"]
+    assert tables["command"]["columns"] == {"linear_x": "cmd_vel_x"}
+    assert tables["wheel_odometry"]["columns"] == {"linear_x": "odom_vel_x"}
+
+
+def test_a_folder_without_known_names_says_so(tmp_path):
+    write(tmp_path / "notes.csv", week=SECONDS, done=1.0)
+    with pytest.raises(UsageError, match="no table with columns of known names"):
+        propose_recipe(tmp_path)
