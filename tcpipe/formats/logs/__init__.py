@@ -1,4 +1,4 @@
-"""Robot logs on disk: ROS 1 bags, ROS 2 bags, MCAP, folders of tables and logs of autopilots, behind one face, `tcpipe.formats.logs.log_file`'s.
+"""Robot logs on disk: ROS 1 and ROS 2 bags, MCAP, tables and logs of autopilots, behind one face, `tcpipe.formats.logs.log_file`'s.
 
 The way from a path to a table, each step importing only those below it::
 
