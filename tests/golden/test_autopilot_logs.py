@@ -1,6 +1,7 @@
 """Autopilot logs against the tools of their makers, pyulog and pymavlink; and what roles get of them against numbers written by hand."""
 
 import json
+import shutil
 import struct
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -12,12 +13,14 @@ import pytest
 from autopilot_files import AMP, ANTENNA_FRD, SPEED_MPS, VOLT, DataFlash, Drive, Ulog, write_dataflash, write_ulog
 from installed_command import tcpipe as run_tcpipe
 from shared_data import shared_data
+from storage_server import object_store
 
 import tcpipe
 from tcpipe.errors import RoleError
 from tcpipe.formats.logs.autopilot_records import read_records
 from tcpipe.logs.topics import split_notes
-from tcpipe.recipe import ReadConfig
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.robots import Profiles
 from tcpipe.stages.read import read_run
 
@@ -292,6 +295,7 @@ def test_a_drive_is_ingested_without_a_recipe(tmp_path, kind):
     done = run_tcpipe("ingest", path, "--store", "store", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "position, time and energy usable" in done.stdout
+    assert f"{path.stem}-" in done.stdout
     (segments,) = (tmp_path / "store").rglob("segments.parquet")
     table = pq.read_table(segments)
     energy, seconds = (np.array(table[name].to_pylist()) for name in ("energy_joule", "duration_s"))
@@ -315,3 +319,17 @@ def test_a_bin_that_is_no_log_is_passed_over_in_a_folder(tmp_path):
     assert Path(told["path"]).name == "1.BIN"
     refused = run_tcpipe("inspect", "000000.bin", cwd=tmp_path)
     assert (refused.returncode != 0, "not a log" in refused.stderr) == (True, True)
+
+
+def test_logs_of_autopilots_lie_in_object_storage(logs, tmp_path, monkeypatch):
+    folder = tmp_path / "store" / "drives"
+    folder.mkdir(parents=True)
+    with object_store(tmp_path / "store") as (settings, _):
+        for name, value in settings.items():
+            monkeypatch.setenv(name, value)
+        for kind, suffix in (("ulog", "ulg"), ("dataflash", "BIN")):
+            shutil.copyfile(logs[kind], folder / f"run.{suffix}")
+            with tcpipe.read_log(f"s3://drives/run.{suffix}") as there, tcpipe.read_log(logs[kind]) as here:
+                assert there.topics == here.topics
+                assert (there.sha256(), there.size_bytes) == (here.sha256(), here.size_bytes)
+        assert inspect("s3://drives", recipe=Recipe()).path == "s3://drives/run.ulg"  # a .bin of a bucket must be named
