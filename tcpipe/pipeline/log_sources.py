@@ -66,7 +66,7 @@ class LogSource:
         path = self.paths[0]
         name, suffixes = path.name.lower(), sorted(LOG_SUFFIXES, key=len, reverse=True)
         suffix = next((end for end in suffixes if name.endswith(end) and not path.is_dir()), "")
-        stem = path.name[: len(name) - len(suffix)]
+        stem = path.name[: len(path.name) - len(suffix)]
         if is_table(path.name) and not path.is_dir():
             stem = f"{path.parent.name}_{path.stem}"
         return clean_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")
