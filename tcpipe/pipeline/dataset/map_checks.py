@@ -78,8 +78,7 @@ def register_runs(
         findings += _find_shift(registration, run.run_id, source.name, is_applied=not reason)
         findings += _find_other_heights(registration, expected_m, run.run_id, source.name)
     if recipe.sample.align:
-        west, south, east, north = projection.area_deg
-        geoid_m = compute_geoid_height((west + east) / 2.0, (south + north) / 2.0)
+        geoid_m = compute_geoid_height(*np.reshape(projection.area_deg, (2, 2)).mean(axis=0).tolist())
         findings += _find_height_datum(registrations, source.name, geoid_m)
     return tuple(registrations), findings
 
