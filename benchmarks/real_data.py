@@ -1,13 +1,20 @@
-"""What can be predicted of real drives where there is no map: time and energy of a metre from slope, turn and commanded speed alone.
+"""What can be predicted of real drives where there is no map: time and energy of a metre from slope, turn and speed alone.
 
     python benchmarks/real_data.py DRIVE=LOG[,RECIPE] [DRIVE=LOG[,RECIPE] ...]
+    python benchmarks/real_data.py --classes STORE
 
-Logs are ingested; the class of the ground is not known. Fitted are the mean, physics (`cost/physics.py`; the speed by a line over the
-slope, of the commanded speed where there is one), and boosted trees on the same numbers. Held out are, in turn, fifths of the drive
-and, between two drives, the whole other drive. 90 % intervals, NLL and CRPS come from a second cross-fit inside what
-is fitted on, so that nothing held out has told them. The floor is what the labels' own deviations make of a perfect prediction. Beside the
-real ones stands a simulated drive of as many metres as the longest (labels, no logs: benchmarks/path_coverage.py), of which the class is
-not told either.
+Logs are ingested; the class of the ground is not known. Fitted are the mean of the other metres, their mean power at the speed, physics
+(`cost/physics.py`; the speed by a line over the slope, of the commanded speed), and boosted trees on slope, turn and commanded speed.
+Where no speed is commanded, the track's own stands for it: E is then that of a metre whose speed is known, and T is not predicted; beside
+that E and T without the speed. Held out are, in turn, fifths of the drive and, between two drives, the whole other drive; the mean of the
+held-out block itself, which no model knows, stands beside. R² is one less the squared errors over those of the mean of all metres. 90 %
+intervals, NLL and CRPS come from a second cross-fit inside what is fitted on, so that nothing held out has told them. The floor is what the
+labels' own deviations make of a perfect prediction. Beside the real ones stands a simulated drive of as many metres as the longest (labels,
+no logs: benchmarks/path_coverage.py), of which the class is not told either.
+
+With ``--classes`` the energy per metre of a store's runs by the class of their ground, which is the first word of their names: does the
+class tell the cost? Runs are the unit: the mean over runs, the deviation between them, and how well the mean of the other runs of a class
+predicts a run's, beside the mean of all other runs.
 """
 
 from __future__ import annotations
@@ -15,7 +22,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +62,7 @@ class Metre:
     rise: Floats
     turn_radpm: Floats
     command: Floats
-    """Commanded speed [m/s]; 1 where none is known."""
+    """Commanded speed [m/s]; where none is known that of the track, or 1 of a simulated drive."""
     duration_std: Floats
     energy_std: Floats
     start_ns: NDArray[np.int64]
@@ -75,10 +82,16 @@ def recorded(log: str, recipe: str | None) -> Metre:
     metres = Metre(
         to_floats(found, "power_watt"), velocity,
         (to_floats(found, "end_z_m") - to_floats(found, "start_z_m")) / to_floats(found, "chord_m"),
-        to_floats(found, "mean_abs_yaw_rate_radps") / velocity, np.where(np.isfinite(command), command, 1.0),
+        to_floats(found, "mean_abs_yaw_rate_radps") / velocity, np.where(np.isfinite(command), command, velocity),
         to_floats(found, "duration_std_s"), to_floats(found, "energy_std_joule"), to_floats(found, "start_ns").astype(np.int64),
     )  # fmt: skip
     return metres.take(np.isfinite(metres.power + metres.velocity + metres.rise + metres.turn_radpm))
+
+
+def forget_speed(of: Metre) -> Metre | None:
+    """Return metres whose command is the track's own speed without it; None where one was commanded."""
+    is_known = not np.array_equal(of.command, of.velocity)
+    return None if is_known else replace(of, command=np.ones_like(of.command))
 
 
 def simulated(metres: int) -> Metre:
@@ -100,6 +113,11 @@ Predictor = Callable[[Metre], Floats]
 def by_mean(of: Metre) -> Predictor:
     energy, time = float((of.power / of.velocity).mean()), float((1.0 / of.velocity).mean())
     return lambda there: np.tile([energy / time, 1.0 / time], (len(there.power), 1))
+
+
+def by_mean_power(of: Metre) -> Predictor:
+    power, share = float(of.power.mean()), float((of.velocity / of.command).mean())
+    return lambda there: np.column_stack([np.full(len(there.power), power), share * there.command])
 
 
 def by_physics(of: Metre) -> Predictor:
@@ -127,7 +145,7 @@ def by_trees(of: Metre) -> Predictor:
     return lambda there: np.maximum(forest.predict(features(there)), [-np.inf, LEAST_VELOCITY_MPS])
 
 
-MODELS = {"mean": by_mean, "physics": by_physics, "boosted trees": by_trees}
+MODELS = {"mean": by_mean, "mean power": by_mean_power, "physics": by_physics, "boosted trees": by_trees}
 
 
 def _folds(count: int) -> NDArray[np.int64]:
@@ -190,49 +208,123 @@ UNITS = {"T": ("s", 3), "E": ("J", 0)}
 
 def lines(name: str, held_out: str, model: str, of: Metre, found: Told) -> Iterator[str]:
     """Yield the table's rows of a drive and a model."""
-    measured = {"T": 1.0 / of.velocity, "E": of.power / of.velocity}
-    for quantity in UNITS:
-        found_errors = compute_errors(found.said[quantity], measured[quantity], LEAST[quantity], found.spread[quantity])
-        yield _row(name, held_out, model, found_errors, quantity)
+    for quantity, measured in _measured(of).items():
+        spread = found.spread.get(quantity)
+        errors = compute_errors(found.said[quantity], measured, LEAST[quantity], spread)
+        yield _row((name, held_out, model), errors, quantity, float(np.std(measured)))
 
 
-def _row(name: str, held_out: str, model: str, of: Errors, quantity: str) -> str:
+def _measured(of: Metre) -> dict[str, Floats]:
+    """Return T and E of metres; no T where the speed is taken as known."""
+    energy = {"E": of.power / of.velocity}
+    return energy if np.array_equal(of.command, of.velocity) else {"T": 1.0 / of.velocity} | energy
+
+
+def own_mean(of: Metre) -> Told:
+    """Return the mean of each block, of itself."""
+    folds = _folds(len(of.power))
+    return Told(
+        {
+            name: np.array([value[folds == fold].mean() for fold in range(FOLDS)])[folds]
+            for name, value in _measured(of).items()
+        },
+        {},
+    )
+
+
+def _row(names: tuple[str, ...], of: Errors, quantity: str, scatter: float) -> str:
     unit, digits = UNITS[quantity]
+    assert of.rmse is not None, "no labels"
     mape = "–" if of.mape_percent is None else f"{of.mape_percent:.1f} ({of.mape_count} of {of.count})"
     scores = (
         ["–"] * 3 if of.nll is None else [f"{of.coverage_percent:.0f}", f"{of.nll:.2f}", f"{of.crps:.{digits}f} {unit}"]
     )
-    return "| " + " | ".join([name, held_out, model, quantity, f"{of.rmse:.{digits}f} {unit}", mape, *scores]) + " |"
+    r2 = f"{1.0 - (of.rmse / scatter) ** 2:.2f}"
+    return "| " + " | ".join([*names, quantity, f"{of.rmse:.{digits}f} {unit}", r2, mape, *scores]) + " |"
 
 
 def floor_lines(name: str, of: Metre) -> Iterator[str]:
     """Yield the rows of what the labels' own deviations make of a perfect prediction."""
-    measured, std = {"T": 1.0 / of.velocity, "E": of.power / of.velocity}, {"T": of.duration_std, "E": of.energy_std}
-    found = label_floor(std, measured, np.zeros(len(of.power), np.int64), {0: "unknown"})
-    for quantity in UNITS:
-        yield _row(name, "–", "floor: labels alone", found[quantity]["all"], quantity)
+    measured, std = _measured(of), {"T": of.duration_std, "E": of.energy_std}
+    found = label_floor(
+        {name: std[name] for name in measured}, measured, np.zeros(len(of.power), np.int64), {0: "unknown"}
+    )
+    for quantity in measured:
+        yield _row(
+            (name, "–", "floor: labels alone"), found[quantity]["all"], quantity, float(np.std(measured[quantity]))
+        )
+
+
+LEAST_METRES = 3
+"""Of a run, so that its mean counts."""
+
+
+def class_lines(store: Path) -> Iterator[str]:
+    """Yield the energy per metre by the class of the ground, and what the class tells of it."""
+    runs: dict[str, list[Floats]] = {}
+    for run in Store(store).runs():
+        found = run.segments()
+        means = [float(np.nanmean(to_floats(found, of))) for of in MEANS if found.num_rows >= LEAST_METRES]
+        if np.isfinite(means).all() and means:
+            runs.setdefault(run.run_id.split("_imu")[0], []).append(np.array([found.num_rows, *means]))
+    yield (
+        "| class | runs | metres | E, mean of runs ± between runs [J/m] | speed [m/s] | turning [rad/s] |\n"
+        + "|---" * 6
+        + "|"
+    )
+    for name, rows in sorted(runs.items()):
+        metres, energy, speed, turning = np.array(rows).T
+        between = f" ± {energy.std(ddof=1):.0f}" if len(rows) > 1 else ""
+        yield (
+            f"| {name} | {len(rows)} | {metres.sum():.0f} | {energy.mean():.0f}{between} | {speed.mean():.2f} | {turning.mean():.2f} |"
+        )
+    known = np.array([(at, *row[1:]) for at, rows in enumerate(runs.values()) if len(rows) > 1 for row in rows])
+    classes, energy, speed = known[:, 0, None] == np.unique(known[:, 0]), known[:, 1], known[:, [2]]
+    ones = np.ones_like(speed)
+    for name, columns in {
+        "mean": ones, "class": classes, "speed": np.hstack([ones, 1.0 / speed]), "class and speed": np.hstack([classes, 1.0 / speed])
+    }.items():  # fmt: skip
+        error = _leave_one_out(columns.astype(np.float64), energy)
+        r2 = 1.0 - np.mean(error**2) / np.var(energy)
+        yield f"E of a run by the others, {name}: RMSE {np.sqrt(np.mean(error**2)):.0f} J/m, R² {r2:.2f} ({len(energy)} runs)"
+
+
+MEANS = ("energy_joule", "velocity_mps", "mean_abs_yaw_rate_radps")
+
+
+def _leave_one_out(columns: Floats, values: Floats) -> Floats:
+    """Return the error of each value by least squares on the others."""
+    hat = columns @ np.linalg.pinv(columns)
+    return np.asarray((values - hat @ values) / (1.0 - np.diag(hat)))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("drives", nargs="+", metavar="DRIVE=LOG[,RECIPE]")
+    parser.add_argument("drives", nargs="*", metavar="DRIVE=LOG[,RECIPE]")
+    parser.add_argument("--classes", type=Path, metavar="STORE")
+    given = parser.parse_args()
+    if given.classes:
+        print(*class_lines(given.classes), sep="\n")
+        return
     drives = {}
-    for entry in parser.parse_args().drives:
+    for entry in given.drives:
         name, _, place = entry.partition("=")
         log, _, recipe = place.partition(",")
         drives[name] = recorded(log, recipe or None)
+    real = list(drives)
+    drives |= {f"{name}, speed unknown": of for name in real if (of := forget_speed(drives[name])) is not None}
     drives["simulated"] = simulated(max(len(of.power) for of in drives.values()))
     print(
-        "| drive | held out | model | of | RMSE | MAPE [%] (labels) | held by 90 % [%] | NLL [nat] | CRPS |\n"
-        + "|---" * 9
+        "| drive | held out | model | of | RMSE | R² | MAPE [%] (labels) | held by 90 % [%] | NLL [nat] | CRPS |\n"
+        + "|---" * 10
         + "|"
     )
     for name, of in drives.items():
         named = f"{name}, {len(of.power)} m"
         print(*floor_lines(named, of), sep="\n")
+        print(*lines(named, "blocks", "mean of the block itself", of, own_mean(of)), sep="\n")
         for model, fit in MODELS.items():
             print(*lines(named, "blocks", model, of, by_blocks(fit, of)), sep="\n", flush=True)
-    real = [name for name in drives if name != "simulated"]
     for name in real:
         for other in real:
             if other != name:

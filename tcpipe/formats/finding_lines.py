@@ -40,6 +40,8 @@ _DAMAGE: Mapping[str, str] = {
     "places_count": "{} places", "first_offset": "at byte {}", "lost_messages_count": "{} messages lost", "lost_bytes": "{} lost"
 }  # fmt: skip
 """Numbers that follow a line in brackets, where they are more than zero and the template lacks them."""
+_EVIDENCE = ("field", "wanted", "joints", "platforms")
+"""Names that do so."""
 _MOST_SUBJECTS = 3
 _DIGITS = 3
 _LARGEST_PLAIN = 1e6
@@ -73,7 +75,8 @@ def describe_finding(finding: Finding) -> str:
     missing = dict.fromkeys(entry.fields, "?")  # a redacted finding keeps only what is public
     line = entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
     numbers = finding.numbers.keys() - entry.fields
-    damage = [text.format(values[name]) for name, text in _DAMAGE.items() if name in numbers and finding.numbers[name]]
+    damage = [f"{name} {finding.names[name]}" for name in _EVIDENCE if name in finding.names.keys() - entry.fields]
+    damage += [text.format(values[name]) for name, text in _DAMAGE.items() if name in numbers and finding.numbers[name]]
     return f"{line} ({', '.join(damage)})" if damage else line
 
 

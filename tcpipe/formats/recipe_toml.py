@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import logging
 import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import Json, digest, to_plain
-from tcpipe.recipe import IngestSections, Recipe, TableMapping
+from tcpipe.recipe import IngestSections, Recipe, TableMapping, TimeWindow
 from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots import GENERIC, PowerSource, Profiles, Robot
 from tcpipe.tables.options import EARLIER_KEYS, REMOVED_KEYS
@@ -53,13 +54,37 @@ def load_recipe(path: Path | None) -> Recipe:
             data = stream.read(_MOST_BYTES + 1)
         if len(data) > _MOST_BYTES:
             raise RecipeError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, which no recipe is")
-        return parse_recipe(parse_toml(data.decode("utf-8")), where=str(path))
+        return _add_windows(parse_recipe(parse_toml(data.decode("utf-8")), where=str(path)), path)
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path}: the recipe cannot be read ({getattr(error, 'strerror', None) or error})") from None
     except RecursionError:
         raise RecipeError(f"{path}: not a recipe: its values are nested too deep") from None
     except ValueError as error:  # no TOML, or a number of thousands of digits
         raise RecipeError(f"{path}: not valid TOML: {error}") from None
+
+
+def _add_windows(recipe: Recipe, path: Path) -> Recipe:
+    """Return the recipe with the time windows of its CSV file, which it names no more."""
+    if not recipe.mask.windows_csv:
+        return recipe
+    file = path.parent / recipe.mask.windows_csv
+    windows = list(recipe.mask.windows)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RecipeError(f"{path}: mask.windows_csv: {file} cannot be read ({error.strerror})") from None
+    for number, row in enumerate(csv.DictReader(text.splitlines()), 2):
+        cells = {str(name).strip(): str(value).strip() for name, value in row.items() if value}
+        given = {name: value if name == "run" else _read_cell(value) for name, value in cells.items() if value}
+        windows.append(from_values(TimeWindow, given, where=f"{file}, line {number}"))
+    return replace(recipe, mask=replace(recipe.mask, windows=windows, windows_csv=None))
+
+
+def _read_cell(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
+from tcpipe.power.joints import Columns, JointPower
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
     REJECTED,
-    Columns,
     Floats,
     HuskyPower,
     RailReadings,
@@ -24,7 +25,7 @@ from tcpipe.power.sources import (
     sign_by_mean,
 )
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots import CurrentSign, PowerSource
+from tcpipe.robots import GAIN_STD_FRACTION, LOSS_STD_FRACTION, TORQUE_GAIN_STD_FRACTION, CurrentSign, PowerSource
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
 
 _LOG_TIME = "log_time_ns"
@@ -80,6 +81,7 @@ def read_power(
     rejected: list[Finding] = []
     scaled: dict[str, list[PowerSource]] = {}
     findings: list[Finding] = []
+    gains: list[float] = []
     for topic, (type_name, columns) in topics.items():
         if too_few := _find_too_few(topic, np.asarray(columns[_LOG_TIME], np.float64)):
             rejected += too_few
@@ -94,6 +96,7 @@ def read_power(
             continue
         sources += found.sources
         findings += found.findings
+        gains += [_find_gain_std(of, rail.joints) for of, rail in zip(found.sources, found.rails, strict=True)]
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
     rejected = rejected or _find_incomplete(rails)
@@ -103,7 +106,8 @@ def read_power(
         return PowerReadings(findings=tuple(rejected))
     rails, odd = _exclude_implausible(rails)
     log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
-    sign, of_sign, told_by = _sign(rails, log_times, sources, current_sign)
+    given: CurrentSign = "auto" if any(of.joints for of in sources) else current_sign
+    sign, of_sign, told_by = _sign(rails, log_times, sources, given)
     if sign == 0:
         return PowerReadings(findings=of_sign)
     includes = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
@@ -121,15 +125,10 @@ def read_power(
         tuple(dict.fromkeys(findings)),
         told_by,
         includes,
-        gain_std_fraction=max(
-            float(
-                np.hypot(
-                    of.gain_std_fraction, 0.0 if of.nominal_voltage_volt is None else of.nominal_voltage_std_fraction
-                )
-            )
-            for of in sources
+        gain_std_fraction=max(gains),
+        offset_std_amp=max(
+            0.0 if of.joints else of.offset_std_watt if of.lacks_voltage else of.offset_std_amp for of in sources
         ),
-        offset_std_amp=max(of.offset_std_watt if of.lacks_voltage else of.offset_std_amp for of in sources),
         rest_current_amp=(min(of[0] for of in rest), max(of[1] for of in rest))
         if rest and len(rest) == sum(bool(of.current or of.energy) for of in sources)
         else None,
@@ -155,7 +154,7 @@ class _TopicRails:
     def apply_type_signs(self) -> list[RailReadings]:
         """Return the rails with the sign that their type gives a drawn current."""
         each = zip(self.rails, self.sources, strict=True)
-        return [apply_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in each]
+        return [apply_sign(rail, -1 if of.sign == "drawn_negative" and not of.joints else 1) for rail, of in each]
 
 
 def _read_first_valid(
@@ -174,9 +173,25 @@ def _read_first_valid(
             rejected += problems
             continue
         used = " + ".join(rail.name for rail in rails)
+        findings += [_find_joints(rail.joints) for rail in rails if rail.joints]
         findings += [make_finding("power-fallback", why.subject, names={**why.names, "used": used}) for why in rejected]
         return _TopicRails(sources, rails, findings)
     return rejected
+
+
+def _find_gain_std(source: PowerSource, joints: JointPower | None) -> float:
+    """Return the σ of a rail's gain; an error of torques changes their loss twice as much."""
+    loss = joints.loss_fraction if joints else 0.0
+    usual = TORQUE_GAIN_STD_FRACTION if joints else GAIN_STD_FRACTION
+    stated = usual if source.gain_std_fraction is None else source.gain_std_fraction
+    nominal = 0.0 if source.nominal_voltage_volt is None else source.nominal_voltage_std_fraction
+    return math.hypot(stated * (1.0 + loss), LOSS_STD_FRACTION * loss, nominal)
+
+
+def _find_joints(joints: JointPower) -> Finding:
+    """Return the finding that power is mechanical."""
+    names, loss, returned = {"joints": ", ".join(joints.names)}, joints.loss_fraction, joints.returned_fraction
+    return make_finding("power-from-joints", _POWER, names=names, loss_fraction=loss, returned_fraction=returned)
 
 
 def _convert_thousandths(
@@ -296,7 +311,7 @@ def _sign(
         return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
     time_s, whole = _sum_currents(rails, log_times)
     sign, net = sign_by_mean(whole, _weight_s(time_s))
-    signs = {source.sign for source in sources}
+    signs = {"drawn_positive" if of.joints else of.sign for of in sources}
     if "auto" not in signs:
         told, other = "drawn_positive", "drawn_negative"
         if signs == {other}:

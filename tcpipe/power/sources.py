@@ -7,6 +7,7 @@ ports is never part of it where the message tells them apart (paper, section IV-
 from __future__ import annotations
 
 import re
+from collections import Counter as Counts
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -14,11 +15,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.power.joints import NAMES, SPEED, TORQUE, Columns, JointPower, compute_joint_power, select_joints
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
-Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 HuskyPower = Literal["battery", "drivers"]
 
@@ -42,6 +43,7 @@ class RailReadings:
     voltage_volt: Floats
     current_amp: Floats
     counter: Counter | None = None
+    joints: JointPower | None = None
 
     @property
     def largest_amp(self) -> float:
@@ -84,9 +86,11 @@ def find_sources(
 
 
 def list_power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
-    """Return the columns inside lists of messages that a type's tables name, as drivers[].current."""
-    texts = [text for of in known if of.type == type_name for text in (of.voltage, of.current, of.power, of.energy)]
-    return frozenset(of.column for text in texts for of in parse_fields(text) if "[]." in of.column)
+    """Return the columns inside lists of messages that a type's tables name, as drivers[].current, and the names of joints."""
+    mine = [of for of in known if of.type == type_name]
+    texts = [text for of in mine for text in (of.voltage, of.current, of.power, of.energy)]
+    numbers = {of.column for text in texts for of in parse_fields(text) if "[]." in of.column}
+    return frozenset(numbers | ({NAMES} if any(of.joints for of in mine) else set()))
 
 
 def _select_most_specific(fitting: Sequence[PowerSource]) -> list[PowerSource]:
@@ -153,11 +157,42 @@ def read_rails(
     for source in sources:
         if found := _find_misfit(columns, source, topic, known):
             return found
-    return [_read_rail(columns, source, topic) for source in sources]
+    rails = []
+    for source in sources:
+        rail = _read_joints(columns, source, topic) if source.joints else _read_rail(columns, source, topic)
+        if isinstance(rail, Finding):
+            return rail
+        rails.append(rail)
+    joints = Counts(name for rail in rails if rail.joints for name in rail.joints.names)
+    if twice := [name for name, count in joints.items() if count > 1]:
+        return reject_power(topic, "joint-in-two-tables", names={"joints": ", ".join(twice)})
+    return rails
+
+
+def _read_joints(columns: Columns, source: PowerSource, topic: str) -> RailReadings | Finding:
+    """Return the power of a source's joints, or why there is none; torques against the motion have the wrong sign."""
+    motion = select_joints(columns, source)
+    if not motion.names:
+        there = ", ".join(np.unique(columns[NAMES]).tolist())
+        return reject_power(topic, "no-joint", names={"wanted": source.joints, "joints": there})
+    for reason, values in (("no-effort", motion.torque_nm), ("no-velocity", motion.speed_radps)):
+        if lacking := [name for name, of in zip(motion.names, values.T, strict=True) if np.isnan(of).all()]:
+            return reject_power(topic, reason, names={"joints": ", ".join(lacking)})
+    watt = (motion.torque_nm * motion.speed_radps).sum(axis=1)
+    if np.isnan(watt).all():
+        return reject_power(topic, "joints-apart", names={"joints": ", ".join(motion.names)})
+    told, net = sign_by_mean(watt, np.ones(len(watt)))
+    sign = {"drawn_positive": 1, "drawn_negative": -1, "auto": told}[source.sign]
+    if not sign or told == -sign:
+        return reject_power(topic, "torque-against-motion" if sign else "sign-unknown", net_fraction=abs(net))
+    found = compute_joint_power(motion, source, sign=sign)
+    return RailReadings(source.rail or topic, np.full(len(watt), UNIT_VOLT), found.watt, joints=found)
 
 
 def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Sequence[PowerSource]) -> Finding | None:
     """Return why messages do not fit a source."""
+    if source.joints and (lacking := [name for name in (NAMES, SPEED, TORQUE) if name not in columns]):
+        return reject_power(topic, "field-missing", names={"field": ", ".join(lacking).replace("[]", "")})
     currents = parse_fields(source.current)
     others = (source.voltage, source.power, source.energy)
     for of in [*currents, *(of for text in others for of in parse_fields(text))]:

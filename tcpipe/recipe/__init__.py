@@ -15,6 +15,7 @@ from tcpipe.recipe.sections import (
     SegmentConfig,
     SplitConfig,
     TableMapping,
+    TimeWindow,
 )
 
 __all__ = [
@@ -32,4 +33,5 @@ __all__ = [
     "SegmentConfig",
     "SplitConfig",
     "TableMapping",
+    "TimeWindow",
 ]

@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
+from datetime import datetime
 from functools import cache
 from itertools import pairwise
 from math import isfinite
@@ -149,7 +150,7 @@ def as_toml(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_make_key(str(name))} = {as_toml(item)}" for name, item in value.items()) + "}"
     if is_dataclass(value) and not isinstance(value, type):
-        return as_toml(asdict(value))
+        return as_toml({name: of for name, of in asdict(value).items() if of is not None})
     if isinstance(value, int) and value.bit_length() > _DECIMAL_BITS:
         return hex(value)
     return repr(value)
@@ -185,6 +186,8 @@ def _to_plain(value: Any) -> Any:
             return int(value) if value.is_integer() else value
         case str():
             return str.__str__(value)
+        case datetime():  # a time as TOML has it
+            return value.isoformat()
         case list() | tuple():
             return [_to_plain(item) for item in value]
         case float() | set() | frozenset():

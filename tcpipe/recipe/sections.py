@@ -8,7 +8,9 @@ A bound is where a value can mean nothing any more, or costs without end: it is 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from typing import Annotated, Literal
 
 from tcpipe.recipe.checking import validate_fields
@@ -137,6 +139,40 @@ class FuseConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class TimeWindow:
+    """A span of a run that is kept, and nothing beside such spans, or dropped."""
+
+    run: str = "*"
+    """Pattern of the runs: the name of the log, or a run_id; * is any text."""
+    action: Literal["drop", "keep"] = "drop"
+    """Whether the span is dropped or kept."""
+    start: Offset | str | None = None
+    """Seconds from the start of the track, or UTC as "2025-11-18T21:40:00"; default: its start."""
+    end: Offset | str | None = None
+    """The same; default: the end of the track."""
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Yield each key whose value cannot be, and what was wanted."""
+        for key in ("start", "end"):
+            try:
+                _find_ns(getattr(self, key), 0, 0)
+            except ValueError:
+                yield key, "seconds, or UTC as 2025-11-18T21:40:00"
+
+    def find_bounds_ns(self, first_ns: int) -> tuple[int, int]:
+        """Return start and end [ns] in a track that starts at ``first_ns``."""
+        return _find_ns(self.start, first_ns, -(2**62)), _find_ns(self.end, first_ns, 2**62)
+
+
+def _find_ns(at: float | str | None, first_ns: int, default_ns: int) -> int:
+    if isinstance(at, str):
+        moment = datetime.fromisoformat(at)
+        since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+        return 1000 * (since // timedelta(microseconds=1))
+    return default_ns if at is None else first_ns + round(at * 1e9)
+
+
+@dataclass(frozen=True, slots=True)
 class MaskConfig:
     """Limits of steady driving; all other rows are masked, never deleted."""
 
@@ -180,6 +216,10 @@ class MaskConfig:
     """Keep sections driven backwards."""
     max_relative_position_std_m: Deviation = 0.10
     """A section is a gap where the standard deviation of the distance over one chord exceeds this [m]."""
+    windows: list[TimeWindow] = field(default_factory=list, metadata=LEFT_OUT)
+    """Spans of runs that are kept or dropped, as {run = "farm_*", action = "drop", start = 0, end = 30}."""
+    windows_csv: str | None = field(default=None, metadata=LEFT_OUT)
+    """More of them: a CSV file beside the recipe, with columns run, action, start, end."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "mask")

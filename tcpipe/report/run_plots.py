@@ -238,6 +238,7 @@ REASON_WORDS = {
     DropReason.REVERSING: "driving backwards",
     DropReason.ACCELERATING: "the speed changes",
     DropReason.BELOW_FULL_SPEED: "commanded below full speed: the terrain does not limit the speed",
+    DropReason.TIME_WINDOW: "outside the recipe's time windows",
 }
 """Why a row of the track is not used."""
 

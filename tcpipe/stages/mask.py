@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from tcpipe.motion import masks
 from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
 from tcpipe.motion.row_sections import Floats, Mask, MotionRows, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m, find_common_scale_std
-from tcpipe.recipe import MaskConfig
+from tcpipe.recipe import MaskConfig, TimeWindow
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.tables.bits import DropReason, flag_name
@@ -66,6 +68,8 @@ def mask_track(
             rows, limit_mps=slowest, window_s=config.command_window_s
         )
     dropped_by = np.bitwise_or.reduce([np.uint32(reason) * mask for reason, mask in found.items()])
+    outside, window_findings = find_outside_windows(track, config.windows)
+    dropped_by = np.where(outside, np.uint32(DropReason.TIME_WINDOW), dropped_by)
     facts = MaskFacts(
         rows=table.num_rows,
         rows_kept=int((dropped_by == 0).sum()),
@@ -75,8 +79,25 @@ def mask_track(
         full_speed_mps=slowest,
     )
     masked = MASKED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
-    findings = (*gap_findings, *find_limits(rows, dropped_by, limit, config))
+    findings = (*gap_findings, *window_findings, *find_limits(rows, dropped_by, limit, config))
     return MaskedTrack(masked, add_findings(track.info, findings, replace(track.info.report.facts, mask=facts)))
+
+
+def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[Mask, tuple[Finding, ...]]:
+    """Return the rows that windows of this run drop, or do not keep where some keep, and the finding on windows without a row."""
+    stamp_ns, run_id = to_integers(track.table, "stamp_ns"), track.info.run_id
+    dropped, kept, empty = np.zeros(len(stamp_ns), np.bool_), np.zeros(len(stamp_ns), np.bool_), 0
+    names = (run_id, run_id.rpartition("-")[0])
+    mine = [of for of in windows if len(stamp_ns) and any(fnmatchcase(name, of.run) for name in names)]
+    for window in mine:
+        start_ns, end_ns = window.find_bounds_ns(int(stamp_ns[0]))
+        inside = (stamp_ns >= start_ns) & (stamp_ns < end_ns)
+        empty += not inside.any()
+        (dropped if window.action == "drop" else kept)[inside] = True
+    if any(of.action == "keep" for of in mine):
+        dropped |= ~kept
+    subject = Subject("run", run_id)
+    return dropped, (make_finding("time-window-empty", subject, windows_count=empty),) if empty else ()
 
 
 def _find_motion_reasons(rows: MotionRows, config: MaskConfig) -> dict[DropReason, Mask]:

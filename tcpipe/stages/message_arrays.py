@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +17,8 @@ from tcpipe.power.rails import Rail, make_rail, make_samples
 from tcpipe.tables.arrays import select_rows, to_numbers, to_texts
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import Streams
+
+T = TypeVar("T", bound=np.generic)
 
 
 class LogReader(Protocol):
@@ -39,7 +41,8 @@ class LogReader(Protocol):
 def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str, NDArray[Any]]:
     """Return a table's columns: numbers as they are, texts as str, lists of numbers as (N, k) with NaN where a row is shorter.
 
-    Of lists of messages only the numbers are read that ``in_lists`` names, as ``drivers[].current``: those are (N, k) as well.
+    Of lists of messages only the numbers are read that ``in_lists`` names, as ``drivers[].current``, and of lists of texts those that it
+    names, as ``name[]`` (128 letters, "" where a row is shorter): they are (N, k) as well.
     """
     found: dict[str, NDArray[Any]] = {}
     for name in table.column_names:
@@ -52,11 +55,12 @@ def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict
         elif _is_list(kind) and _is_number(kind.value_type):
             found[name] = _make_matrix(array)
     for path in in_lists:
-        name, _, inner = path.partition("[].")
-        if (
-            name in table.column_names
-            and (values := _read_nested(_combine_chunks(table.column(name)), inner.split("."))) is not None
-        ):
+        name, _, inner = path.partition("[]")
+        if name not in table.column_names:
+            continue
+        lists = _combine_chunks(table.column(name))
+        values = _read_nested(lists, inner[1:].split(".")) if inner else _read_text_lists(lists)
+        if values is not None:
             found[path] = values
     return found
 
@@ -74,6 +78,14 @@ def _read_nested(lists: pa.Array, path: list[str]) -> NDArray[np.float64] | None
     return _fill_nulls(
         to_numbers(pc.list_value_length(lists)).astype(np.int64), pc.struct_field(pc.list_flatten(lists), path)
     )
+
+
+def _read_text_lists(lists: pa.Array) -> NDArray[np.str_] | None:
+    """Return lists of texts, shape (N, k); None where they are no texts."""
+    if not _is_list(lists.type) or not pa.types.is_string(lists.type.value_type):
+        return None
+    lengths = to_numbers(pc.list_value_length(lists)).astype(np.int64)
+    return _fill_rows(lengths, to_texts(pc.utf8_slice_codeunits(pc.list_flatten(lists), 0, 128)), "")
 
 
 def _combine_chunks(column: pa.ChunkedArray) -> pa.Array:
@@ -97,10 +109,14 @@ def _make_matrix(lists: pa.Array) -> NDArray[np.float64]:
 
 
 def _fill_nulls(lengths: NDArray[np.int64], flat: pa.Array) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = to_numbers(flat).astype(np.float64, copy=False)
+    return _fill_rows(lengths, to_numbers(flat).astype(np.float64, copy=False), np.nan)
+
+
+def _fill_rows(lengths: NDArray[np.int64], values: NDArray[T], empty: float | str) -> NDArray[T]:
+    """Return values of lists, one after the other, as a row a list, shape (N, k); ``empty`` where one is shorter than the longest."""
     if len(lengths) and lengths.min() == lengths.max():
-        return values.reshape(len(lengths), -1)
-    matrix = np.full((len(lengths), int(lengths.max(initial=0))), np.nan)
+        return values.reshape(len(lengths), int(lengths[0]))
+    matrix = np.full((len(lengths), int(lengths.max(initial=0))), empty, values.dtype)
     matrix[np.arange(matrix.shape[1]) < lengths[:, None]] = values
     return matrix
 
@@ -154,7 +170,8 @@ def _compact_column(values: NDArray[Any]) -> NDArray[Any]:
     row_bytes = values[:1].nbytes
     if len(values) < 2 or not row_bytes:
         return values.copy()
-    bits = values.reshape(-1).view(np.uint64 if row_bytes % 8 == 0 else np.uint8).reshape(len(values), -1)
+    octets = values.reshape(-1).view(np.uint8)  # of a text of 17 letters no view as numbers of 8 bytes
+    bits = octets.view(np.uint64 if row_bytes % 8 == 0 else np.uint8).reshape(len(values), -1)
     if np.array_equal(bits[0], bits[-1]) and (bits == bits[0]).all():
         return np.broadcast_to(values[0].copy(), values.shape)
     return values.copy()
@@ -167,7 +184,7 @@ def _join_columns(parts: list[Arrays]) -> Arrays:
 
 
 def _concatenate_column(pieces: list[NDArray[Any]]) -> NDArray[Any]:
-    """Return pieces of one column as one; rows of lists that are shorter than the longest are filled up with NaN."""
+    """Return pieces of one column as one; rows of lists that are shorter than the longest are filled up."""
     if len(pieces) == 1:
         return pieces[0]
     first = pieces[0][0]
@@ -178,7 +195,8 @@ def _concatenate_column(pieces: list[NDArray[Any]]) -> NDArray[Any]:
     if first.ndim:
         widest = max(piece.shape[1] for piece in pieces)
         fill = [((0, 0), (0, widest - piece.shape[1])) for piece in pieces]
-        pieces = [np.pad(p, f, constant_values=np.nan) if f[1][1] else p for p, f in zip(pieces, fill, strict=True)]
+        empty = np.nan if first.dtype.kind == "f" else ""
+        pieces = [np.pad(p, f, constant_values=empty) if f[1][1] else p for p, f in zip(pieces, fill, strict=True)]
     return np.concatenate(pieces)
 
 

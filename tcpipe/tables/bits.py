@@ -32,6 +32,8 @@ class DropReason(IntFlag):
     """A commanded change of speed (2 s after it), or, without commands, |dv/dt| > 0.3 m/s² for 0.2 s; start and stop ramps."""
     BELOW_FULL_SPEED = 1 << 6
     """Commanded below 0.95 of the robot's maximum: the terrain does not limit the speed."""
+    TIME_WINDOW = 1 << 7
+    """Outside the time windows of the recipe (`mask.windows`); no other reason counts there."""
 
 
 class Quality(IntFlag):

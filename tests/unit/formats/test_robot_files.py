@@ -87,7 +87,7 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
         'power_sources.1.current is "i["; expected fields joined by +',
         "power_sources.2.current",
         'power_sources.3.sign is "plus"; expected one of auto',
-        'power_sources.4.energy is "e"; expected a voltage besides it, and no current',
+        'power_sources.4.current is "i"; expected one of current, power, energy and joints',
         'power_sources.5.unsupported_reason is "tells phases"; expected no field besides it',
     ]
     assert len(said) == len(keys)

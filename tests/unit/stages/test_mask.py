@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from made_tracks import make_track, stamps, straight_track
 
-from tcpipe.errors import FusionError
-from tcpipe.recipe import MaskConfig, SegmentConfig
+from tcpipe.errors import FusionError, RecipeError
+from tcpipe.formats.recipe_toml import ingest_key, load_recipe
+from tcpipe.recipe import MaskConfig, SegmentConfig, TimeWindow
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
@@ -212,3 +213,62 @@ def test_a_run_that_is_mostly_faster_than_plausible_is_refused():
     with pytest.raises(FusionError) as error:  # the recipe's goes first
         mask_track(track, MaskConfig(max_plausible_mps=20.0), **robot, max_plausible_mps=1e4)
     assert error.value.findings[0].numbers["limit_mps"] == 20.0
+
+
+def windows(*given):
+    return MaskConfig(windows=[TimeWindow(*of) for of in given])
+
+
+def test_time_windows_keep_and_drop_metres_with_a_reason_of_their_own():
+    track = straight_track(np.full(T.size, 0.5))
+    run, utc = (
+        track.info.run_id,
+        (np.datetime64(int(track.table["stamp_ns"][0].as_py()), "ns") + np.timedelta64(40, "s")),
+    )
+    masked = gate(
+        track, config=windows((run, "keep", 10.0, 50.0), ("*", "drop", 20.0, 30), ("*", "drop", str(utc)[:19], None))
+    )
+    t = (track.table["stamp_ns"].to_numpy() - track.table["stamp_ns"][0].as_py()) / 1e9
+    wanted = (t < 10) | ((t >= 20) & (t < 30)) | (t >= 40)
+    assert (rows_of(masked, DropReason.TIME_WINDOW) == wanted).all()
+    lost = segment_track(masked, SegmentConfig()).distance_by_reason_m
+    assert lost["time_window"] == pytest.approx(0.5 * wanted.sum() * 0.05, abs=0.2)
+    assert lost["kept"] + lost["leftover"] + lost["time_window"] == pytest.approx(30.0, abs=0.05)
+
+
+def test_a_window_goes_before_every_other_reason_and_others_runs_do_not_count():
+    standing = straight_track(np.zeros(T.size))
+    masked = gate(standing, config=windows(("*", "drop", None, 20)))
+    assert masked.table["dropped_by"].to_pylist()[:400] == [int(DropReason.TIME_WINDOW)] * 400
+    assert rows_of(masked, DropReason.STATIONARY)[401:].all()
+    other = gate(standing, config=windows(("another*", "keep", 0, 1)))
+    assert not rows_of(other, DropReason.TIME_WINDOW).any()
+    assert "time-window-empty" in codes_of(gate(standing, config=windows(("*", "drop", 900, 950))))
+
+
+def test_windows_of_a_csv_file_are_those_of_the_recipe(tmp_path):
+    (tmp_path / "tcpipe.toml").write_text(
+        "[mask]\nwindows_csv = 'windows.csv'\nwindows = [{run = 'a', start = 2025-11-18T21:40:00Z}]\n"
+    )
+    (tmp_path / "windows.csv").write_text("run, action,start,end\nfield_*,keep,12.5,\nb,drop,,2025-11-18 21:40:00\n")
+    found = load_recipe(tmp_path / "tcpipe.toml")
+    utc = "2025-11-18T21:40:00+00:00"
+    assert found.mask.windows == [
+        TimeWindow("a", "drop", utc), TimeWindow("field_*", "keep", 12.5), TimeWindow("b", "drop", None, "2025-11-18 21:40:00"),
+    ]  # fmt: skip
+    assert (
+        found.mask.windows[0].find_bounds_ns(5)[0] == found.mask.windows[2].find_bounds_ns(5)[1] == 1763502000 * 10**9
+    )
+    before = ingest_key(found)
+    (tmp_path / "windows.csv").write_text("run,action,start,end\nfield_*,keep,12.6,\n")
+    assert ingest_key(load_recipe(tmp_path / "tcpipe.toml")) != before
+    (tmp_path / "windows.csv").write_text("run,action,start,end\nb,skip,soon,1\n")
+    with pytest.raises(RecipeError) as caught:
+        load_recipe(tmp_path / "tcpipe.toml")
+    assert "windows.csv, line 2: action is" in caught.value.problems[0]
+    (tmp_path / "windows.csv").write_text("run,action,start,end\nb,drop,soon,1\n")
+    with pytest.raises(RecipeError, match="seconds, or UTC"):
+        load_recipe(tmp_path / "tcpipe.toml")
+    (tmp_path / "windows.csv").unlink()
+    with pytest.raises(RecipeError, match="cannot be read"):
+        load_recipe(tmp_path / "tcpipe.toml")

@@ -104,7 +104,7 @@ def test_the_ledger_accounts_for_every_metre_once(seed):
     ledger = segments.distance_by_reason_m
     assert list(ledger) == [
         *("kept", "gap", "stationary", "stuck", "turning_in_place", "reversing", "accelerating", "below_full_speed"),
-        *("curved", "leftover"),
+        *("time_window", "curved", "leftover"),
     ]
     assert ledger["kept"] == pytest.approx(to_floats(segments.table, "arc_length_m").sum(), rel=1e-12)
     # Independent odometer: a fine polygon through every row's Hermite cubic, straight lines where stamps or epochs break.
