@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.logs.table_log import TableLog
+from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
 from tcpipe.pipeline.proposals import propose_recipe
 
@@ -48,7 +48,7 @@ def test_stamps_since_1970_go_before_those_from_the_start_and_texts_cut_to_secon
     assert values["tables"]["gnss"]["stamp"] == "timestamp (ns)"
     assert values["tables"]["gnss"]["columns"]["altitude"] == "alt_msl"
     assert values["tables"]["power"] == {"file": "b/power.csv", "stamp": "stamp_ns", "columns": {"power": "Power (w)"}}
-    topics = TableLog(tmp_path, recipe.tables).topics
+    topics = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables).topics
     assert {name: topic.message_count for name, topic in topics.items()} == {"/gnss": ROWS, "/power": ROWS}
 
 
