@@ -26,7 +26,7 @@ from tcpipe.recipe.suggestions import (
     ProposedLine,
     ProposedRecipe,
     format_first,
-    propose_extrinsics,
+    propose_decisions,
     propose_lines,
     propose_quality,
 )
@@ -35,6 +35,7 @@ from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read_roles import decide_roles
 from tcpipe.stages.read_sources import place_frames
+from tcpipe.store import is_store
 from tcpipe.tables.findings import Finding
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ def propose_recipe(
     LogError, UsageError : there is nothing to read.
     """
     path = path if is_url(path) else Path(path)
+    if isinstance(path, Path) and (is_store(path) or (path / "dataset.json").is_file()):
+        raise UsageError(f"{path}: tcpipe wrote this; expected a log or a folder of tables")
     if isinstance(path, Path) and (is_table(path.name) or (path.is_dir() and not is_one_bag(path))):
         logs = list_logs_below(path) if path.is_dir() else []
         if not logs:
@@ -106,8 +109,12 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
         if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
             fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
             lines += [propose_quality("read.fields", "gnss.quality", of) for of in fields]
-    unplaced = [(role, frames[role]) for role, (_, by) in places.items() if by == "assumed"]
-    return ProposedRecipe([*head, "", "These need no line."], [*lines, *propose_extrinsics(unplaced)], path)
+    unplaced = [
+        (role, frames[role]) for role, (_, by) in places.items() if by == "assumed" and role != "wheel_odometry"
+    ]
+    return ProposedRecipe(
+        [*head, "", "These need no line."], [*lines, *propose_decisions(unplaced, [*decided, *used.values()])], path
+    )
 
 
 def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterator[ProposedLine]:

@@ -125,3 +125,23 @@ def test_a_folder_without_known_names_says_so(tmp_path):
     write(tmp_path / "notes.csv", week=SECONDS, done=1.0)
     with pytest.raises(UsageError, match="no table with columns of known names"):
         propose_recipe(tmp_path)
+
+
+def test_what_tcpipe_wrote_is_no_table(tmp_path):
+    write(tmp_path / "samples.csv", time=SECONDS + UTC_S, **FIXES)
+    (tmp_path / "dataset.json").write_text("{}")
+    with pytest.raises(UsageError, match="tcpipe wrote this"):
+        propose_recipe(tmp_path)
+
+
+def test_tables_of_two_drives_are_not_mixed(tmp_path):
+    write(tmp_path / "gps.csv", time=np.arange(ROWS) + UTC_S, **FIXES)
+    write(
+        tmp_path / "other" / "log.csv",
+        time=np.arange(ROWS) + UTC_S + 9e5,
+        battery_voltage=24.0 + SECONDS,
+        battery_current=2.0 + SECONDS,
+    )
+    values, _, text = proposed(tmp_path)
+    assert set(values["tables"]) == {"gnss"}
+    assert "no time in common" in text
