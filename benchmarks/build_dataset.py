@@ -1,6 +1,7 @@
 """Building a dataset against the sum of its floors: decode each map tile once, gather nearest pixels, encode and write each chunk.
 
     python benchmarks/build_dataset.py DIRECTORY [SAMPLES …]
+    python benchmarks/build_dataset.py DIRECTORY memory [SAMPLES …]    builds of patches of 4 x 4 pixels: memory that each sample adds
 
 Default 10,886 samples (the paper's) and 1,000,000. The directory keeps map and stores (`big_store`). CPU time of one process after a
 first small build (kernels loaded), the best of `REPEATS` builds of a small dataset, one of a large; memory as sampled 20 times a second:
@@ -9,10 +10,13 @@ anonymous, and with mapped files that the system can drop. Tiles are counted as 
 
 import os
 import shutil
+import subprocess
 import sys
 import threading
 import time
 from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +26,7 @@ from sample_patches import gather
 from tcpipe.formats.dataset_files import CHUNK_ROWS, open_patches, read_card
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.pipeline.dataset import build, content
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import Recipe, SampleConfig
 
 LAYERS = ("ortho", "terrain", "height")
 FEW = 40
@@ -177,13 +181,41 @@ def measure(directory, samples):
     shutil.rmtree(out)
 
 
+def measure_memory(directory, counts):
+    """Print the largest anonymous memory of builds, each in a process of its own, and what each sample between two of them adds."""
+    peaks = []
+    for count in counts:
+        store_of(directory, count)
+        command = [sys.executable, __file__, str(directory), "one", str(count)]
+        said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+        peaks.append((count, int(said.split()[-1])))
+        print(f"{count} samples: {peaks[-1][1] / 1e6:.1f} MB at most", flush=True)
+    for (fewer, before), (more, after) in pairwise(peaks):
+        print(f"from {fewer} to {more} samples: {(after - before) / (more - fewer):.0f} bytes a sample")
+
+
+def build_one(directory, count):
+    """Build once, and print the largest anonymous memory [byte]."""
+    out, recipe = directory / f"built-{count}", replace(Recipe(), sample=SampleConfig(patch_px=4))
+    threading.Thread(target=watch, daemon=True).start()
+    build.build_dataset(out, store=store_of(directory, count).root, recipe=recipe)
+    shutil.rmtree(out)
+    print(peak["RssAnon"] * 1024)
+
+
 def main():
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    directory, what = Path(sys.argv[1]), sys.argv[2:3]
+    if what == ["memory"]:
+        measure_memory(directory, [int(count) for count in sys.argv[3:] or ("200000", "1000000")])
+        return
+    if what == ["one"]:
+        build_one(directory, int(sys.argv[3]))
+        return
     timed(content, "sample_all_segments")
     timed(build, "write_patches")
     counted()
     threading.Thread(target=watch, daemon=True).start()
-    directory = Path(sys.argv[1])
     built(store_of(directory, SMALL), directory / "first")
     for samples in map(int, sys.argv[2:] or ("10886", "1000000")):
         measure(directory, samples)

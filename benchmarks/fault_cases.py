@@ -31,7 +31,8 @@ FROM, TO = "15.434471784,47.069643821", "15.434788601,47.069732605"
 class Case:
     """One call, what was called before it, and which inputs it wants: ``log``, ``world`` (rasters and a store), ``model``, ``old`` store.
 
-    What it writes lies in its directory, or below ``url``; a Dask cluster does its work where it wants ``cluster``.
+    What it writes lies in its directory, or below ``url``; a Dask cluster does its work where it wants ``cluster``. Steps are those of its
+    ``workers`` where it has some to be killed, each a process that `fault_workers` watches.
     """
 
     name: str
@@ -41,6 +42,14 @@ class Case:
     url: str = ""
     extra_features: Run | None = None
     """What else is done at the same time where two things are; None: the same."""
+    partner: Run | None = None
+    """Another task of its array, which runs when this one is killed, and has to finish what this one began."""
+    has_workers: bool = False
+
+    @property
+    def steps_in(self) -> str:
+        """Return where steps are counted: ``workers``, ``bucket`` or ``disk``."""
+        return "workers" if self.has_workers else "bucket" if self.url else "disk"
 
 
 def _as_command(run: Run) -> Run:
@@ -100,7 +109,44 @@ _FORCED_THERE = command("build-dataset", f"{URL}/dataset", *_BUILD[1:], "--seed"
 _OTHER_RUN = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q")
 _AT_ONCE = ("--min-age", "0")
 """What a killed prune left goes with the next one where it is a day old; here it is not."""
-_MIGRATE = ("migrate", f"{INPUTS}/old/store")
+_OLD_STORE = f"{INPUTS}/old/store"
+_ARRAY_TASK, _OTHER_TASK = (command("ingest", f"{INPUTS}/logs", *_THERE, "--shard", f"{n}/2") for n in (1, 2))
+
+
+def _copy(store: str, to: str) -> Run:
+    """Return a command that copies the files of a store to a directory or URL."""
+
+    def copy() -> None:
+        from tcpipe.formats.place import open_place
+
+        for file in sorted(path for path in Path(store).rglob("*") if path.is_file()):
+            open_place(to).put(file.relative_to(store).as_posix(), file.read_bytes())
+
+    return _as_command(copy)
+
+
+def _by_submitit(options: Callable[[], dict[str, object]], function: str) -> Run:
+    """Return a command that ingests or builds by jobs of submitit, each a process of its own."""
+
+    def run() -> None:
+        import submitit
+
+        import tcpipe
+
+        executor = submitit.LocalExecutor("../jobs")
+        result = getattr(tcpipe, function)(**options(), cluster=executor)
+        if result.exit_code:
+            raise SystemExit(result.exit_code)
+
+    return _as_command(run)
+
+
+_STORE_THERE = _copy(f"{INPUTS}/store", f"{URL}/store")
+_BUILD_ALL_THERE = command("build-dataset", f"{URL}/dataset", *_THERE, "--split", f"{INPUTS}/region.geojson")
+_INGEST_BY_JOBS = _by_submitit(lambda: {"logs": [LOG], "store": f"{URL}/store"}, "ingest")
+_BUILD_BY_JOBS = _by_submitit(
+    lambda: {"out": f"{URL}/dataset", "store": f"{URL}/store", "split": f"{INPUTS}/region.geojson"}, "build_dataset"
+)
 
 CASES = (
     Case("a file", _file("one", "1")),
@@ -117,7 +163,8 @@ CASES = (
     Case("ingest beside build-dataset", _RUN, wants=_LOG | _WORLD, extra_features=command(*_BUILD)),
     Case("ingest beside prune", _OTHER_RUN, (_RUN,), _LOG, extra_features=command("prune")),
     Case("prune", command("prune", *_AT_ONCE), (_OTHER_RUN, _RUN), _LOG),
-    Case("migrate elsewhere", command(*_MIGRATE, "tcpipe-store"), wants=_OLD),
+    Case("migrate", command("migrate", "tcpipe-store"), (_copy(_OLD_STORE, "tcpipe-store"),), _OLD),
+    Case("migrate elsewhere", command("migrate", _OLD_STORE, "tcpipe-store"), wants=_OLD),
     Case("ingest into a bucket", _RUN_THERE, wants=_LOG, url=URL),
     Case("ingest --force there", command("ingest", LOG, "--force", *_THERE), (_RUN_THERE,), _LOG, URL),
     Case("ingest there beside prune", _OTHER_THERE, (_RUN_THERE,), _LOG, URL, command(*_PRUNE_THERE)),
@@ -125,9 +172,22 @@ CASES = (
     Case("build-dataset there", _BUILD_THERE, wants=_WORLD, url=URL),
     Case("build-dataset --force there", _FORCED_THERE, (_BUILD_THERE,), _WORLD, URL),
     Case("prune there", command(*_PRUNE_THERE, *_AT_ONCE), (_OTHER_THERE, _RUN_THERE), _LOG, URL),
-    Case("migrate into a bucket", command(*_MIGRATE, f"{URL}/store"), wants=_OLD, url=URL),
+    Case("migrate into a bucket", command("migrate", _OLD_STORE, f"{URL}/store"), wants=_OLD, url=URL),
+    Case("migrate in a bucket", command("migrate", f"{URL}/store"), (_copy(_OLD_STORE, f"{URL}/store"),), _OLD, URL),
+    Case(
+        "migrate from bucket to bucket",
+        command("migrate", f"{URL}/old", f"{URL}/store"),
+        (_copy(_OLD_STORE, f"{URL}/old"),),
+        _OLD,
+        URL,
+    ),
+    Case("ingest --shard 1/2 there", _ARRAY_TASK, wants=_LOG, url=URL, extra_features=_OTHER_TASK, partner=_OTHER_TASK),
     Case("ingest on a cluster", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL),
     Case("build-dataset on a cluster", _BUILD_THERE, wants=_WORLD | _CLUSTER, url=URL),
+    Case("ingest on Dask workers", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL, has_workers=True),
+    Case("build-dataset on Dask workers", _BUILD_ALL_THERE, (_STORE_THERE,), _WORLD | _CLUSTER, URL, has_workers=True),
+    Case("ingest by jobs", _INGEST_BY_JOBS, wants=_LOG, url=URL, has_workers=True),
+    Case("build-dataset by jobs", _BUILD_BY_JOBS, (_STORE_THERE,), _WORLD, URL, has_workers=True),
     Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
     Case("ingest --jobs 2", command("ingest", f"{INPUTS}/logs", "--jobs", "2", "--quiet"), wants=_LOG),
     Case("acknowledge", command("acknowledge", CUT), (command("ingest", CUT, "--quiet"),), _LOG),
@@ -172,7 +232,7 @@ def make_inputs(place: Path, wanted: set[str]) -> None:
         _make_model(place)
     if "old" in wanted:
         (place / "old").mkdir()
-        with tarfile.open(Path(__file__).parents[1] / "tests" / "data" / "store-1.4.tar.xz") as archive:
+        with tarfile.open(Path(__file__).parents[1] / "tests" / "data" / "store-2.1.tar.xz") as archive:
             archive.extractall(place / "old", filter="data")
 
 

@@ -2,7 +2,8 @@
 
 A step is a moment at which Python is about to change the disk: it opens a file to write (or a directory, to lock or sync it), makes,
 renames or removes something. An audit hook counts them, so every state that a kill can leave between two of them is met once. Of a call
-that writes to a bucket a step is the moment before, and the one after, each request that changes something there.
+that writes to a bucket a step is the moment before, and the one after, each request that changes something there; of one whose workers are
+killed, of each such request of theirs (`fault_workers`).
 """
 
 import atexit
@@ -21,6 +22,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import IO, TypeVar
+
+import fault_workers
 
 T = TypeVar("T")
 
@@ -44,6 +47,7 @@ UNFINISHED = (
     ".*.partial",
     "*.checkpoint",
     "tmp/tcpipe-*",
+    "there/*/spool",
 )
 """What a killed call may leave for the next one: temporaries, where a cost map and a training stand."""
 
@@ -93,11 +97,11 @@ def call(
     work: Path,
     fault: Fault | None = None,
     *,
-    in_bucket: bool = False,
+    steps_in: str = "disk",
     strike: Callable[[str], None] | None = None,
 ) -> Ended:
     """Run something in ``work`` in a forked child. Import what it needs before: children share it."""
-    begun = _begun(run, work, fault, in_bucket=in_bucket)
+    begun = start(run, work, fault, steps_in=steps_in)
     struck = None
     if fault and fault.after_s:
         time.sleep(fault.after_s)
@@ -106,12 +110,12 @@ def call(
         else:
             os.kill(begun.child, fault.signal)
         struck = time.monotonic()
-    return _ended(begun, struck)
+    return finish(begun, struck)
 
 
 def calls_together(runs: Sequence[Callable[[], object]], work: Path) -> list[Ended]:
     """Run several things at once."""
-    return [_ended(each, None) for each in [_begun(run, work, None) for run in runs]]
+    return [finish(each) for each in [start(run, work) for run in runs]]
 
 
 def in_child(act: Callable[[], T]) -> T:
@@ -134,25 +138,31 @@ def in_child(act: Callable[[], T]) -> T:
 
 
 @dataclass(frozen=True)
-class _Begun:
+class Begun:
+    """A call that runs in a child."""
+
     child: int
     counted: "memoryview[int]"
     at_s: float
     output: IO[bytes]
 
 
-def _begun(run: Callable[[], object], work: Path, fault: Fault | None, *, in_bucket: bool = False) -> _Begun:
+def start(run: Callable[[], object], work: Path, fault: Fault | None = None, *, steps_in: str = "disk") -> Begun:
+    """Begin a call in a forked child, which `finish` waits for."""
+    if steps_in == "workers":
+        fault_workers.watch(fault.step if fault else 0)
     counted = memoryview(mmap.mmap(-1, 8)).cast("q")
     begun_s = time.monotonic()
     output = tempfile.TemporaryFile()  # noqa: SIM115  closed where the child has ended
     sys.stdout.flush()
     child = os.fork()
     if child == 0:
-        _be_the_child(run, work, output.fileno(), counted, fault, in_bucket=in_bucket)
-    return _Begun(child, counted, begun_s, output)
+        _be_the_child(run, work, output.fileno(), counted, fault, steps_in=steps_in)
+    return Begun(child, counted, begun_s, output)
 
 
-def _ended(begun: _Begun, struck_s: float | None) -> Ended:
+def finish(begun: Begun, struck_s: float | None = None) -> Ended:
+    """Return how a call ended."""
     code = _waited(begun.child, time.monotonic() + LONGEST_S)
     ended_s = time.monotonic()
     left_running = _outlived(begun.child)
@@ -160,7 +170,9 @@ def _ended(begun: _Begun, struck_s: float | None) -> Ended:
         output.seek(0)
         said = output.read().decode(errors="replace")
     late_s = ended_s - (begun.at_s if struck_s is None else struck_s)
-    return Ended(code, said, begun.counted[0], ended_s - begun.at_s, late_s, left_running)
+    return Ended(
+        code, said, max(begun.counted[0], fault_workers.count_steps()), ended_s - begun.at_s, late_s, left_running
+    )
 
 
 def command(*arguments: str) -> Callable[[], object]:
@@ -182,7 +194,7 @@ def _be_the_child(
     counted: "memoryview[int]",
     fault: Fault | None,
     *,
-    in_bucket: bool,
+    steps_in: str,
 ) -> None:
     """Become the child: never returns."""
     code = 70
@@ -194,9 +206,10 @@ def _be_the_child(
         os.dup2(output, 1)
         os.dup2(output, 2)
         tempfile.tempdir = os.environ["TMPDIR"] = str(work / "tmp")
-        if in_bucket:
+        if steps_in == "bucket":
             _tell_of_requests()
-        sys.addaudithook(_hook(work, counted, fault, in_bucket=in_bucket))
+        if steps_in != "workers":
+            sys.addaudithook(_hook(work, counted, fault, in_bucket=steps_in == "bucket"))
         run()
         code = 0
     except SystemExit as done:
@@ -212,18 +225,7 @@ def _be_the_child(
 
 def _tell_of_requests() -> None:
     """Have requests that change something in a bucket tell the audit hook when they begin, and when they are answered."""
-    import obstore
-
-    def telling(act: Callable[..., object]) -> Callable[..., object]:
-        def told(*args: object, **how: object) -> object:
-            sys.audit(_REQUEST)
-            found = act(*args, **how)
-            sys.audit(_REQUEST)
-            return found
-
-        return told
-
-    obstore.put, obstore.delete = telling(obstore.put), telling(obstore.delete)
+    fault_workers.call_around_requests(lambda: sys.audit(_REQUEST))
 
 
 def _hook(work: Path, counted: "memoryview[int]", fault: Fault | None, *, in_bucket: bool):
@@ -374,5 +376,8 @@ def _unit_of(path: str) -> str:
 
 
 def different(one: Tree, other: Tree) -> list[str]:
-    """Name the paths at which two trees differ."""
-    return sorted(path for path in one.keys() | other.keys() if one.get(path) != other.get(path))
+    """Name the paths at which two trees differ; an empty folder of a store is nothing."""
+    changed = sorted(path for path in one.keys() | other.keys() if one.get(path) != other.get(path))
+    return [
+        path for path in changed if not (_in_store(path) and {one.get(path), other.get(path)} == {None, "directory"})
+    ]

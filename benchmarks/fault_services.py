@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+import fault_workers
 from fault_children import in_child
 
 from tcpipe.formats.place import open_place
@@ -42,12 +43,18 @@ class Services:
         self._gateway: Path | None = None
         self._cluster: DaskCluster | None = None
         self._outage: subprocess.Popen[bytes] | None = None
+        self._is_watched = False
 
-    def start(self, *, gateway: bool, cluster: bool) -> None:
-        """Have what is wanted running, and lead there by the environment."""
+    def start(self, *, gateway: bool, cluster: bool, watched: bool) -> None:
+        """Have what is wanted running, and lead there by the environment; ``watched``: workers count their requests."""
         self._directory.mkdir(exist_ok=True)
         if gateway and self._gateway is None:
             self._start_gateway()
+        if watched != self._is_watched:
+            self._cluster_stack.close()
+            self._cluster, self._is_watched = None, watched
+            if watched:
+                self._cluster_stack.enter_context(fault_workers.lead_workers(self._directory / "steps"))
         if cluster and self._cluster is None:
             self._start_cluster()
         os.environ.pop("TCPIPE_CLUSTER", None)

@@ -33,9 +33,11 @@ from fault_children import (
     call,
     calls_together,
     different,
+    finish,
     half_written,
     in_child,
     is_passing,
+    start,
     tree,
     without_unfinished,
 )
@@ -53,8 +55,11 @@ STRIKES = {
     "services": (),
     "together": (),
 }
+LEFT_OVER = ("left by a killed command", "belongs to a call that is running or was killed", "no commit names it")
+UNFINISHED_RUN = ": contains no finished run"
 PROMISES = """
-false if: a final path is neither whole as before nor whole as after, at the moment of the fault or later; the next identical call does not
+false if: a final path is neither whole as before nor whole as after, at the moment of the fault or later; a reader sees damage then; the
+other task of an array does not finish what a killed one began; the next identical call does not
 complete, or leaves other bytes than an undisturbed one, or any temporary; a process outlives its command; a command that is asked to end
 (SIGTERM, SIGINT, SIGHUP) takes more than 5 s, exits with another code than 128 + signal, or leaves a temporary; a full disk, a gateway or
 a cluster that is gone is told in more than plain lines; a full disk leaves a temporary; verify finds a problem after the next call."""
@@ -93,7 +98,7 @@ def undisturbed(case: Case, work: Path) -> Undisturbed:
     assert not changed, f"{case.name}: a second call changes {changed}"
     _restore(state, work)
     put_objects(case.url, objects)
-    ended = call(case.run, work, in_bucket=bool(case.url))
+    ended = call(case.run, work, steps_in=case.steps_in)
     changed = different(after, all_of(case, work))
     assert not changed, f"{case.name}: not the same twice: {changed}"
     there = {path: work / path for path in after if before.get(path) != after[path]}
@@ -130,10 +135,17 @@ def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
     _restore(plain.state, work)
     put_objects(case.url, plain.objects)
     with _room(work, fault.room_bytes):
-        ended = call(case.run, work, fault, in_bucket=bool(case.url), strike=services.strike)
+        partner = start(case.partner, work) if case.partner else None
+        ended = call(case.run, work, fault, steps_in=case.steps_in, strike=services.strike)
+        others = [finish(partner)] if partner else []
     services.mend()
     now = all_of(case, work)
     bad = half_written(plain.before, plain.after, now)
+    bad += [f"half visible: {line}" for line in _select_damage(list(_find_problems(plain, work)))]
+    bad += [
+        f"the other task ends with {other.code}: {other.said}" for other in others if other.code != plain.ended.code
+    ]
+    bad += [f"the other task leaves other bytes: {path}" for path in different(plain.after, now) if others][:3]
     bad += ["processes outlive it"] if ended.left_running else []
     if fault.victim:
         bad += _not_plain(plain, ended)
@@ -177,19 +189,40 @@ def _of_the_next_call(plain: Undisturbed, work: Path, wanted: Tree) -> Iterator[
         yield f"the next call ends with {again.code}: {again.said.strip()[-300:]}"
     for path in different(wanted, all_of(plain.case, work))[:3]:
         yield f"the next call leaves other bytes: {path}"
-    for store in filter(None, ("tcpipe-store", plain.case.url and f"{plain.case.url}/store")):
-        if store == "tcpipe-store" and not (work / store / "store.json").exists():
-            continue
-        if plain.case.url and not any(name.startswith("there/store/") for name in wanted):
-            continue
-        yield from in_child(lambda path=store if "://" in store else work / store: _problems(path))
+    yield from _find_problems(plain, work)
 
 
-def _problems(store: str | Path) -> list[str]:
-    """Return what is not as it was written in a store."""
+def _find_problems(plain: Undisturbed, work: Path) -> Iterator[str]:
+    """Yield what `verify` finds at the outputs that a reader would find now: store and dataset, on disk and in the bucket."""
+    objects = get_objects(plain.case.url).keys() if plain.case.url else ()
+    for name in ("store", "dataset"):
+        if any(of == f"{name}/store.json" or (of.startswith(f"{name}/log/") and name == "dataset") for of in objects):
+            yield from in_child(lambda name=name: _verify(f"{plain.case.url}/{name}"))
+    for name, mark in (("tcpipe-store", "store.json"), ("dataset", "dataset.json")):
+        if (work / name / mark).exists():
+            yield from in_child(lambda name=name: _verify(work / name))
+
+
+def _select_damage(lines: list[str]) -> list[str]:
+    """Return the lines of `verify` without those on what a killed call left and no reader sees."""
+    unfinished = [line.partition(UNFINISHED_RUN)[0] for line in lines if UNFINISHED_RUN in line]
+    return [
+        line
+        for line in lines
+        if not any(of in line for of in LEFT_OVER) and not any(line.startswith(run) for run in unfinished)
+    ]
+
+
+def _verify(path: str | Path) -> list[str]:
+    """Return what is not as it was written at a place; nothing where a migration has not come to its end."""
+    from tcpipe.formats.place import open_place
+    from tcpipe.formats.run_documents import read_layout
     from tcpipe.pipeline.verify import verify
+    from tcpipe.tables.levels import DATA_MODEL_VERSION
 
-    return [f"verify: {problem}" for problem in verify(store).problems]
+    if read_layout(open_place(path)) not in (None, DATA_MODEL_VERSION):
+        return []
+    return [f"verify: {problem}" for problem in verify(path).problems]
 
 
 @contextmanager
@@ -273,7 +306,7 @@ def run(campaigns: list[str], cases: list[Case], options: argparse.Namespace) ->
     with workplace(set().union(*(case.wants for case in cases))) as work:
         inputs = without_unfinished(tree(work / INPUTS))
         for case in cases:
-            services.start(gateway=bool(case.url), cluster="cluster" in case.wants)
+            services.start(gateway=bool(case.url), cluster="cluster" in case.wants, watched=case.has_workers)
             plain, wrong = undisturbed(case, work), []
             counts = dict.fromkeys(campaigns, 0)
             for name in campaigns:

@@ -37,6 +37,9 @@ LEVEL = 4
 _PATCHES_EACH = 20
 """Largest patches of ground for each class and slope."""
 
+_MOST_KEYS = 256
+"""Classes, ranges of slope and ranges of speed each have smaller numbers."""
+
 CLOSED = -1
 """Class of ground that is closed or unknown."""
 
@@ -67,9 +70,9 @@ class Cell:
         return count < read_threshold("thin-ground", "enough_count")
 
 
-def find_slope_ranges(slope_rad: Floats) -> Ints:
+def find_slope_ranges(slope_rad: Floats) -> NDArray[np.int8]:
     """Return the range of `SLOPE_NAMES` that each slope [rad] lies in, shape (N,)."""
-    return np.searchsorted(np.radians(SLOPE_EDGES_DEG), slope_rad, side="right").astype(np.int64)
+    return np.searchsorted(np.radians(SLOPE_EDGES_DEG), slope_rad, side="right").astype(np.int8)
 
 
 def choose_speed_edges(velocity_mps: Floats) -> tuple[float, ...]:
@@ -83,37 +86,38 @@ def choose_speed_edges(velocity_mps: Floats) -> tuple[float, ...]:
 
 
 def count_cells(
-    keys: Sequence[Ints],
-    split: NDArray[np.str_],
+    keys: Sequence[NDArray[np.integer]],
+    splits: Mapping[str, NDArray[np.bool_]],
     xy_m: Floats,
     correlations: Sequence[Correlation],
-    *,
-    splits: Sequence[str],
 ) -> list[Cell]:
     """Return every cell that holds a sample, by class, slope and speed.
 
     Parameters
     ----------
     keys : class ids, ranges of slope and, if cells have one, of speed, each of shape (N,).
-    split, xy_m : split and centre of every footprint [m], shape (N,) and (N, 2).
+    splits : which samples are in each split that counts, ``train`` among them, shape (N,).
+    xy_m : centre of every footprint [m], shape (N, 2).
     correlations : of the labels; the one with the smallest effective size counts.
-    splits : the splits that count, ``train`` among them.
     """
-    counted = np.flatnonzero(np.isin(split, splits))
-    if not len(counted):
-        return []
-    names, member = np.unique(np.stack(keys)[:, counted], axis=1, return_inverse=True)
-    order = np.argsort(member.reshape(-1), kind="stable")
-    parts = np.split(counted[order], np.flatnonzero(np.diff(member.reshape(-1)[order])) + 1)
+    counted = np.flatnonzero(np.any(list(splits.values()), axis=0))
+    code = np.zeros(len(counted), np.int32)
+    for key in keys:
+        code = code * _MOST_KEYS + key[counted]
+    codes = np.unique(code)
+    member = np.searchsorted(codes, code).astype(np.int32)
+    order = np.argsort(member, kind="stable")
+    parts = np.split(counted[order], np.flatnonzero(np.diff(member[order])) + 1)
     cells = []
-    for (terrain, slope, *speed), rows in zip(names.T.tolist(), parts, strict=True):
-        train = rows[split[rows] == "train"]
+    for found, rows in zip(codes.tolist(), parts, strict=False):  # a part even where there is no cell
+        terrain, slope, *speed = (found // _MOST_KEYS**at % _MOST_KEYS for at in reversed(range(len(keys))))
+        train = rows[splits["train"][rows]]
         cells.append(
             Cell(
                 terrain,
                 slope,
                 speed[0] if speed else None,
-                {name: int((split[rows] == name).sum()) for name in splits},
+                {name: int(of[rows].sum()) for name, of in splits.items()},
                 compute_effective_size(xy_m[rows], *correlations) if correlations else None,
                 compute_effective_size(xy_m[train], *correlations) if correlations else None,
             )
@@ -140,8 +144,8 @@ class MapGround:
     def __post_init__(self) -> None:
         """Find the ranges of slope."""
         steepest = np.arctan(np.hypot(self.gradient[..., 0], self.gradient[..., 1]))
-        object.__setattr__(self, "up", find_slope_ranges(steepest).astype(np.int8))
-        object.__setattr__(self, "down", find_slope_ranges(-steepest).astype(np.int8))
+        object.__setattr__(self, "up", find_slope_ranges(steepest))
+        object.__setattr__(self, "down", find_slope_ranges(-steepest))
 
     def find_cells(self, xy_m: Floats) -> tuple[Ints, Ints, NDArray[np.bool_]]:
         """Return row and column of points, shape (N, 2) [m], and whether they lie on the map."""

@@ -54,7 +54,7 @@ class Correlation:
     """Pairs of samples that it was estimated from."""
 
 
-def compute_slope_residuals(values: Floats, terrain_class: Ints, slope_rad: Floats) -> Floats:
+def compute_slope_residuals(values: Floats, terrain_class: NDArray[np.integer], slope_rad: Floats) -> Floats:
     """Return what a parabola over slope, one a class, leaves of a label, shape (N,)."""
     left = np.empty(len(values))
     for kind in np.unique(terrain_class):
@@ -66,7 +66,7 @@ def compute_slope_residuals(values: Floats, terrain_class: Ints, slope_rad: Floa
 
 
 def estimate_correlations(
-    residual_by_label: Mapping[str, Floats], xy_m: Floats, run: Ints, start_ns: Ints, *, chord_m: float
+    residual_by_label: Mapping[str, Floats], xy_m: Floats, run: NDArray[np.integer], start_ns: Ints, *, chord_m: float
 ) -> dict[str, Correlation | None]:
     """Return the correlation of each label's residuals, shape (N,), over distance; None where too few samples are near each other.
 
@@ -90,7 +90,7 @@ def estimate_correlations(
     return found
 
 
-def _draw_sections(run: Ints, start_ns: Ints) -> Ints:
+def _draw_sections(run: NDArray[np.integer], start_ns: Ints) -> Ints:
     """Return rows of whole stretches of the drives, spread evenly; all rows where there are few."""
     order = np.lexsort((start_ns, run))
     if len(order) <= _MOST:
@@ -129,6 +129,8 @@ NEAR = 0.25
 ALONG_RAD = np.radians(10.0)
 """Courses that differ by at most so much are one direction [rad]; NEAR and this bound the two together, as an ellipsoid."""
 
+_CHUNK = 65_536
+"""Samples whose nearest are looked for together."""
 _BLOCK = 10.0
 """Side of a jackknife block, in chords."""
 _FEWEST_BLOCKS = 5
@@ -150,7 +152,9 @@ class Floor:
     """Of the label's own variance; no model explains more than the rest."""
 
 
-def find_repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: Ints, *, chord_m: float) -> Ints:
+def find_repeated_pairs(
+    xy_m: Floats, course_rad: Floats, terrain_class: NDArray[np.integer], *, chord_m: float
+) -> Ints:
     """Return pairs of samples that cover one place of one class in one direction, shape (P, 2); no sample is in two pairs.
 
     Samples of one pass never qualify: they begin a chord apart. Of several passes the two nearest are the pair.
@@ -161,15 +165,17 @@ def find_repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: Ints, *
     reach_m = NEAR * chord_m
     turned_m = reach_m / (2.0 * np.sin(ALONG_RAD / 2.0))  # a circle on which ALONG_RAD apart is reach_m apart
     points = np.column_stack([xy_m, turned_m * np.cos(course_rad), turned_m * np.sin(course_rad)])
-    rows = np.arange(len(points))
-    apart_m, near = cKDTree(points).query(points, k=2, distance_upper_bound=reach_m * (1.0 + 1e-9))
-    itself = near[:, 0] == rows
-    other, apart_m = np.where(itself, near[:, 1], near[:, 0]), np.where(itself, apart_m[:, 1], apart_m[:, 0])
-    found = np.isfinite(apart_m)
-    back = np.full(len(points) + 1, -1)
-    back[:-1][found] = other[found]
-    mutual = found & (back[other] == rows) & (rows < other)
-    pairs = np.column_stack([rows[mutual], other[mutual]]).astype(np.int64)
+    tree, other = cKDTree(points), np.full(len(points), -1, np.int32)
+    for first in range(0, len(points), _CHUNK):
+        rows = np.arange(first, min(first + _CHUNK, len(points)))
+        apart_m, near = tree.query(points[rows], k=2, distance_upper_bound=reach_m * (1.0 + 1e-9))
+        itself = near[:, 0] == rows
+        nearest = np.where(itself, near[:, 1], near[:, 0])
+        found = np.isfinite(np.where(itself, apart_m[:, 1], apart_m[:, 0]))
+        other[rows[found]] = nearest[found]
+    ours = np.flatnonzero(other >= 0)
+    mutual = ours[(other[other[ours]] == ours) & (ours < other[ours])]
+    pairs = np.column_stack([mutual, other[mutual]]).astype(np.int64)
     return np.asarray(pairs[terrain_class[pairs[:, 0]] == terrain_class[pairs[:, 1]]])
 
 

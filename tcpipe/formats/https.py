@@ -9,10 +9,11 @@ from __future__ import annotations
 import ssl
 import time
 from collections.abc import Iterable
+from contextlib import closing
 from http.client import HTTPException, HTTPMessage
 from typing import IO, Any
 from urllib.error import HTTPError, URLError
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
 from tcpipe import __version__
@@ -47,6 +48,14 @@ class HttpsClient:
                 "if you trust it, add it to hosts in the TOML file that you give with --stac"
             )
 
+    def check_left(self, url: str, wanted_bytes: int) -> None:
+        """Raise `MapError` where so many bytes more are too many."""
+        if wanted_bytes > self.left_bytes:
+            raise MapError(
+                f"{url}: would be {wanted_bytes / 1e6:.3g} MB, {self.left_bytes / 1e6:.3g} of {self._most_bytes / 1e6:g} MB a command "
+                "are left; name fewer runs with --around, or a smaller --margin"
+            )
+
     def get(self, url: str, *, most: int, span: tuple[int, int] | None = None) -> tuple[bytes, HTTPMessage]:
         """Return the body of a URL, or its bytes from first to last, and the head of the reply; a failed request is made three times.
 
@@ -58,6 +67,7 @@ class HttpsClient:
         for pause_s in _PAUSES_S:
             try:
                 self.check_url(url)
+                self.check_left(url, most)
                 with self._opener.open(Request(url, headers=headers), timeout=_SILENT_S) as reply:  # noqa: S310  checked
                     if span and reply.status != 206:
                         remedy = "download it and give it with --height or --ortho"
@@ -77,15 +87,12 @@ class HttpsClient:
 
     def _read(self, reply: Any, url: str, most: int) -> bytes:
         deadline_s, data = time.monotonic() + _REQUEST_S, b""
-        most = min(most, self.left_bytes)
         while len(data) <= most and (piece := reply.read1(_PIECE_BYTES)):
             data += piece
             if time.monotonic() > deadline_s:
                 raise TimeoutError(f"{len(data)} bytes in {_REQUEST_S:g} s")
         if len(data) > most:
-            raise MapError(
-                f"{url}: more than {most / 1e6:.3g} MB, of {self._most_bytes / 1e6:g} MB in all that one command may read; name fewer runs"
-            )
+            raise MapError(f"{url}: sends more than {most} bytes, expected at most these; it is no such file")
         if reply.length:
             raise HTTPException(f"ended after {len(data)} of {len(data) + reply.length} bytes")
         self.left_bytes -= len(data)
@@ -96,12 +103,9 @@ class _CheckedRedirects(HTTPRedirectHandler):
     def __init__(self, client: HttpsClient) -> None:
         self._client = client
 
-    def redirect_request(  # noqa: PLR0917  urllib's signature
-        self, req: Request, fp: IO[bytes], code: int, msg: str, headers: HTTPMessage, newurl: str
-    ) -> Request | None:
-        try:
-            self._client.check_url(newurl)
-        except MapError:
-            fp.close()
-            raise
-        return super().redirect_request(req, fp, code, msg, headers, newurl)
+    def http_error_302(self, req: Request, fp: IO[bytes], code: int, msg: str, headers: HTTPMessage) -> Any:
+        with closing(fp):
+            self._client.check_url(urljoin(req.full_url, headers["Location"] or ""))
+            return super().http_error_302(req, fp, code, msg, headers)
+
+    http_error_301 = http_error_303 = http_error_307 = http_error_308 = http_error_302

@@ -6,11 +6,12 @@ all pages say how large the table becomes: one that is out of proportion to its 
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -28,6 +29,8 @@ from tcpipe.tables.levels import GEOMETRY, Datum
 from tcpipe.tables.options import EARLIER_COLUMNS
 
 N = TypeVar("N", bound=np.generic)
+
+_M_MMAP_THRESHOLD = -3
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
@@ -324,6 +327,20 @@ def map_table(path: Path) -> pa.Table:
         return pa.ipc.open_file(source).read_all()
 
 
+def take_rows(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
+    """Return rows of a table: `pa.Table.take` would copy all of each column that has several chunks."""
+    batches = table.to_batches()
+    firsts = np.cumsum([0, *(batch.num_rows for batch in batches)])
+    order = np.argsort(rows, kind="stable")
+    number = np.searchsorted(firsts, rows[order], side="right") - 1
+    parts = np.split(order, np.flatnonzero(np.diff(number)) + 1)
+    numbers = [int(number[0]), *number[1:][np.diff(number) > 0].tolist()] if len(rows) else []
+    taken = [batches[at].take(pa.array(rows[part] - firsts[at])) for at, part in zip(numbers, parts, strict=False)]
+    back = np.empty(len(rows), np.int64)
+    back[order] = np.arange(len(rows))
+    return pa.Table.from_batches(taken, table.schema).take(pa.array(back))
+
+
 def make_mapped_array(directory: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Return an array of zeros in a nameless file in a directory: the system may put its pages aside, so it takes no memory."""
     size_bytes = np.dtype(dtype).itemsize * math.prod(shape)
@@ -339,6 +356,23 @@ def move_to_file(array: NDArray[N], directory: Path) -> NDArray[N]:
     mapped = make_mapped_array(directory, array.shape, array.dtype)
     mapped[...] = array
     return mapped
+
+
+def move_rows_to_file(array: NDArray[N], rows: NDArray[np.int64], directory: Path) -> NDArray[N]:
+    """Return rows of an array as `make_mapped_array` gives them."""
+    mapped = make_mapped_array(directory, (len(rows), *array.shape[1:]), array.dtype)
+    if mapped.size:
+        np.take(array, rows, axis=0, out=mapped, mode="clip")  # "raise" would make a copy
+    return mapped
+
+
+def return_freed_memory() -> None:
+    """Have columns go back to the system when nobody needs them: heaps would keep the room of all that there ever was."""
+    pa.set_memory_pool(pa.system_memory_pool())
+    with suppress(OSError, AttributeError, TypeError):  # only glibc has it
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
+        library.malloc_trim(0)
 
 
 def write_table_bytes(table: pa.Table) -> bytes:

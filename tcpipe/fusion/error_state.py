@@ -29,15 +29,19 @@ from tcpipe.fusion.filter_kernel import (
     allocate_steps,
     filter_ticks,
 )
-from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects, make_excursions
+from tcpipe.fusion.hypotheses import (
+    POSSIBLE,
+    ROLES,
+    Hypothesis,
+    compute_weights,
+    explain,
+    find_suspects,
+    make_excursions,
+)
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import (
-    DOPPLER,
-    GNSS,
     IMU,
     STATED_ARM_STD_M,
-    VISUAL,
-    WHEELS,
     InitialState,
     Measurements,
     select_rows,
@@ -59,19 +63,17 @@ from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smoo
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts, make_vector
+from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-ROLES = {
-    state.WHEELS: WHEELS,
-    state.VISUAL: VISUAL,
-    state.DOPPLER: DOPPLER,
-    state.FIX: GNSS,
-    state.ATTITUDE: GNSS,
+_OF_ODOMETRY = {
+    state.WHEELS: (state.WHEEL_SCALE, state.WHEEL_SLIP, state.WHEEL_LAG),
+    state.VISUAL: (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG),
 }
+"""Errors of an odometry: its mean scale, what it varies by, its lag."""
 _BLOCK = 1024
 _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
@@ -145,8 +147,8 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     m = inflate_unclaimed_fixes(m, residuals)
     noise = fit_noise(m, residuals)
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
-    std, walk, time_s = make_priors(m, noise, ticks)
-    section = _Section(m, ticks, std, walk, time_s, gate_probability)
+    std = make_priors(m, noise, ticks)[0]
+    section = _Section(m, noise, ticks, gate_probability)
     model = section.make_model()
     start = make_start(initial, model, std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
     first_minute = filter_section(ticks, model, start, until=round(_LEVELLING_S / ticks.inputs.period_s))
@@ -178,22 +180,21 @@ class _Section:
     """A section that is filtered under several hypotheses."""
 
     measurements: Measurements
+    noise: NoiseModel
     ticks: Ticks
-    std: Floats
-    walk: Floats
-    time_s: Floats
     gate_probability: float
 
     def make_model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
         """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
+        std, walk, time_s = make_priors(self.measurements, changes.alter_noise(self.noise), self.ticks)
         return make_model(
             self.measurements,
-            self.std,
-            self.walk,
+            std,
+            walk,
             changes.events,
             period_s=self.ticks.inputs.period_s,
             gate_probability=self.gate_probability,
-            time_s=self.time_s,
+            time_s=time_s,
             follows=not judges,
             ignored=changes.ignored,
             possible=POSSIBLE if judges else (),
@@ -451,13 +452,9 @@ def _correct_measurements(
             off = np.einsum("nij,nj->ni", rotation, moved) - late
             corrected = replace(source, position_enu_m=source.position_enu_m - off)
         else:
-            places = (
-                (state.WHEEL_SCALE, state.WHEEL_SLIP, state.WHEEL_LAG)
-                if kind == state.WHEELS
-                else (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG)
-            )
-            scale = 1.0 + x[:, places[0]] + x[:, places[1]] + x[:, state.SHARED_SCALE]
-            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[2]])) * 1e9)
+            mean, slip, lag = _OF_ODOMETRY[kind]
+            scale = 1.0 + x[:, mean] + x[:, slip] + x[:, state.SHARED_SCALE]
+            stamp_ns = source.stamp_ns - round(float(np.median(x[:, lag])) * 1e9)
             corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
         kept = np.ones(tick.size, np.bool_)
         for change in changes:
@@ -471,11 +468,14 @@ def _correct_measurements(
     return replace(m, **found)
 
 
-def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
+def _list_changes(made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
     """Yield the changes that explain the run best."""
     for change in (c for each in explained for c in each.changes):
         last = change.last or made.states.shape[0] - 1
         size = 0.0 if change.kind == "gyroscope" else change.size
+        if change.kind == "varies":
+            mean, slip, _ = _OF_ODOMETRY[change.role]
+            size = float((smoothed.states[:, mean + 6] + smoothed.states[:, slip + 6]).std())
         role = IMU if change.kind == "gyroscope" else ROLES[change.role]
         start_ns, end_ns = made.ticks.stamp_ns[[change.first, last]].tolist()
         yield ChangeFacts(change.kind, role, start_ns, end_ns, size)
@@ -487,34 +487,17 @@ def _make_facts(  # noqa: PLR0917
     rows = _list_rows(m, made)
     tests = made.tests
     nis, verdicts = {}, {}
-    for role in {ROLES[kind]: None for kind in rows}:
+    for role in dict.fromkeys(ROLES[kind] for kind in rows):
         kinds = [kind for kind in rows if ROLES[kind] == role]
         taken = np.concatenate([tests.nis[tests.verdict[:, kind] == ACCEPTED, kind] for kind in kinds])
         nis[role] = float(taken.mean()) / state.SIZES[kinds[0]] if taken.size else None
         verdicts[role] = np.concatenate([tests.verdict[rows[kind][1], kind] for kind in kinds])
-    last, active = smoothed.states[-1], list(made.model.active)
-
-    def spread(error: int) -> float:
-        return float(smoothed.spreads[-1, active.index(error)]) if error in active else 0.0
-
-    x = last[6:]
     return StretchFacts(
         nis_mean=nis,
         measurements={role: int(of.size) for role, of in verdicts.items()},
         rejected={role: int((of == REJECTED).sum()) for role, of in verdicts.items()},
-        reopened={role: int((of == RESET).sum()) for role, of in verdicts.items()},
-        events=int(made.ticks.stamp_ns.size),
-        zero_velocity_updates=int((tests.verdict[:, state.STATIONARY] != NONE).sum()),
-        gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
         gate_resets=find_gate_resets(made),
-        changes=tuple(_list_changes(made, explained)),
-        gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
-        turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
-        accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),
-        wheel_scale=float(1.0 + x[state.WHEEL_SCALE] + x[state.WHEEL_SLIP] + x[state.SHARED_SCALE]),
-        wheel_scale_std=max(spread(state.WHEEL_SCALE), scale_std),
-        visual_scale=float(1.0 + x[state.VISUAL_SCALE] + x[state.VISUAL_SLIP] + x[state.SHARED_SCALE]),
-        visual_scale_std=max(spread(state.VISUAL_SCALE), scale_std),
+        changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,
         parameters=_describe_parameters(m, made, smoothed, std),
     )

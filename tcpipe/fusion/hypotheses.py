@@ -2,10 +2,11 @@
 
 A hypothesis is a set of changes. A change makes one block of the state uncertain at a tick, and where it ends makes it what it was: fixes
 are off by a constant, the antenna was moved, a clock stepped, a gyroscope's bias jumped, the scale of an odometry changed, the robot was
-carried, the frame of a pose turned, a sensor is useless for a while. Fixes do not err for ever: where nothing tells when they did, their
-lasting error is taken to be larger around a step. Each hypothesis runs the filter over the same measurements, predicted whether they are
-used or not; its score is the log likelihood, with what lies beyond the gate counted as the gate, less a cost by kind. The changes that
-explain most are found one after the other; hypotheses that are nearly as good widen the deviations where they differ.
+carried, the frame of a pose turned, a sensor is useless for a while. The scale of an odometry may also vary much, throughout. Fixes do not
+err for ever: where nothing tells when they did, their lasting error is taken to be larger around a step. Each hypothesis runs the filter
+over the same measurements, predicted whether they are used or not; its score is the log likelihood, with what lies beyond the gate counted
+as the gate, less a cost by kind. The changes that explain most are found one after the other; hypotheses that are nearly as good widen the
+deviations where they differ.
 
 Blame is never what is left when a sensor is ignored: without fixes everything is explained.
 """
@@ -19,13 +20,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
+from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.event_candidates import EventCandidate, TurnJump
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
+from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS
 from tcpipe.fusion.parameters import Event
 from tcpipe.fusion.ticks import Pass, Ticks
 
 Floats = NDArray[np.float64]
 
+ROLES = {
+    state.WHEELS: WHEELS,
+    state.VISUAL: VISUAL,
+    state.DOPPLER: DOPPLER,
+    state.FIX: GNSS,
+    state.ATTITUDE: GNSS,
+}
+"""Sensors by the kind of their measurements."""
 POSSIBLE = (
     *range(state.ARM, state.FIX_OFFSET + 3),
     state.WHEEL_SCALE,
@@ -123,15 +134,20 @@ _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
     ("gyroscope", state.FIX): ((state.GYRO_BIAS, 3, 0.03),),
     ("scale", state.WHEELS): ((state.WHEEL_SCALE, 1, 0.3),),
     ("scale", state.VISUAL): ((state.VISUAL_SCALE, 1, 0.3),),
+    ("varies", state.WHEELS): ((state.WHEEL_SLIP, 1, 0.0),),  # not by an event, but all the time
+    ("varies", state.VISUAL): ((state.VISUAL_SLIP, 1, 0.0),),
     ("frame", state.ATTITUDE): ((state.POSE_FRAME, 3, 0.3),),
     ("pose", state.FIX): ((state.RHO, 3, 2.0), (state.THETA, 3, 0.1), (state.U, 3, 0.5)),
 }
+_VARYING = GaussMarkov(0.1**2, 5.0)
+"""A scale that changes by a tenth with slope, ground or load."""
 _COSTS = {
     "offset": 12.0,
     "antenna": 40.0,
     "clock": 14.0,
     "gyroscope": 16.0,
     "scale": 10.0,
+    "varies": 40.0,
     "frame": 14.0,
     "pose": 20.0,
     "wander": 12.0,
@@ -166,6 +182,12 @@ class Hypothesis:
             ticks = change.alter_ticks(ticks)
         return ticks
 
+    def alter_noise(self, noise: NoiseModel) -> NoiseModel:
+        """Return the noise of the sensors as it is under all changes."""
+        roles = [ROLES[change.role] for change in self.changes if change.kind == "varies"]
+        varying = {role: replace(noise.odometries[role], scale=_VARYING) for role in roles}
+        return replace(noise, odometries={**noise.odometries, **varying})
+
     @property
     def ignored(self) -> tuple[tuple[int, int, int], ...]:
         """Measurements that are not used: (kind, first tick, last tick)."""
@@ -196,11 +218,9 @@ def find_suspects(tests: Tests, period_s: float) -> list[Suspect]:
 
 def compute_evidence(tests: Tests, gates: Floats, first: int, last: int) -> float:
     """Return the log likelihood of the measurements of some ticks; one beyond the gate counts as the gate."""
-    kinds = [state.WHEELS, state.VISUAL, state.DOPPLER, state.FIX]
+    kinds = [state.WHEELS, state.VISUAL, state.DOPPLER, state.FIX, state.ATTITUDE]
     nis = np.minimum(tests.nis[first:last, kinds], gates[kinds])
-    of_attitude = np.minimum(tests.nis[first:last, state.ATTITUDE], gates[state.ATTITUDE])
-    attitude = np.nansum(of_attitude + tests.log_det[first:last, state.ATTITUDE])
-    return float(-0.5 * (np.nansum(nis + tests.log_det[first:last, kinds]) + attitude))
+    return float(-0.5 * np.nansum(nis + tests.log_det[first:last, kinds]))
 
 
 def explain(
@@ -226,7 +246,7 @@ def explain(
         last = min(size, end + round(_HORIZON_S / period_s))
         tried: list[Hypothesis] = []
         for change in changes:
-            if all(e in active for place, count, _ in change.blocks for e in range(place, place + count)):
+            if _is_possible(change, best, active):
                 changed = Hypothesis((*best.changes, change), 0.0)
                 first = min(c.first for c in changed.changes)
                 plain = compute_evidence(tests, gates, first, last)
@@ -240,13 +260,16 @@ def explain(
             best = top
             if (change := top.changes[-1]).kind == "pose" and change.size < _CARRIED_M:
                 # Such a step is one of the fixes, which err before or after it; if neither is more likely, around it.
-                around, *sides = (_add(top, each) for each in _list_wanders(change.first, change.size, size, period_s))
+                wanders = _list_wanders(change.first, change.size, size, period_s)
+                around, *sides = (replace(top, changes=(*top.changes[:-1], each)) for each in wanders)
                 begin = min(c.first for c in around.changes)
                 likely = [compute_evidence(run(each, begin, last).tests, gates, begin, last) for each in sides]
                 best = around if abs(likely[0] - likely[1]) < _SIDE else sides[int(np.argmax(likely))]
             tests = run(best, 0, size).tests
         elif number > 0:
             break
+    if any(each.kind == "varies" for each in best.changes):
+        best, tests = _drop_changes(best, tests, gates, run)
     left = [each for each in find_suspects(tests, period_s) if each.role == state.FIX] if best.changes else []
     rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
     off_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in left]
@@ -255,9 +278,26 @@ def explain(
     return [best, *sorted(rivals, key=lambda each: -each.score)[:_MOST_RIVALS]] if best.changes or rivals else []
 
 
-def _add(hypothesis: Hypothesis, change: Change) -> Hypothesis:
-    """Return a hypothesis with another change in place of its last."""
-    return replace(hypothesis, changes=(*hypothesis.changes[:-1], change))
+def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> bool:
+    """Return whether what it changes is part of the state, and the same scale does not vary already."""
+    varying = {each.role for each in best.changes if each.kind == change.kind == "varies"}
+    return change.role not in varying and all(
+        e in active for place, count, _ in change.blocks for e in range(place, place + count)
+    )
+
+
+def _drop_changes(
+    best: Hypothesis, tests: Tests, gates: Floats, run: Callable[[Hypothesis, int, int], Pass]
+) -> tuple[Hypothesis, Tests]:
+    """Return the hypothesis without what a scale that varies explains as well, and its tests: it explains more than where it was found."""
+    size, first = tests.verdict.shape[0], min(each.first for each in best.changes)
+    for change in [each for each in best.changes if each.kind not in {"varies", "wander"}]:
+        others = replace(best, changes=tuple(each for each in best.changes if each != change))
+        rest = run(others, 0, size).tests
+        lost = compute_evidence(tests, gates, first, size) - compute_evidence(rest, gates, first, size) - change.cost
+        if lost < _SURELY:
+            best, tests = replace(others, score=best.score - lost), rest
+    return best, tests
 
 
 def _list_wanders(tick: int, off_m: float, size: int, period_s: float) -> Iterator[Change]:
@@ -301,6 +341,8 @@ def _list_changes(suspect: Suspect, suspects: Sequence[Suspect], tests: Tests, p
     """Yield single changes that could explain a suspect."""
     size = tests.verdict.shape[0]
     role, first, last = suspect.role, suspect.first, None if suspect.last >= size else suspect.last
+    for odometry in (state.WHEELS, state.VISUAL):
+        yield Change("varies", odometry, first)
     if role != state.FIX:
         if role == state.ATTITUDE:
             yield Change("frame", role, first)

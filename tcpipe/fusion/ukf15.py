@@ -473,7 +473,7 @@ def _make_rejections(sources: Sequence[SensorRows], gates: Sequence[float], foun
 
 
 def _make_facts(sources: Sequence[SensorRows], found: ForwardResult) -> StretchFacts:
-    measurements, rejected, recovered, nis_mean = {}, {}, {}, dict[str, float | None]()
+    measurements, rejected, nis_mean = {}, {}, dict[str, float | None]()
     for role in (GNSS, IMU, WHEELS, VISUAL):
         mine = [at for at, source in enumerate(sources) if source.role == role]
         if not mine:
@@ -484,6 +484,5 @@ def _make_facts(sources: Sequence[SensorRows], found: ForwardResult) -> StretchF
         nis = np.concatenate([found.nis[at] for at in mine])
         measurements[role] = int((outcome != NOT_RUN).sum())
         rejected[role] = int((outcome == REJECTED).sum())
-        recovered[role] = int((outcome == RECOVERED).sum())
         nis_mean[role] = float(nis[accepted].sum() / freedom[accepted].sum()) if accepted.any() else None
-    return StretchFacts(nis_mean, measurements, rejected, recovered=recovered)
+    return StretchFacts(nis_mean, measurements, rejected)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-
-import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
@@ -15,6 +12,7 @@ from tcpipe.formats.commit_log import read_state_here
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import KnownLog, RunFacts
 from tcpipe.formats.logs.log_joining import AnyLog, open_logs
+from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, make_recipe_id, read_key
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
 from tcpipe.formats.stored_runs import lend_streams
@@ -28,8 +26,6 @@ from tcpipe.store import Store
 from tcpipe.tables.findings import Finding, Subject, judge, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, MaskedTrack, Streams, Track, add_findings
 
-_M_MMAP_THRESHOLD = -3
-
 
 @dataclass(frozen=True, slots=True)
 class Ingested:
@@ -42,7 +38,7 @@ class Ingested:
 
 def ingest_one(task: IngestTask) -> Ingested:
     """Ingest one run from its log as that is now; every error becomes its result, so that one log never costs the others."""
-    _return_freed_memory()
+    return_freed_memory()
     task = replace(task, source=task.source.now())
     hashed, rows = list[str](), list[RunFacts]()
     young = check_age(task)
@@ -54,15 +50,6 @@ def ingest_one(task: IngestTask) -> Ingested:
         note = "changed during the check; will be ingested when its recording has ended"
         return Ingested(task.source, IngestResult(task.source.name, "waiting", notes=(note,)))
     return Ingested(task.source, replace(result, sha256=hashed[0]) if hashed else result, tuple(rows))
-
-
-def _return_freed_memory() -> None:
-    """Have columns go back to the system when nobody needs them: heaps would keep the room of all that a long log ever took."""
-    pa.set_memory_pool(pa.system_memory_pool())
-    with suppress(OSError, AttributeError, TypeError):  # only glibc has it
-        library = ctypes.CDLL(None)
-        library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
-        library.malloc_trim(0)
 
 
 def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> IngestResult:
@@ -88,7 +75,7 @@ def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> Ing
             known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
         streams = lend_streams(store.runs_place.below(run_id), streams, known.streams)
-        _return_freed_memory()
+        return_freed_memory()
         manifest = _fuse_and_label(store, run_id, streams, known, task)
     rows += _read_rows(store, state, run_id, manifest.recipe_id)
     (made,) = (row for row in rows if row.recipe_id == manifest.recipe_id)

@@ -143,6 +143,7 @@ def _bring_card(place: Place) -> tuple[str, ...]:
 
 def _bring_store(source: Place, target: Place) -> Migrated:
     """Bring a store to this data model; ``target`` is ``source``, or where it is copied to."""
+    target.clear()
     is_current, names = read_layout(source) == DATA_MODEL_VERSION, [entry.name for entry in source.entries()]
     there = {entry.name: entry.size_bytes for entry in target.entries()}
     units, log = dict[str, list[str]](), list[str]()
@@ -158,9 +159,9 @@ def _bring_store(source: Place, target: Place) -> Migrated:
     records = [name for name in names if name.startswith(_RECORDS)]
     if records or read_layout(target) != DATA_MODEL_VERSION:
         problems += _write_log(Store(target.where()), source, records)
-    _put(target, MARK, to_json(seal_document(StoreDocument(DATA_MODEL_VERSION))).encode(), there)
     for name in (name for name in names if target == source and name.startswith((_RECORDS, f"{_INDEX}logs."))):
         source.delete(name)
+    _put(target, MARK, to_json(seal_document(StoreDocument(DATA_MODEL_VERSION))).encode(), there)
     count = sum(map(_is_converted, names))
     return Migrated(target.where(), tuple(changed), count - len(changed), tuple(problems), copied)
 

@@ -66,7 +66,7 @@ def verify_store(store: Store) -> Iterator[CheckResult]:
     for name in place.folders():
         if name == SPOOL:
             yield f"{place.where(name)}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones"
-        elif name not in (LOG, "maps", "runs", _INDEX):
+        elif name not in (LOG, "maps", "runs", _INDEX) and place.entries(name):
             yield _describe_stranger(place, name)
     yield from verify_log(place.below(LOG))
     yield from _verify_maps(store)

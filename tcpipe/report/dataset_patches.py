@@ -80,7 +80,7 @@ def _open_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Pat
     return _Patches(files, place, piece, choose_thinning(card.patch_px))
 
 
-def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int64]) -> Json:
+def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int32]) -> Json:
     """Return sheets of patches by layer and the rows of the page that they belong to (``row_of`` each sample, (T,)).
 
     `DatasetError` if they cannot be read.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,6 @@ SAMPLE_COLUMNS = (
 """Of samples.parquet that the page needs."""
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ class SamplesShown:
     """
 
     xy_m: Floats
-    row_of: Ints
+    row_of: NDArray[np.int32]
     apart_m: Floats
     cell_m: float | None
     json: Json
@@ -222,10 +222,12 @@ def _make_label_sections(samples: pa.Table) -> list[Section]:
 
 def _draw_distances(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
     """Yield the distances of held-out samples to the nearest training sample, unless cells are shown in their place."""
+    if shown.cell_m is not None:
+        return
     split = to_texts(samples.column("split"))
     distances_m = {name: np.sort(shown.apart_m[split == name]) for name in ("test", "unseen")}
     distances_m = {name: part for name, part in distances_m.items() if np.isfinite(part).any()}
-    if shown.cell_m is not None or not distances_m:
+    if not distances_m:
         return
     plot = make_plot(
         "apart",
@@ -338,10 +340,13 @@ def _make_provenance_section(card: DatasetCard) -> Section:
     return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)
 
 
-def find_nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints]:
-    """Return distance [m] and row of the nearest training sample, by middles, of each held-out sample, shape (N,); NaN elsewhere."""
-    apart, nearest = np.full(len(xy_m), np.nan), np.zeros(len(xy_m), np.int64)
-    held, train = np.flatnonzero(np.isin(split, ("test", "unseen"))), np.flatnonzero(split == "train")
+def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floats, NDArray[np.int32]]:
+    """Return distance [m] and row of the nearest training sample, by middles, of each held-out sample, shape (N,); NaN elsewhere.
+
+    ``split`` is the number of each sample's split in `SPLITS`, shape (N,).
+    """
+    apart, nearest = np.full(len(xy_m), np.nan), np.zeros(len(xy_m), np.int32)
+    held, train = (np.flatnonzero(np.isin(SPLITS, names)[split]) for names in (("test", "unseen"), "train"))
     if len(held) and len(train):
         apart[held], found = cKDTree(xy_m[train]).query(xy_m[held])
         nearest[held] = train[found]
@@ -353,22 +358,22 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
     to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
     middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
     xy_m = np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
-    split = to_texts(table.column("split"))
-    apart_m, nearest = find_nearest_train_m(xy_m, split)
-    values = _read_values(card, table, apart_m) | {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
-    cell_m, row_of = None, np.arange(table.num_rows)
-    run_ids = [run.run_id for run in card.runs]
-    keys = {
+    cell_m, row_of = None, np.arange(table.num_rows, dtype=np.int32)
+    keys: dict[str, NDArray[np.integer]] = {
         "split": _find_indices(table, "split", SPLITS),
-        "class": np.nan_to_num(to_floats(table, "terrain_class")).astype(np.int64),
+        "class": table.column("terrain_class").fill_null(0).to_numpy(),
+        "quality": table.column("quality").to_numpy(),
+        "run": _find_indices(table, "run_id", [run.run_id for run in card.runs]),
     }
-    keys |= {
-        "quality": table.column("quality").to_numpy().astype(np.int64),
-        "run": _find_indices(table, "run_id", run_ids),
-    }
+    apart_m, nearest = find_nearest_train_m(xy_m, keys["split"])
+    x_m, y_m = xy_m.T
+    readers = _list_values(card, table) | {"apart": lambda: apart_m, "x": lambda: x_m, "y": lambda: y_m}
     if table.num_rows > MOST_SAMPLES:
-        values, keys, row_of, cell_m = _average_in_cells(values, keys)
+        values, keys, row_of, cell_m = _average_in_cells(readers, keys, xy_m)
         xy_m = np.column_stack([values["x"], values["y"]])
+    else:
+        values = {name: read() for name, read in readers.items()}
+        values["count"] = np.ones(len(xy_m))
     columns: dict[str, Column] = {"x": ("steps", values["x"]), "y": ("steps", values["y"])}
     columns |= {name: make_shown_column(digits, values[name]) for name, (*_, digits) in LABELS.items()}
     columns |= {name: ("half", part) for name, part in values.items() if name not in {*columns, "count"}}
@@ -383,20 +388,22 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
     return SamplesShown(xy_m, row_of, apart_m, cell_m, json)
 
 
-def _read_values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[str, Floats]:
-    values = {name: to_floats(table, column) for name, (column, *_) in LABELS.items()}
-    values |= {f"{name}_std": to_floats(table, column) for name, (_, column, _) in LABELS.items()}
+def _list_values(card: DatasetCard, table: pa.Table) -> dict[str, Callable[[], Floats]]:
+    """Return by name what reads a value of every sample, shape (N,): one at a time, so that few are in memory."""
+    readers = {name: partial(to_floats, table, column) for name, (column, *_) in LABELS.items()}
+    readers |= {f"{name}_std": partial(to_floats, table, column) for name, (_, column, _) in LABELS.items()}
     angles = {"slope": "slope_rad", "turn": "yaw_change_rad"}
-    values |= {name: np.degrees(to_floats(table, column)) for name, column in angles.items()}
+    every: dict[str, Callable[[], Floats]] = {**readers}
+    every |= {name: lambda of=column: np.degrees(to_floats(table, of)) for name, column in angles.items()}  # type: ignore[misc]
     if card.physics:
-        values["residual"] = values["power"] - to_floats(table, "physics_power_watt")
-    return values | {"apart": apart_m}
+        every["residual"] = lambda: readers["power"]() - to_floats(table, "physics_power_watt")
+    return every
 
 
-def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> Ints:
+def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray[np.int32]:
     """Return the place of each row's name among ``names``, shape (N,); 0 of an unknown one."""
-    indices = pc.index_in(table.column(column).combine_chunks(), value_set=pa.array(names, pa.string()))
-    return np.asarray(indices.fill_null(0).to_numpy(), np.int64)
+    indices = pc.index_in(table.column(column), value_set=pa.array(names, pa.string()))
+    return np.asarray(indices.fill_null(0).to_numpy(), np.int32)
 
 
 def find_first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
@@ -417,28 +424,35 @@ def _find_odd_ids(table: pa.Table) -> Sequence[str] | None:
 
 
 def _average_in_cells(
-    values: Mapping[str, Floats], keys: Mapping[str, Ints]
-) -> tuple[dict[str, Floats], dict[str, Ints], Ints, float]:
+    readers: Mapping[str, Callable[[], Floats]], keys: Mapping[str, NDArray[np.integer]], xy_m: Floats
+) -> tuple[dict[str, Floats], dict[str, NDArray[np.integer]], NDArray[np.int32], float]:
     """Return means over square cells, one row for each split and class in a cell, each sample's row, and the cells' side [m]."""
-    x, y = values["x"] - values["x"].min(), values["y"] - values["y"].min()
-    cell_m = 1.0
+    cell_m, low_m = 1.0, xy_m.min(axis=0)
     while True:
-        place = (np.floor(x / cell_m) * 4e6 + np.floor(y / cell_m)).astype(np.int64)
-        _, group = np.unique((place * 4 + keys["split"]) * 256 + keys["class"], return_inverse=True)
-        if group.max(initial=0) < MOST_SAMPLES:
+        place = np.zeros(len(xy_m), np.int64)
+        for axis, factor in ((0, 4_000_000), (1, 1)):
+            place += np.floor((xy_m[:, axis] - low_m[axis]) / cell_m).astype(np.int64) * factor
+        place *= 4
+        place += keys["split"]
+        place *= 256
+        place += keys["class"]
+        groups = np.unique(place)
+        if len(groups) <= MOST_SAMPLES:
             break
         cell_m *= np.sqrt(2.0)
-    size = int(group.max(initial=-1)) + 1
-    count = np.bincount(group, minlength=size).astype(float)
+    size, group = len(groups), np.searchsorted(groups, place).astype(np.int32)
+    del place
     means = {}
-    for name, part in values.items():
+    for name, read in readers.items():
+        part = read()
         known = np.isfinite(part)
         with np.errstate(invalid="ignore"):
             means[name] = np.bincount(group[known], part[known], size) / np.bincount(group[known], minlength=size)
-    whole = {name: np.zeros(size, np.int64) for name in keys}
+    count = np.bincount(group, minlength=size).astype(float)
+    whole: dict[str, NDArray[np.integer]] = {name: np.zeros(size, np.int64) for name in keys}
     for name, numbers in keys.items():
         if name == "quality":
             np.bitwise_or.at(whole[name], group, numbers)
         else:
             whole[name][group] = numbers
-    return means | {"count": count}, whole, group.astype(np.int64), float(cell_m)
+    return means | {"count": count}, whole, group, float(cell_m)

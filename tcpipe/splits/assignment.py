@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = NDArray[np.signedinteger]
 Names = NDArray[np.str_]
 Mask = NDArray[np.bool_]
 Ranks = NDArray[np.uint64]
@@ -36,6 +36,13 @@ UNDECIDED = -1
 
 NO_FOLD = UNDECIDED
 """Fold of a sample that is neither train nor test."""
+
+_NAMES = np.array([*SPLITS, EXCLUDED, ""])
+_TRAIN, _TEST, _UNSEEN, _BUFFER, _EXCLUDED, _NEW = np.arange(len(_NAMES), dtype=np.uint8)
+_CODE_BY_SIDE = np.array([_TRAIN, _UNSEEN, _BUFFER, _EXCLUDED])
+
+_CHUNK = 65_536
+"""Footprints whose centres are computed together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +63,18 @@ class Groups:
         return np.where(votes.any(axis=1), votes.argmax(axis=1), UNDECIDED)
 
 
-def assign_blocks(centres_xy_m: Floats, *, block_m: float) -> Groups:
-    """Return the spatial block of each footprint's centre: square cells of ``block_m`` [m] on the plane's own origin."""
-    cells = np.floor(centres_xy_m / block_m).astype(np.int64)
-    codes, first, member = np.unique((cells[:, 0] << 32) + cells[:, 1], return_index=True, return_inverse=True)
-    names = tuple(f"{block_m:g}:{column}:{row}" for column, row in cells[first].tolist())
-    return Groups(member.astype(np.int64).reshape(len(cells)), names if len(codes) else ())
+def assign_blocks(corners_xy_m: Floats, rows: Ints, *, block_m: float) -> Groups:
+    """Return the spatial block of the centre of footprints ``rows``: square cells of ``block_m`` [m] on the plane's own origin."""
+    codes = np.empty(len(rows), np.int64)
+    for first in range(0, len(rows), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        cells = np.floor(corners_xy_m[rows[part]].mean(axis=1) / block_m).astype(np.int64)
+        codes[part] = (cells[:, 0] << 32) + cells[:, 1]
+    blocks = np.unique(codes)
+    row = ((blocks + (1 << 31)) & 0xFFFF_FFFF) - (1 << 31)
+    cells = np.stack([(blocks - row) >> 32, row], axis=1)
+    names = tuple(f"{block_m:g}:{column}:{row}" for column, row in cells.tolist())
+    return Groups(np.searchsorted(blocks, codes).astype(np.int32), names)
 
 
 def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: float, kept: Ints | None = None) -> Mask:
@@ -87,8 +100,9 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
         chosen = free[: max(missing, 0)]
         test[chosen] = True
         missing, first = missing - len(chosen), end
-    rest = np.flatnonzero((kept == UNDECIDED) & ~test)
-    test[rest[np.argsort(ranks[rest], kind="stable")][: max(missing, 0)]] = True
+    if missing > 0:
+        rest = np.flatnonzero((kept == UNDECIDED) & ~test)
+        test[rest[np.argsort(ranks[rest], kind="stable")][:missing]] = True
     return test
 
 
@@ -156,16 +170,36 @@ def _iterate_sizes(groups: Groups, arrival: Ints) -> Iterator[Ints]:
 
 def group_by_run(run: Ints, names: Sequence[str]) -> Groups:
     """Return runs as groups: the number of each sample's run, shape (N,), and the runs' names by number."""
-    used, member = np.unique(run, return_inverse=True)
-    return Groups(member.astype(np.int64).reshape(len(run)), tuple(names[number] for number in used.tolist()))
+    used = np.unique(run)
+    return Groups(np.searchsorted(used, run).astype(np.int32), tuple(names[number] for number in used.tolist()))
 
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Split of every sample, one of `SPLITS` or `EXCLUDED`, (N,), and its fold or `NO_FOLD`, (N,)."""
+    """Split of every sample as a number, and its fold or `NO_FOLD`, each a byte: shape (N,)."""
 
-    split: Names
-    fold: Ints
+    code: NDArray[np.uint8]
+    fold: NDArray[np.int8]
+
+    @classmethod
+    def from_names(cls, split: Names, fold: NDArray[np.signedinteger]) -> Assignment:
+        """Return an assignment by the names of splits; "" where there is none."""
+        order = np.argsort(_NAMES)
+        return cls(order[np.searchsorted(_NAMES, split, sorter=order)].astype(np.uint8), fold.astype(np.int8))
+
+    @property
+    def split(self) -> Names:
+        """The split of every sample by its name: one of `SPLITS` or `EXCLUDED`."""
+        names: Names = _NAMES[self.code]
+        return names
+
+    def is_in(self, *splits: str) -> Mask:
+        """Return which samples are in one of these splits, shape (N,)."""
+        return np.isin(_NAMES, splits)[self.code]
+
+    def select(self, rows: Ints) -> Assignment:
+        """Return the assignment of some samples."""
+        return Assignment(self.code[rows], self.fold[rows])
 
 
 def assign_splits(
@@ -202,14 +236,15 @@ def assign_splits(
     """
     n = len(ranks)
     sides = np.zeros(n, np.uint8) if regions is None else classify_footprints(corners_xy_m, regions, buffer_m=buffer_m)
-    split = np.array(["train", "unseen", "buffer", EXCLUDED], dtype=np.str_)[sides]
-    old = np.full(n, "", np.str_) if kept is None else np.where(sides == Side.EXCLUDED, "", kept.split)
-    split[old != ""] = old[old != ""]
-    inside = np.flatnonzero((split == "train") | (split == "test"))
-    known = np.select([old[inside] == "test", old[inside] == "train"], [1, 0], UNDECIDED)
+    code, new = _CODE_BY_SIDE[sides], np.ones(n, np.bool_)
+    if kept is not None:
+        new = (kept.code == _NEW) | (sides == Side.EXCLUDED)
+        code = np.where(new, code, kept.code)
+    inside = np.flatnonzero(code <= _TEST)
+    known = np.where(new[inside], UNDECIDED, code[inside] == _TEST).astype(np.int8)
     whole = {"run": (run, run_names), "tag": tagged}.get(holdout)
     groups = (
-        assign_blocks(corners_xy_m.mean(axis=1)[inside], block_m=block_m)
+        assign_blocks(corners_xy_m, inside, block_m=block_m)
         if whole is None
         else group_by_run(whole[0][inside], whole[1])
     )
@@ -218,12 +253,12 @@ def assign_splits(
     else:
         chosen = draw_groups(groups, run[inside], test_fraction=test_fraction, seed=seed, kept=groups.decided(known))
         test = np.where(known == UNDECIDED, chosen[groups.member], known == 1)
-    split[inside] = np.where(test, "test", "train")
-    fold = np.full(n, NO_FOLD)
-    old_fold = np.full(len(inside), NO_FOLD) if kept is None else kept.fold[inside]
-    dealt = draw_folds(groups, run[inside], folds=folds, seed=seed, kept=groups.decided(old_fold))
+    code[inside] = np.where(test, _TEST, _TRAIN)
+    fold = np.full(n, NO_FOLD, np.int8)
+    old_fold = fold[inside] if kept is None else kept.fold[inside]
+    dealt = draw_folds(groups, run[inside], folds=folds, seed=seed, kept=groups.decided(old_fold)).astype(np.int8)
     fold[inside] = np.where(old_fold == NO_FOLD, dealt[groups.member], old_fold)
-    return Assignment(split, fold)
+    return Assignment(code, fold)
 
 
 def hash_ranks(names: Sequence[str], *, seed: int, purpose: str) -> Ranks:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,13 +13,14 @@ from scipy.spatial import cKDTree
 from tcpipe.compiled import compile_kernel
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = NDArray[np.signedinteger]
+Mask = NDArray[np.bool_]
 
 _CONTACT_FRACTION = 1e-3
 """Footprints that share less of their area than this touch; consecutive segments always do."""
 
-_CHUNK = 16_384
-"""Footprints looked at together."""
+_CHUNK = 4_096
+"""Footprints looked at together: each may be near hundreds of others."""
 
 CLOSE = 1.05
 """Ground nearer than so many chords to a training sample counts as covered: consecutive samples are one chord apart."""
@@ -53,50 +54,74 @@ class HeldOut:
 
 
 def audit_leakage(
-    split: NDArray[np.str_], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
+    train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
 ) -> tuple[HeldOut, ...]:
-    """Return one entry for ``test`` and one for ``unseen``, each against train.
+    """Return one entry for each split that is ``held`` out, by its name, against train.
 
     Parameters
     ----------
-    split, run, start_ns : split of each sample, number of its run, and start of its segment [ns], shape (N,).
+    train, held : which samples are in each split, shape (N,).
+    run, start_ns : number of each sample's run, and start of its segment [ns], shape (N,).
     corners_xy_m : corners of the footprints [m], shape (N, 4, 2).
     chord_m : segment length [m]; samples follow one another if their centres are at most 1.5 chords apart.
     """
-    follows = _find_consecutive(run, start_ns, corners_xy_m.mean(axis=1), chord_m=chord_m)
-    return tuple(_audit_split(name, split, run, follows, corners_xy_m) for name in ("test", "unseen"))
+    crossing = _count_crossing(train, held, run, start_ns, corners_xy_m, chord_m=chord_m)
+    ground = Ground(corners_xy_m, np.flatnonzero(train))
+    return tuple(_audit_split(name, np.flatnonzero(of), run, ground, crossing[name]) for name, of in held.items())
 
 
-def _find_consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_m: float) -> Ints:
-    """Return index pairs of samples that follow one another on one track, shape (P, 2)."""
-    order = np.lexsort((start_ns, run))
-    before, after = order[:-1], order[1:]
-    apart_m = np.linalg.norm(centres_xy_m[after] - centres_xy_m[before], axis=1)
-    adjoining = (run[before] == run[after]) & (apart_m <= 1.5 * chord_m)
-    return np.column_stack([before[adjoining], after[adjoining]])
+def _count_crossing(
+    train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
+) -> dict[str, int]:
+    """Return by split how many pairs of samples follow one another on one track, one held out and one in train."""
+    order, found = np.lexsort((start_ns, run)), dict.fromkeys(held, 0)
+    for first in range(0, len(order) - 1, _CHUNK):
+        rows = order[first : first + _CHUNK + 1]
+        before, after = rows[:-1], rows[1:]
+        apart_m = np.linalg.norm(np.diff(corners_xy_m[rows].mean(axis=1), axis=0), axis=1)
+        adjoining = (run[before] == run[after]) & (apart_m <= 1.5 * chord_m)
+        for name, of in held.items():
+            crosses = (of[before] & train[after]) | (train[before] & of[after])
+            found[name] += int((crosses & adjoining).sum())
+    return found
 
 
-def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, corners_xy_m: Floats) -> HeldOut:
-    held, train = np.flatnonzero(split == name), np.flatnonzero(split == "train")
-    queries, references = corners_xy_m[held], corners_xy_m[train]
-    pairs, overlaps, repeated = 0, np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
-    diagonal_m = float(np.linalg.norm(corners_xy_m[:, 2] - corners_xy_m[:, 0], axis=1).max(initial=0.0))
-    for i, j in iterate_near_pairs(queries.mean(axis=1), references.mean(axis=1), within_m=diagonal_m):
-        real = compute_shared_fraction(queries, references, i, j) > _CONTACT_FRACTION
+class Ground:
+    """Ground of footprints ``rows`` among all, whose corners are counter-clockwise, shape (N, 4, 2) [m]."""
+
+    def __init__(self, corners_xy_m: Floats, rows: Ints) -> None:
+        self.corners_xy_m, self.rows = corners_xy_m, rows
+        centres, self.half_diagonal_m = np.empty((len(rows), 2)), 0.0
+        for first in range(0, len(rows), _CHUNK):
+            corners = corners_xy_m[rows[first : first + _CHUNK]]
+            centres[first : first + _CHUNK] = corners.mean(axis=1)
+            self.half_diagonal_m = max(self.half_diagonal_m, _compute_half_diagonal_m(corners))
+        self.tree = cKDTree(centres)
+
+
+def _audit_split(name: str, held: Ints, run: Ints, train: Ground, crossing: int) -> HeldOut:
+    pairs = overlapping = repeated = 0
+    apart_m = [np.empty(0)]
+    for rows in _split_points(held, _CHUNK) if len(train.rows) else []:
+        queries = train.corners_xy_m[rows]
+        reach_m = _compute_half_diagonal_m(queries) + train.half_diagonal_m
+        i, j = find_near_pairs(queries.mean(axis=1), train.tree, within_m=reach_m)
+        j = train.rows[j]
+        real = compute_shared_fraction(queries, train.corners_xy_m, i, j) > _CONTACT_FRACTION
         pairs += int(real.sum())
-        overlaps[i[real]] = True
-        repeated[i[real & (run[held[i]] != run[train[j]])]] = True
-    crossing = (split == name)[follows].any(axis=1) & (split == "train")[follows].any(axis=1)
-    apart_m = compute_nearest_m(queries, references)
+        overlapping += len(np.unique(i[real]))
+        repeated += len(np.unique(i[real & (run[rows[i]] != run[j])]))
+        apart_m.append(compute_nearest_m(queries, train))
+    nearest_m = np.concatenate(apart_m)
     return HeldOut(
         split=name,
         samples=len(held),
-        overlapping_samples=int(overlaps.sum()),
+        overlapping_samples=overlapping,
         overlapping_pairs=pairs,
-        same_track_pairs=int(crossing.sum()),
-        repeated_place_samples=int(repeated.sum()),
-        nearest_train_min_m=float(apart_m.min()) if len(apart_m) else None,
-        nearest_train_median_m=float(np.median(apart_m)) if len(apart_m) else None,
+        same_track_pairs=crossing,
+        repeated_place_samples=repeated,
+        nearest_train_min_m=float(nearest_m.min()) if len(nearest_m) else None,
+        nearest_train_median_m=float(np.median(nearest_m)) if len(nearest_m) else None,
     )
 
 
@@ -119,18 +144,11 @@ def are_near(queries_deg: Floats, references_deg: Floats, *, within_m: float) ->
     return found
 
 
-def iterate_near_pairs(
-    queries_xy_m: Floats, references_xy_m: Floats, *, within_m: float
-) -> Iterator[tuple[Ints, Ints]]:
-    """Yield index pairs of points at most ``within_m`` apart [m]: ``queries`` (N, 2) and ``references`` (M, 2), by chunk of queries."""
-    if len(queries_xy_m) == 0 or len(references_xy_m) == 0:
-        return
-    tree = cKDTree(references_xy_m)
-    for first in range(0, len(queries_xy_m), _CHUNK):
-        part = cKDTree(queries_xy_m[first : first + _CHUNK])
-        found = part.sparse_distance_matrix(tree, within_m, output_type="ndarray")
-        order = np.lexsort((found["j"], found["i"]))
-        yield found["i"][order] + first, found["j"][order]
+def find_near_pairs(queries_xy_m: Floats, tree: cKDTree, *, within_m: float) -> tuple[Ints, Ints]:
+    """Return index pairs of ``queries``, shape (N, 2), and points of a tree that are at most ``within_m`` apart [m], in order."""
+    found = cKDTree(queries_xy_m).sparse_distance_matrix(tree, within_m, output_type="ndarray")
+    order = np.lexsort((found["j"], found["i"]))
+    return found["i"][order], found["j"][order]
 
 
 def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Ints) -> Floats:
@@ -141,28 +159,25 @@ def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Int
     return np.asarray(shared_m2 / side_m[i] ** 2)
 
 
-def compute_nearest_m(queries: Floats, references: Floats) -> Floats:
-    """Return the distance from each of ``queries`` to the nearest of ``references`` [m], (N,); empty if either is.
-
-    Both are corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
-    """
-    if len(queries) == 0 or len(references) == 0:
+def compute_nearest_m(queries: Floats, ground: Ground) -> Floats:
+    """Return the distance from each of ``queries``, corners (N, 4, 2), to the nearest of the ground [m], (N,); empty if either is."""
+    count = len(ground.rows)
+    if len(queries) == 0 or count == 0:
         return np.empty(0)
-    tree = cKDTree(references.mean(axis=1))
-    reach_m = _compute_half_diagonal_m(queries) + _compute_half_diagonal_m(references)
+    reach_m = _compute_half_diagonal_m(queries) + ground.half_diagonal_m
     best_m = np.full(len(queries), np.inf)
     pending = [(rows, 8) for rows in _split_points(np.arange(len(queries)), _CHUNK)]
     while pending:
-        rows, count = pending.pop()
-        asked = min(count, len(references))
-        distances_m, j = tree.query(queries[rows].mean(axis=1), k=np.arange(1, asked + 1))
-        apart_m = np.empty(j.size)
-        pair_distances(queries, references, np.repeat(rows, asked), j.reshape(-1).astype(np.int64), apart_m)
+        rows, wanted = pending.pop()
+        asked = min(wanted, count)
+        distances_m, j = ground.tree.query(queries[rows].mean(axis=1), k=np.arange(1, asked + 1))
+        apart_m, near = np.empty(j.size), ground.rows[j.reshape(-1)]
+        pair_distances(queries, ground.corners_xy_m, np.repeat(rows, asked), near, apart_m)
         best_m[rows] = apart_m.reshape(-1, asked).min(axis=1)
         # squares are nearer than their centres by at most two half diagonals: what is farther still cannot win
         doubtful = rows[(best_m[rows] > np.asarray(distances_m)[:, -1] - reach_m) & (best_m[rows] > 0.0)]
-        if asked < len(references):
-            pending += [(part, 4 * count) for part in _split_points(doubtful, max(_CHUNK * 2 // count, 1))]
+        if asked < count:
+            pending += [(part, 4 * wanted) for part in _split_points(doubtful, max(_CHUNK * 2 // wanted, 1))]
     return best_m
 
 
@@ -172,7 +187,7 @@ def _split_points(rows: Ints, size: int) -> list[Ints]:
 
 def _compute_half_diagonal_m(corners: Floats) -> float:
     across: Floats = corners[:, 2] - corners[:, 0]
-    return float(np.hypot(across[:, 0], across[:, 1]).max()) / 2.0
+    return float(np.hypot(across[:, 0], across[:, 1]).max(initial=0.0)) / 2.0
 
 
 @compile_kernel

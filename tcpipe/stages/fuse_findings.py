@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -153,7 +154,16 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
 
 def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
     """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
-    for change in (each for section in facts.stretches for each in section.changes):
+    merged: list[ChangeFacts] = []
+    changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
+    for change in sorted(changes, key=lambda each: (each.role, each.kind, each.start_ns)):
+        before = merged[-1] if merged else change
+        if merged and (before.role, before.kind) == (change.role, change.kind) and change.start_ns <= before.end_ns:
+            end_ns, size = max(before.end_ns, change.end_ns), max(before.size, change.size)
+            merged[-1] = replace(before, end_ns=end_ns, size=size)
+        else:
+            merged.append(change)
+    for change in sorted(merged, key=lambda each: each.start_ns):
         subject = Subject("role", change.role)
         names = {"change": CHANGES[change.kind]}
         yield make_finding(
@@ -164,7 +174,7 @@ def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
 CHANGES = {
     "offset": "positions are off by a constant",
     "wander": "positions err far more than usual",
-    "antenna": "the antenna was moved",
+    "antenna": "it was moved on the robot",
     "clock": "its clock stepped",
     "gyroscope": "the bias of its gyroscope jumped",
     "scale": "its scale changed",
@@ -254,9 +264,11 @@ def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Str
             yield make_finding("odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=std)
     # That of wheels always varies: they slip.
     camera = parameters.get("camera scale")
-    variation = 0.0 if camera is None else max(camera.variation, default=0.0)
-    if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
-        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=variation)
+    varies = {} if camera is None else {VISUAL: max(camera.variation, default=0.0)}
+    varies |= {each.role: each.size for of in facts.stretches for each in of.changes if each.kind == "varies"}
+    for role, variation in varies.items():
+        if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
+            yield make_finding("odometry-scale-varies", Subject("role", role), variation_fraction=variation)
 
 
 def _is_contradicted(found: ParameterFacts, least: float) -> bool:

@@ -17,7 +17,7 @@ from tcpipe.fusion.measurements import GNSS, BodyVelocities, InitialState
 from tcpipe.fusion.signals import compute_seconds, hold_last, is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
-from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix, rpy_from_quat
+from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
@@ -183,8 +183,5 @@ def make_section_facts(section: TrackSection, initial: InitialState, found: Traj
         rows=int(found.stamp_ns.size),
         sensors=tuple(m.sensors()),
         gyro_noise_radps=None if m.imu is None else m.imu.gyro_std_radps,
-        accelerometer_noise_mps2=None if m.imu is None else m.imu.accelerometer_std_mps2,
-        initial_yaw_rad=float(rpy_from_quat(initial.quat_xyzw)[2]),
-        initial_yaw_std_rad=initial.yaw_std_rad,
         heading_from=initial.heading_from,
     )

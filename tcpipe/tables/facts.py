@@ -8,22 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tcpipe.tables.findings import LEFT_OUT as LEFT_OUT  # noqa: PLC0414  facts are documents, too
 from tcpipe.tables.findings import StageReport
 
 ABSENT: Mapping[str, tuple[object, ...]] = {"json": (None,)}
 """Metadata of a field that JSON omits if it is None."""
-
-Vector = tuple[float, float, float]
-
-
-def make_vector(values: NDArray[np.float64]) -> Vector:
-    """Return the three values of an array."""
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +93,9 @@ class GateReset:
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """A change that explains a contradiction: its kind (a key of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
+    """A change that explains a contradiction: its kind (``varies`` or one of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
 
-    ``size``: median innovation of fixes there [m]; 0 of another sensor.
+    ``size``: median innovation of fixes there [m]; σ of a scale that varies [1]; 0 of other changes.
     """
 
     kind: str
@@ -148,26 +137,13 @@ class NoiseFacts:
 class StretchFacts:
     """One section that was fused in one pass: counts and estimates of the filter, then its span and initial state.
 
-    ``nis_mean`` is the normalised innovation squared over degrees of freedom, without rejected measurements; ``reopened`` and all from
-    ``events`` on are the error-state filter's, ``recovered`` is the 15-state filter's.
+    ``nis_mean`` is the normalised innovation squared over degrees of freedom, without rejected measurements.
     """
 
     nis_mean: Mapping[str, float | None]
     measurements: Mapping[str, int]
     rejected: Mapping[str, int]
-    recovered: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
-    reopened: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
-    events: int | None = field(default=None, metadata=LEFT_OUT)
-    zero_velocity_updates: int | None = field(default=None, metadata=LEFT_OUT)
-    gnss_lasting_error_m: float | None = field(default=None, metadata=LEFT_OUT)
     gate_resets: tuple[GateReset, ...] = field(default=(), metadata=LEFT_OUT)
-    gyro_bias_radps: Vector | None = None
-    turn_scale: float | None = None
-    accelerometer_bias_mps2: Vector | None = field(default=None, metadata=LEFT_OUT)
-    wheel_scale: float | None = field(default=None, metadata=LEFT_OUT)
-    wheel_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
-    visual_scale: float | None = field(default=None, metadata=LEFT_OUT)
-    visual_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
     changes: tuple[ChangeFacts, ...] = field(default=(), metadata=LEFT_OUT)
@@ -179,9 +155,6 @@ class StretchFacts:
     rows: int = 0
     sensors: tuple[str, ...] = ()
     gyro_noise_radps: float | None = None
-    accelerometer_noise_mps2: float | None = None
-    initial_yaw_rad: float | None = None
-    initial_yaw_std_rad: float | None = None
     heading_from: str = ""
 
 

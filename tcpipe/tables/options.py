@@ -151,7 +151,6 @@ EARLIER_DOCUMENT_KEYS = {
     "ledger_m": "distance_by_reason_m",
     "ledger_s": "duration_by_reason_s",
     "standing_watt": "idle_watt",
-    "standing_updates": "zero_velocity_updates",
     "standing": "stationary",
     "below_limit": "below_full_speed",
     "not_at_limit": "below_full_speed",

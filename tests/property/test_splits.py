@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from splits_squares import squares
 
 from tcpipe.splits.assignment import NO_FOLD, Assignment, Groups, assign_splits, draw_groups, hash_ranks
-from tcpipe.splits.audit import audit_leakage, compute_nearest_m, compute_shared_fraction, iterate_near_pairs
+from tcpipe.splits.audit import Ground, audit_leakage, compute_nearest_m, compute_shared_fraction, find_near_pairs
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
 coordinate = st.floats(-30, 30, allow_nan=False)
@@ -140,8 +140,9 @@ def test_a_kept_split_moves_nothing_wherever_a_run_comes_in(driven, where, holdo
     names = [f"r{i}" for i in range(run.max() + 1)]
     old = run != where % (run.max() + 1)
     first = split_of(corners[old], run[old], names, holdout="block")
-    kept = Assignment(np.full(len(run), "", "<U8"), np.full(len(run), NO_FOLD))
-    kept.split[old], kept.fold[old] = first.split, first.fold
+    split, fold = np.full(len(run), "", "<U8"), np.full(len(run), NO_FOLD)
+    split[old], fold[old] = first.split, first.fold
+    kept = Assignment.from_names(split, fold)
     after = split_of(corners, run, names, holdout=holdout, fraction=fraction, kept=kept)
     assert (after.split[old] == first.split).all()
     assert (after.fold[old] == first.fold).all()
@@ -171,10 +172,11 @@ def test_distance_and_shared_ground_are_those_of_shapely(seed, n, m, extent_m):
         squares(rng.uniform(0, extent_m, (count, 2)), rng.uniform(-np.pi, np.pi, count)) for count in (n, m)
     )
     a, b = shapely.polygons(ours)[:, None], shapely.polygons(theirs)[None]
-    np.testing.assert_allclose(compute_nearest_m(ours, theirs), shapely.distance(a, b).min(axis=1), atol=1e-9)
+    ground = Ground(theirs, np.arange(m))
+    np.testing.assert_allclose(compute_nearest_m(ours, ground), shapely.distance(a, b).min(axis=1), atol=1e-9)
     shared = np.zeros((n, m))
-    for i, j in iterate_near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=np.sqrt(2) + 1e-9):
-        shared[i, j] = compute_shared_fraction(ours, theirs, i, j)
+    i, j = find_near_pairs(ours.mean(axis=1), ground.tree, within_m=np.sqrt(2) + 1e-9)
+    shared[i, j] = compute_shared_fraction(ours, theirs, i, j)
     np.testing.assert_allclose(shared, shapely.area(shapely.intersection(a, b)), atol=1e-9)
 
 
@@ -186,7 +188,8 @@ def test_the_audit_is_that_of_plain_geometry_pair_by_pair(driven, seed):
     split = rng.choice(["train", "test", "unseen", "buffer"], len(run), p=[0.5, 0.2, 0.2, 0.1])
     polygons, start_ns = shapely.polygons(corners), np.arange(len(run))
     train = np.flatnonzero(split == "train")
-    for part in audit_leakage(split, run, start_ns, corners, chord_m=1.0):
+    held = {name: split == name for name in ("test", "unseen")}
+    for part in audit_leakage(split == "train", held, run, start_ns, corners, chord_m=1.0):
         held = np.flatnonzero(split == part.split)
         shared = shapely.area(shapely.intersection(polygons[held][:, None], polygons[train][None])) > 1e-3
         apart_m = shapely.distance(polygons[held][:, None], polygons[train][None])

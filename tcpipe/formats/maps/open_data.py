@@ -107,7 +107,7 @@ def find_catalogue(stac: str) -> Catalogue:
 
 
 def make_area(tracks: Sequence[NDArray[np.float64]], margin_m: float) -> Geometry:
-    """Return the ground around tracks, each (N, 2) longitude and latitude [deg], in these; the margin is right to 1 %."""
+    """Return the ground around tracks, each (N, 2) longitude and latitude [deg], in these; the margin is right to 2 %."""
     parts = []
     for lonlat in tracks:
         middle = (lonlat.min(axis=0) + lonlat.max(axis=0)) / 2.0

@@ -35,6 +35,8 @@ from tcpipe.terrain.projection import Projection, parse_crs
 _BLOCK_BYTES = 1 << 16
 _MOST_BLOCKS = 128
 """Of one request: 8 MB."""
+_MOST_BLOCKS_READ = 1_000_000
+"""Of one raster, as it is divided."""
 _LARGEST_BYTES = 1 << 42
 """Of a remote file; its parts lie at their places in a local one."""
 _MOST_PIXELS = 400_000_000
@@ -49,7 +51,7 @@ class RemoteFile:
     def __init__(self, client: HttpsClient, url: str) -> None:
         self._client, self.url, self._have = client, url, set[int]()
         self.size, self.version = 0, ""
-        self.error: MapError | None = None
+        self.error: Exception | None = None
         self._local = tempfile.TemporaryFile()  # noqa: SIM115  closed by `close`
 
     def close(self) -> None:
@@ -72,7 +74,7 @@ class RemoteFile:
         """Return bytes for GDAL; none after an error, which GDAL could not pass on."""
         try:
             self.fetch([(offset, count)])
-        except MapError as error:
+        except (MapError, OSError) as error:
             self.error = error
             return b""
         self._local.seek(offset)
@@ -85,11 +87,8 @@ class RemoteFile:
         found = re.fullmatch(rf"bytes {span[0]}-(\d{{1,15}})/(\d{{1,15}})", headers["Content-Range"] or "")
         size, version = int(found[2]) if found else 0, headers["ETag"] or headers["Last-Modified"] or ""
         self.size, self.version = self.size or size, self.version or version
-        if (len(data), size, version) != (
-            min(span[1] + 1, size) - span[0],
-            self.size,
-            self.version,
-        ) or size > _LARGEST_BYTES:
+        is_whole = len(data) == min(span[1] + 1, size) - span[0] and size <= _LARGEST_BYTES
+        if not is_whole or (size, version) != (self.size, self.version):
             raise MapError(
                 f"{self.url}: asked for bytes {span[0]} to {span[1]}, got {len(data)} ({headers['Content-Range']}, version {version}) "
                 f"of a file that had {self.size} (version {self.version}); run the command again"
@@ -122,10 +121,11 @@ class _Handle(io.RawIOBase):
 class RemoteWindow:
     """The pixels of a raster around an area; `copy` reads them."""
 
-    def __init__(self, remote: RemoteFile, dataset: Any, window: Window) -> None:
+    def __init__(self, client: HttpsClient, remote: RemoteFile, dataset: Any, window: Window) -> None:
         self._remote, self._dataset, self._window = remote, dataset, window
-        self._spans = list(_iterate_blocks(dataset, window))
+        self._spans = list(_iterate_blocks(dataset, window, remote.url))
         self.to_read_bytes = sum(count for _, count in self._spans)
+        client.check_left(remote.url, self.to_read_bytes)
         self.version = remote.version
         unit = parse_crs(dataset.crs.to_wkt(), where=remote.url).axis_info[0].unit_name
         self.resolution = f"{np.hypot(dataset.transform.a, dataset.transform.d):.6g} {unit}"
@@ -169,7 +169,7 @@ def open_window(client: HttpsClient, url: str, area: Geometry, *, crs: str | Non
             with rasterio.Env(**GDAL_CONFIG), rasterio.open(_NAME, driver="GTiff", opener=open_handle) as dataset:
                 check_layout(dataset, url, "download it and write it again: gdal_translate in.tif out.tif")
                 window = _find_window(dataset, url, area, crs)
-                yield None if window is None else RemoteWindow(remote, dataset, window)
+                yield None if window is None else RemoteWindow(client, remote, dataset, window)
         except RasterioError as error:
             raise remote.error or MapError(f"{url}: not a GeoTIFF, or damaged: {describe_error(error)}") from None
 
@@ -180,14 +180,14 @@ def _find_window(dataset: Any, url: str, area: Geometry, said: str | None) -> Wi
         raise MapError(f"{url}: has no georeference; tcpipe cannot tell which part of it covers the track")
     crs = parse_crs(dataset.crs.to_wkt(), where=url)
     placed = _project(area, crs)
-    if (
-        said
-        and not shapely.hausdorff_distance(placed, _project(area, parse_crs(said, where=f"{url} in the catalogue")))
-        < _SAME_PLACE
-    ):
+    xy = shapely.get_coordinates(placed)
+    stated = _project(area, parse_crs(said, where=f"{url} in the catalogue")) if said else placed
+    if not np.allclose(xy, shapely.get_coordinates(stated), rtol=0.0, atol=_SAME_PLACE):
         raise MapError(
-            f"{url}: its CRS is {crs.name!r}, the catalogue says {said}, which is elsewhere; tell the provider, and give other rasters"
+            f"{url}: its CRS is {crs.name!r}, the catalogue says {said}, which is elsewhere; give other rasters"
         )
+    if not np.isfinite(xy).all():
+        return None  # far outside the area of its CRS
     inverse = ~dataset.transform
     pixels = affine_transform(placed, (inverse.a, inverse.b, inverse.d, inverse.e, inverse.c, inverse.f))
     on_raster = shapely.intersection(pixels, shapely.box(0, 0, dataset.width, dataset.height))
@@ -207,17 +207,18 @@ def _project(area: Geometry, crs: CRS) -> Geometry:
     return shapely.transform(area, Projection(CRS.from_epsg(4326), crs, area.bounds).forward)
 
 
-def _iterate_blocks(dataset: Any, window: Window) -> Iterator[tuple[int, int]]:
+def _iterate_blocks(dataset: Any, window: Window, url: str) -> Iterator[tuple[int, int]]:
     """Yield offset and count of every block of a window, as GDAL finds them in the file; those of a mask are unknown."""
     bands = range(1, dataset.count + 1) if dataset.profile.get("interleave") == "band" else (1,)
     starts, ends = (window.row_off, window.col_off), (window.row_off + window.height, window.col_off + window.width)
-    rows, cols = (
-        range(a // side, -(-b // side)) for a, b, side in zip(starts, ends, dataset.block_shapes[0], strict=True)
-    )
+    sides = dataset.block_shapes[0]
+    rows, cols = (range(a // side, -(-b // side)) for a, b, side in zip(starts, ends, sides, strict=True))
+    if len(rows) * len(cols) > _MOST_BLOCKS_READ:
+        raise MapError(f"{url}: {len(rows) * len(cols)} blocks around the track, at most {_MOST_BLOCKS_READ}")
     for row, col, band in itertools.product(rows, cols, bands):
-        block = [dataset.get_tag_item(f"BLOCK_{of}_{col}_{row}", "TIFF", bidx=band) for of in ("OFFSET", "SIZE")]
-        if all(block):
-            yield int(block[0]), int(block[1])
+        found = [dataset.get_tag_item(f"BLOCK_{of}_{col}_{row}", "TIFF", bidx=band) for of in ("OFFSET", "SIZE")]
+        if all(found):
+            yield int(found[0]), int(found[1])
 
 
 def _move(of: Any, window: Window) -> rasterio.Affine:
@@ -230,14 +231,7 @@ def _copy_pixels(dataset: Any, window: Window, path: Path) -> None:
     """Write a window as a GeoTIFF of the same pixels, with what the raster says of them, some rows at a time."""
     profile = {"width": window.width, "height": window.height, "count": dataset.count, "dtype": dataset.dtypes[0]}
     profile |= {"crs": dataset.crs, "transform": _move(dataset.transform, window), "nodata": dataset.nodata}
-    profile |= {
-        "tiled": True,
-        "blockxsize": 256,
-        "blockysize": 256,
-        "compress": "deflate",
-        "zlevel": 1,
-        "BIGTIFF": "IF_SAFER",
-    }
+    profile |= {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate", "BIGTIFF": "IF_SAFER"}
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "w", driver="GTiff", **profile) as out:
         out.colorinterp = dataset.colorinterp
         out.scales, out.offsets, out.units = dataset.scales, dataset.offsets, [unit or "" for unit in dataset.units]

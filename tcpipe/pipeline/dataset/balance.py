@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
@@ -29,6 +30,8 @@ from tcpipe.balance.cells import (
     fit_cell_gradients,
 )
 from tcpipe.balance.correlation import (
+    Correlation,
+    Floor,
     compute_slope_residuals,
     estimate_correlations,
     estimate_repeatability,
@@ -39,7 +42,6 @@ from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.regions import Regions
-from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
@@ -79,30 +81,30 @@ def measure_balance(
     sources : the maps; the first counts where they overlap.
     regions, buffer_m : of the split, in WGS84 lon/lat [deg] and [m]: excluded ground and the buffer are not worth driving.
     """
-    split, slope = to_texts(table.column("split")), to_floats(table, "slope_rad")
-    terrain = table.column("terrain_class").fill_null(0).to_numpy().astype(np.int64)
-    labels = {name: to_floats(table, name) for name in ("power_watt", velocity_column, "duration_s", "energy_joule")}
-    residuals = {name: compute_slope_residuals(values, terrain, slope) for name, values in labels.items()}
-    run = table.column("run_id").combine_chunks().dictionary_encode().indices.to_numpy().astype(np.int64)
-    correlations = estimate_correlations(
-        {name: residuals[name] for name in ("power_watt", velocity_column)},
-        xy_m,
-        run,
-        to_integers(table, "start_ns"),
-        chord_m=chord_m,
-    )
+    slope, splits = to_floats(table, "slope_rad"), {name: _is_in(table, name) for name in SPLITS}
+    terrain = table.column("terrain_class").fill_null(0).to_numpy()
+    run = table.column("run_id").combine_chunks().dictionary_encode().indices.to_numpy()
+    start_ns = to_integers(table, "start_ns")
+    repeated = find_repeated_pairs(xy_m, to_floats(table, "course_rad"), terrain, chord_m=chord_m)
+    correlations, repeatability = dict[str, Correlation | None](), dict[str, Floor | None]()
+    for name in ("power_watt", velocity_column, "duration_s", "energy_joule"):  # one after another: each takes memory
+        values = to_floats(table, name)
+        residual = compute_slope_residuals(values, terrain, slope)
+        repeatability[name] = estimate_repeatability(values, residual, repeated, xy_m, chord_m=chord_m)
+        if name in ("power_watt", velocity_column):
+            correlations |= estimate_correlations({name: residual}, xy_m, run, start_ns, chord_m=chord_m)
     known = [correlation for correlation in correlations.values() if correlation is not None]
-    slopes, edges = find_slope_ranges(slope), choose_speed_edges(labels[velocity_column])
-    speeds = np.searchsorted(edges, labels[velocity_column], side="right").astype(np.int64)
-    pairs = count_cells((terrain, slopes), split, xy_m, known, splits=_USED)
-    cells = count_cells((terrain, slopes, speeds), split, xy_m, known, splits=_USED)
+    velocity_mps = to_floats(table, velocity_column)
+    slopes, edges = find_slope_ranges(slope), choose_speed_edges(velocity_mps)
+    speeds = np.searchsorted(edges, velocity_mps, side="right").astype(np.int8)
+    used = {name: splits[name] for name in _USED}
+    pairs = count_cells((terrain, slopes), used, xy_m, known)
+    cells = count_cells((terrain, slopes, speeds), used, xy_m, known)
     grounds = [
         _OpenGround(source, sources[:number], sources[0], regions, buffer_m) for number, source in enumerate(sources)
     ]
     names = dict(enumerate(sources[0].classes.names().tolist()))
-    used = split != "buffer"
-    rows, features = _count_by_ground(pairs, grounds, (terrain[used], slopes[used], xy_m[used]), names)
-    repeated = find_repeated_pairs(xy_m, to_floats(table, "course_rad"), terrain, chord_m=chord_m)
+    rows, features = _count_by_ground(pairs, grounds, (terrain, slopes, xy_m, ~splits["buffer"]), names)
     balance = Balance(
         slope_edges_deg=SLOPE_EDGES_DEG,
         speed_edges_mps=tuple(edges),
@@ -110,12 +112,13 @@ def measure_balance(
         correlation=correlations,
         by_class_and_slope=tuple(rows),
         cells=tuple(_make_row(cell, names, edges) for cell in cells),
-        repeatability={
-            name: estimate_repeatability(values, residuals[name], repeated, xy_m, chord_m=chord_m)
-            for name, values in labels.items()
-        },
+        repeatability=repeatability,
     )
     return balance, FeatureCollection(tuple(features))
+
+
+def _is_in(table: pa.Table, split: str) -> NDArray[np.bool_]:
+    return np.asarray(pc.equal(table.column("split"), split).to_numpy(), np.bool_)
 
 
 def _make_row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> CellRow:
@@ -213,14 +216,14 @@ def _read_ground(source: MapFile) -> MapGround:
 def _count_by_ground(
     pairs: Sequence[Cell],
     grounds: Sequence[_OpenGround],
-    driven_by: tuple[Ints, Ints, Floats],
+    driven_by: tuple[NDArray[np.integer], NDArray[np.int8], Floats, NDArray[np.bool_]],
     names: Mapping[int, str],
 ) -> tuple[list[CellRow], list[Feature]]:
     """Return a row for each class and slope that was driven or that the maps offer, and the polygons to drive next.
 
-    ``driven_by`` has class, range of slope and place [m] of each sample outside the buffer.
+    ``driven_by`` has class, range of slope and place [m] of each sample, and whether it is outside the buffer.
     """
-    terrain, slopes, xy_m = driven_by
+    terrain, slopes, xy_m, counts = driven_by
     driven = {(cell.terrain_class, cell.slope): cell for cell in pairs}
     kinds = {int(kind) for part in grounds for kind in np.unique(part.ground.terrain_class)} - {CLOSED}
     rows, thin = list[CellRow](), []
@@ -232,7 +235,7 @@ def _count_by_ground(
                 continue
             rows.append({**_make_row(cell, names, ()), "offered_m2": area_m2})
             if cell.is_undersampled and area_m2 > 0.0:
-                near = xy_m[(terrain == kind) & (slopes == slope)]
+                near = xy_m[(terrain == kind) & (slopes == slope) & counts]
                 thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, near)]
     thin.sort(key=lambda found: (found[0].effective or 0.0, found[0].terrain_class, found[0].slope, -found[1].area_m2))
     features = [

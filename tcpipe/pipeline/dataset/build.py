@@ -42,7 +42,7 @@ from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_p
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
-from tcpipe.formats.parquet import ROWS_PER_GROUP, map_table, write_parquet_rows, write_pieces
+from tcpipe.formats.parquet import ROWS_PER_GROUP, map_table, return_freed_memory, write_parquet_rows, write_pieces
 from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
@@ -197,6 +197,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         code = 3 if select_problems(inputs.findings) else 0
         return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
     output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
+    return_freed_memory()
     with commit_call(log, BUILD, [make_absolute(place)]) as call:
         start_workers = partial(_start_workers, jobs=options.jobs, cluster=options.cluster)
         with output as directory, start_workers(directory, opened, inputs.digest) as workers:
@@ -408,7 +409,10 @@ def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces(ROWS_PER_GROUP):
             write(piece)
-            yield piece.select(names).replace_schema_metadata(None)
+            few = piece.select(names).replace_schema_metadata(None)
+            del piece  # else it is in memory beside the next one
+            yield few
+            del few
 
     with write_parquet_rows(path, samples.schema) as write:
         write_pieces(mapped, pa.schema([samples.schema.field(name) for name in names]), write_both())

@@ -47,6 +47,7 @@ from tcpipe.formats.parquet import (
     map_table,
     move_to_file,
     read_table_bytes,
+    take_rows,
     write_pieces,
     write_table_bytes,
 )
@@ -198,8 +199,9 @@ class SampleTable:
     def take(self, rows: NDArray[np.int64]) -> pa.Table:
         """Return rows of the samples table (schema SAMPLES, and the added columns behind it)."""
         at = self.patch[rows]
-        rows_of_segments = pa.array(self.sampled.kept[at])
-        segments = self.segments.take(rows_of_segments)
+        assigned = self.assigned.select(at)
+        rows_of_segments = self.sampled.kept[at]
+        segments = take_rows(self.segments, rows_of_segments)
         columns: dict[str, Any] = {
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
@@ -212,13 +214,14 @@ class SampleTable:
             columns |= {column.name: pa.nulls(len(at), column.dtype) for column in of_terrain}
         table = SAMPLES.table(
             sample_id=segments.column("segment_id"),
-            split=self.assigned.split[at].tolist(),
-            fold=pa.array(self.assigned.fold[at], pa.int8(), mask=self.assigned.fold[at] == NO_FOLD),
+            split=assigned.split.tolist(),
+            fold=pa.array(assigned.fold, pa.int8(), mask=assigned.fold == NO_FOLD),
             map=[self.map_names[index] for index in self.sampled.map_index[at]],
             **columns,
         )
         for field in self.added.schema:
-            table = table.append_column(field, self.added.column(field.name).take(rows_of_segments))
+            added = take_rows(self.added.select([field.name]), rows_of_segments)
+            table = table.append_column(field, added.column(0))
         return add_geo_metadata(table if self.redaction is None else self.redaction.table(table), "Point", centres)
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
@@ -228,21 +231,24 @@ class SampleTable:
 
     def ids(self, first: int, last: int) -> list[str]:
         """Return the ids of rows ``first:last``."""
-        rows = pa.array(self.sampled.kept[self.patch[first:last]])
-        ids: list[str] = self.segments.column("segment_id").take(rows).to_pylist()
+        names = take_rows(self.segments.select(["segment_id", "run_id"]), self.sampled.kept[self.patch[first:last]])
+        ids: list[str] = names.column("segment_id").to_pylist()
         if self.redaction is None:
             return ids
-        runs = self.segments.column("run_id").take(rows).to_pylist()
+        runs = names.column("run_id").to_pylist()
         return [self.redaction.segment_id(name, run_id) for name, run_id in zip(ids, runs, strict=True)]
 
     def centres_xy_m(self) -> NDArray[np.float64]:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
-        centres: NDArray[np.float64] = self.sampled.footprint_xy_m[self.patch].mean(axis=1)
+        centres = np.empty((len(self), 2))
+        for first in range(0, len(self), _ROWS):
+            corners = self.sampled.footprint_xy_m[self.patch[first : first + _ROWS]]
+            centres[first : first + _ROWS] = corners.mean(axis=1)
         return centres
 
     def splits(self) -> NDArray[np.str_]:
         """Return the split of every sample, shape (N,)."""
-        return self.assigned.split[self.patch]
+        return self.assigned.select(self.patch).split
 
     def slots(self) -> NDArray[np.int64]:
         """Return the slot of every sample's pixels in the spool, shape (N,)."""
@@ -299,14 +305,15 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     assigned, result = draw_splits(
         segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
     )
-    assigned = Assignment(move_to_file(assigned.split, directory), move_to_file(assigned.fold, directory))
-    split = assigned.split
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
-    unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
+    unused_m = {
+        loss: arc_m[assigned.is_in(name)].sum()
+        for loss, name in ((Loss.SPLIT_BUFFER, "buffer"), (Loss.SPLIT_EXCLUDED, EXCLUDED))
+    }
     shifted = [finding for _, findings in registered for finding in findings]
-    in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
+    in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
-    kept = np.flatnonzero(split != EXCLUDED)
+    kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
         segments, sampled.kept[order], inputs.sources, inputs.covariates, recipe.covariates, layers=tuple(spool.layers)

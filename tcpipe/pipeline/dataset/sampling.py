@@ -23,7 +23,7 @@ from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.parquet import make_mapped_array, move_to_file
+from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file, take_rows
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
@@ -174,7 +174,7 @@ class _Batches(Sequence[_Batch]):
     def __getitem__(self, index: int) -> _Batch:  # type: ignore[override]  # nobody asks for slices
         """Return one batch."""
         rows = self.rows[index]
-        segments = self.whole.segments.take(pa.array(rows))
+        segments = take_rows(self.whole.segments, rows)
         return replace(self.whole, number=index, ranks=self.whole.ranks[rows], segments=segments)
 
 
@@ -223,13 +223,12 @@ def sample_all_segments(
                     columns[name][kept] = values
     finally:
         _held.clear()
-    kept = np.flatnonzero(lost_by == 0)
-    for name in columns:
-        columns[name] = move_to_file(columns[name][kept], directory)
+    kept = move_to_file(np.flatnonzero(lost_by == 0), directory)
+    columns = {name: move_rows_to_file(values, kept, directory) for name, values in columns.items()}
     every = dict.fromkeys(finding for index in sorted(findings) for finding in findings[index])
     placing = {name: columns.pop(name) for name in _PLACING}
     sampled = Sampled(kept=kept, patches=Patches({}, **columns), lost_by=lost_by, findings=tuple(every), **placing)
-    return sampled, move_to_file(slots[kept], directory), replace(spool, counts=tuple(counts))
+    return sampled, move_rows_to_file(slots, kept, directory), replace(spool, counts=tuple(counts))
 
 
 def _as_bytes(sampled: Sampled) -> bytes:

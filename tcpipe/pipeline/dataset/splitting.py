@@ -15,6 +15,7 @@ from pyproj import CRS
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import KeptSplit, SplitResult
 from tcpipe.formats.geojson import PolygonGeometry
+from tcpipe.formats.parquet import take_rows
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits, hash_ranks
@@ -51,11 +52,14 @@ def draw_splits(
     starts_ns = to_integers(segments, "start_ns")
     run, run_names = _number_runs(segments, starts_ns)
     run, starts_ns = run[sampled.kept], starts_ns[sampled.kept]
-    ids, rows = segments.column("segment_id"), sampled.kept
-    kept = None if earlier is None else _read_earlier_assignment(ids.take(pa.array(rows)), earlier)
-    pieces = (ids.take(pa.array(rows[first : first + _ROWS])) for first in range(0, len(rows), _ROWS))
+    ids, rows = segments.select(["segment_id"]), sampled.kept
+    kept = None if earlier is None else _read_earlier_assignment(take_rows(ids, rows).column(0), earlier)
+    ranks = np.empty(len(rows), np.uint64)
+    for first in range(0, len(rows), _ROWS):
+        names = take_rows(ids, rows[first : first + _ROWS]).column(0).to_pylist()
+        ranks[first : first + _ROWS] = hash_ranks(names, seed=rules.seed, purpose="test")
     assigned = assign_splits(
-        np.concatenate([hash_ranks(part.to_pylist(), seed=rules.seed, purpose="test") for part in pieces]),
+        ranks,
         run,
         run_names,
         sampled.footprint_xy_m,
@@ -69,35 +73,36 @@ def draw_splits(
         kept=kept,
         tagged=None if tags is None else _number_values(run, [tags[name] for name in run_names]),
     )
-    split = assigned.split
-    if regions is not None and not ((split == "train") | (split == "test")).any():
-        raise DatasetError(_describe_nothing_inside(regions, sampled.footprint_lonlat_deg, split))
-    audit = audit_leakage(split, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
+    del ranks
+    if regions is not None and not assigned.is_in("train", "test").any():
+        raise DatasetError(_describe_nothing_inside(regions, sampled.footprint_lonlat_deg, assigned))
+    held = {name: assigned.is_in(name) for name in ("test", "unseen")}
+    audit = audit_leakage(assigned.is_in("train"), held, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
     counts = None
     if kept is not None and earlier is not None:
-        found = int((kept.split != "").sum())
+        found = int((~kept.is_in("")).sum())
         counts = KeptSplit(found, earlier.num_rows - found)
     region = None if regions is None else regions_to_json(regions)
     return assigned, SplitResult(buffer_m, region, audit, counts)
 
 
-def _number_runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
+def _number_runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int32], list[str]]:
     """Return the number of each segment's run in the order of recording, (M,), and the runs' ids by number."""
     coded = segments.column("run_id").dictionary_encode().unify_dictionaries()
     names = coded.chunk(0).dictionary.to_pylist()
-    codes = np.concatenate([chunk.indices.to_numpy() for chunk in coded.chunks]).astype(np.int64)
+    codes = np.concatenate([chunk.indices.to_numpy() for chunk in coded.chunks])
     first_ns = np.full(len(names), np.iinfo(np.int64).max)
     np.minimum.at(first_ns, codes, starts_ns)
     order = sorted(range(len(names)), key=lambda code: (first_ns[code], names[code]))
-    number = np.empty(len(names), np.int64)
+    number = np.empty(len(names), np.int32)
     number[order] = np.arange(len(names))
     return number[codes], [names[code] for code in order]
 
 
-def _number_values(run: NDArray[np.int64], values: list[str]) -> tuple[NDArray[np.int64], list[str]]:
+def _number_values(run: NDArray[np.int32], values: list[str]) -> tuple[NDArray[np.int32], list[str]]:
     """Return the number of each sample's value, (N,), and the values by number; run i has ``values[i]``."""
     names = list(dict.fromkeys(values))
-    return np.array([names.index(value) for value in values], np.int64)[run], names
+    return np.array([names.index(value) for value in values], np.int32)[run], names
 
 
 def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignment:
@@ -110,7 +115,7 @@ def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignm
     split[known] = earlier.column("split").to_numpy().astype(np.str_)[rows]
     if "fold" in earlier.column_names:
         fold[known] = earlier.column("fold").fill_null(NO_FOLD).to_numpy()[rows]
-    return Assignment(split, fold)
+    return Assignment.from_names(split, fold)
 
 
 def regions_to_json(regions: Regions) -> dict[str, PolygonGeometry]:
@@ -131,25 +136,26 @@ def _project_regions(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDAr
     return project_regions(regions, projection.forward, window_deg=(west, south, east, north))
 
 
-def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: NDArray[np.str_]) -> str:
+def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], assigned: Assignment) -> str:
     """Return why no sample is inside the region, and what to change."""
     points = shapely.multipoints(lonlat_deg.mean(axis=1))
     lon, lat = lonlat_deg.mean(axis=(0, 1))
-    near, excluded = int((split == "buffer").sum()), int((split == EXCLUDED).sum())
+    near, excluded = (int(assigned.is_in(name).sum()) for name in ("buffer", EXCLUDED))
+    count = len(assigned.code)
     if excluded:
         return (
-            f"the region (--split) leaves no training sample: {excluded} of {len(split)} samples are in its exclude polygons, "
+            f"the region (--split) leaves no training sample: {excluded} of {count} samples are in its exclude polygons, "
             f"{near} on a border or nearer to one than the buffer; redraw them"
         )
     if near:
         return (
-            f"the region (--split) contains no whole footprint: {near} of {len(split)} samples are on its border or nearer "
+            f"the region (--split) contains no whole footprint: {near} of {count} samples are on its border or nearer "
             f"to it than the buffer; draw it larger, or lower the {format_recipe_key('split.buffer_m')}"
         )
     swapped = shapely.transform(regions.train_test, lambda lonlat: lonlat[:, ::-1])
     if shapely.intersects(swapped, points):
         return (
-            f"the region (--split) covers none of the {len(split)} samples, but would with its axes swapped: "
+            f"the region (--split) covers none of the {count} samples, but would with its axes swapped: "
             "GeoJSON is lon before lat (RFC 7946)"
         )
     km_per_deg = 111.3 * np.array([math.cos(math.radians(lat)), 1.0])
@@ -157,6 +163,6 @@ def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], 
         *(shapely.transform(each, lambda p: p * km_per_deg) for each in (regions.train_test, points))
     )
     return (
-        f"the region (--split) covers none of the {len(split)} samples: they are around {lon:.5f}, {lat:.5f} (lon, lat), "
+        f"the region (--split) covers none of the {count} samples: they are around {lon:.5f}, {lat:.5f} (lon, lat), "
         f"about {apart_km:.2g} km from it; draw it over the runs"
     )

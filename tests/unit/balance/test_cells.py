@@ -50,7 +50,7 @@ def test_cells_count_every_sample_once_and_are_worth_what_the_least_label_says()
     split, xy = rng.choice([*SPLITS, "buffer"], n), rng.uniform(0, 30, (n, 2))
     labels = (Correlation(1.0, 0.5, 9), Correlation(4.0, 0.9, 9))
     for keys in ((kind, slope), (kind, slope, speed)):
-        cells = count_cells(keys, split, xy, labels, splits=SPLITS)
+        cells = count_cells(keys, {name: split == name for name in SPLITS}, xy, labels)
         assert sum(sum(cell.samples.values()) for cell in cells) == (split != "buffer").sum()
         for cell in cells:
             rows = (kind == cell.terrain_class) & (slope == cell.slope) & (split != "buffer")
@@ -65,11 +65,10 @@ def test_cells_count_every_sample_once_and_are_worth_what_the_least_label_says()
 
 
 def test_where_likeness_cannot_be_told_the_number_of_samples_decides():
-    cells = count_cells(
-        (np.repeat([1, 2], [29, 30]), np.zeros(59, int)), np.full(59, "test"), np.zeros((59, 2)), (), splits=SPLITS
-    )
+    splits = {"train": np.zeros(59, bool), "test": np.ones(59, bool)}
+    cells = count_cells((np.repeat([1, 2], [29, 30]), np.zeros(59, int)), splits, np.zeros((59, 2)), ())
     assert [(cell.effective, cell.is_undersampled) for cell in cells] == [(None, True), (None, False)]
-    assert count_cells((np.zeros(3, int),) * 2, np.full(3, "buffer"), np.zeros((3, 2)), (), splits=SPLITS) == []
+    assert count_cells((np.zeros(3, int),) * 2, {"train": np.zeros(3, bool)}, np.zeros((3, 2)), ()) == []
 
 
 UP, DOWN, LEVEL = SLOPE_NAMES.index("5° to 10°"), SLOPE_NAMES.index("-10° to -5°"), SLOPE_NAMES.index("-2° to 2°")

@@ -77,8 +77,8 @@ def test_the_error_of_a_displacement_is_as_large_as_it_says(faults):
 
 def test_facts_name_what_the_sensors_were():
     facts = smoothed().facts
-    assert facts.gyro_bias_radps == pytest.approx([0.006, -0.004, 0.008], abs=1e-3)
-    assert facts.visual_scale == pytest.approx(1.02, abs=0.01)
+    assert facts.parameters["gyroscope bias"].value == pytest.approx([0.006, -0.004, 0.008], abs=1e-3)
+    assert facts.parameters["camera scale"].value == pytest.approx([0.02], abs=0.01)
     assert set(facts.nis_mean) == {GNSS, WHEELS, VISUAL}
     assert all(0.2 < facts.nis_mean[role] < 1.6 for role in (GNSS, WHEELS, VISUAL))
 
@@ -160,8 +160,8 @@ def test_without_gnss_a_metre_of_the_wheels_stays_one(kept):
     own_m = np.sum(np.abs(wheels.velocity_mps[1:, 0]) * np.diff(wheels.stamp_ns) * 1e-9)
     driven_m = np.sum(np.linalg.norm(np.diff(found.position_enu_m, axis=0), axis=1))
     assert driven_m == pytest.approx(own_m, rel=0.02)
-    assert found.facts.wheel_scale == pytest.approx(1.0, abs=1e-6)
-    assert found.facts.common_scale_std == found.facts.wheel_scale_std == SCALE_STD["wheel_odometry"]
+    assert "wheel scale" not in found.facts.parameters
+    assert found.facts.common_scale_std == SCALE_STD["wheel_odometry"]
     moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
     assert (found.forward_velocity_std_mps[moving] > 0.1 * np.linalg.norm(found.velocity_enu_mps, axis=1)[moving]).all()
     assert np.linalg.norm(found.position_std_m[-1]) > 0.1 * np.linalg.norm(found.position_enu_m[-1])
@@ -289,5 +289,5 @@ def test_an_error_of_a_metre_that_lasts_leaves_the_scale_open():
     found = fuse(replace(all_of_it, gnss=fixes))
     true = drive.errors(truth(), found)["forward"]
     moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
-    assert found.facts.gnss_lasting_error_m > 1.0
+    assert found.facts.noise["gnss"].std[-1] > 1.0
     assert np.median(found.forward_velocity_std_mps[moving]) > true

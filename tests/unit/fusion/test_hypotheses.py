@@ -86,6 +86,28 @@ def test_fixes_that_drift_away_and_jump_back_do_not_lead_the_track_astray():
     check_track(fuse(shift(drive.measure(truth(), 1), 65.0, 110.0, (0.4, -0.3, 0.2), ramp_s=10.0)), 0.15)
 
 
+def test_a_camera_whose_scale_varies_is_blamed_and_not_the_fixes_that_it_contradicts():
+    m, rng = drive.measure(truth(), 1), np.random.default_rng(3)
+    t, slip_s = ((each.stamp_ns - drive.ZERO_NS) * 1e-9 for each in (m.visual, m.wheels))
+    scale = np.where((t > 90.0) & (t < 130.0), 1.2, 0.8)  # another kind of ground
+    visual = m.visual.velocity_mps * scale[:, None] + rng.normal(0.0, 0.03, m.visual.velocity_mps.shape)
+    wheels = m.wheels.velocity_mps * (1.05 + 0.05 * np.sin(slip_s / 8.0))[:, None]
+    force = m.imu.specific_force_mps2 + rng.normal(0.0, 1.5, m.imu.specific_force_mps2.shape)  # cannot tell who errs
+    found = fuse(
+        replace(
+            m,
+            visual=replace(m.visual, velocity_mps=visual),
+            wheels=replace(m.wheels, velocity_mps=wheels),
+            imu=replace(m.imu, specific_force_mps2=force, accelerometer_std_mps2=1.5),
+        )
+    )
+    (change,) = found.facts.changes
+    assert (change.kind, change.role) == ("varies", "visual_odometry")
+    assert change.size == pytest.approx(scale.std(), abs=0.02)
+    error = found.position_enu_m - truth().at(truth().position, (found.stamp_ns - drive.ZERO_NS) * 1e-9)
+    assert np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))) < 0.05
+
+
 def test_nothing_happened_in_a_clean_run():
     assert smoothed().facts.changes == ()
     assert smoothed(imu=False).facts.changes == ()

@@ -65,8 +65,9 @@ def test_a_turn_rate_of_an_odometry_has_a_scale_to_be_found():
     assert turn_scale_std(with_imu) == 0.0
     assert turn_scale_std(without) > 0.1
     found = fuse(without)
-    assert found.facts.turn_scale == pytest.approx(0.8, abs=0.03)
-    assert found.facts.gyro_bias_radps is None
+    (value,) = found.facts.parameters["turn scale"].value
+    assert 1.0 / (1.0 - value) == pytest.approx(0.8, abs=0.03)
+    assert "gyroscope bias" not in found.facts.parameters
     assert drive.errors(truth(), found)["yaw_deg"] < 1.5
 
 
@@ -97,7 +98,7 @@ def test_an_error_of_the_fixes_that_lasts_does_not_average_out(std_m):
     variance = np.full(error.shape, std_m**2)
     fixes = replace(m.gnss, position_enu_m=m.gnss.position_enu_m + error, variance_m2=variance)
     found = fuse(replace(m, gnss=fixes))
-    assert 0.4 * std_m < found.facts.gnss_lasting_error_m < 1.6 * std_m
+    assert 0.4 * std_m < found.facts.noise["gnss"].std[-1] / np.sqrt(2.0) < 1.6 * std_m
     figures = drive.errors(truth(), found)
     assert 0.05 < figures["nees_position"] < 3.0
     assert figures["forward"] < 0.02

@@ -22,6 +22,7 @@ from tcpipe.pipeline.verify import verify
 from tcpipe.report import dataset_report
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, find_nearest_train_m, render_dataset_report, select_samples
 from tcpipe.report.label_sections import QUALITY_WORDS
+from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 
@@ -183,7 +184,7 @@ def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):
 def test_the_nearest_train_metre_is_the_nearest():
     chance = np.random.default_rng(1)
     xy_m, split = chance.uniform(0, 9, (60, 2)), chance.choice(["train", "test", "unseen", "buffer"], 60)
-    apart_m, nearest = find_nearest_train_m(xy_m, split)
+    apart_m, nearest = find_nearest_train_m(xy_m, np.array([SPLITS.index(name) for name in split]))
     train = np.flatnonzero(split == "train")
     for row in range(60):
         if split[row] in {"test", "unseen"}:

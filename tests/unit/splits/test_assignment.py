@@ -49,7 +49,7 @@ def assigned(
 def kept(splits, folds=None):
     names = {"t": "train", "T": "test", ".": "", "u": "unseen"}
     folds = [NO_FOLD] * len(splits) if folds is None else folds
-    return Assignment(np.array([names[letter] for letter in splits]), np.array(folds))
+    return Assignment.from_names(np.array([names[letter] for letter in splits]), np.array(folds))
 
 
 def test_the_lowest_ranks_test_and_all_inside_have_a_fold():
@@ -159,9 +159,13 @@ def drawn(groups, arrival=None, **keywords):
     return draw_groups(groups, arrival, **{"test_fraction": 0.2, "seed": 0, **keywords})[groups.member]
 
 
+def blocks(centres):
+    return assign_blocks(np.repeat(centres[:, None], 4, axis=1), np.arange(len(centres)), block_m=10.0)
+
+
 def test_blocks_that_are_far_apart_are_told_apart():
     cells = [(0, 1), (1, 0), (32, 0), (-32, 2), (2**20, -(2**20)), (-(2**20), 2**20)]
-    found = assign_blocks(10.0 * np.array(cells) + 5.0, block_m=10.0)
+    found = blocks(10.0 * np.array(cells) + 5.0)
     assert [found.names[member] for member in found.member] == [f"10:{column}:{row}" for column, row in cells]
 
 
@@ -194,9 +198,9 @@ def test_the_majority_decides_for_a_group_an_even_vote_trains_and_without_a_vote
 
 
 def test_a_cell_begins_at_its_border_and_holds_one_group_in_every_direction():
-    found = assign_blocks(np.array([[10.0, 0.0], [9.999, 0.0], [-10.0, -0.001], [-0.001, -10.0]]), block_m=10.0)
+    found = blocks(np.array([[10.0, 0.0], [9.999, 0.0], [-10.0, -0.001], [-0.001, -10.0]]))
     assert [found.names[member] for member in found.member] == ["10:1:0", "10:0:0", "10:-1:-1", "10:-1:-1"]
-    assert assign_blocks(np.zeros((0, 2)), block_m=10.0).names == ()
+    assert blocks(np.zeros((0, 2))).names == ()
 
 
 def test_more_kept_than_wanted_draws_no_more():

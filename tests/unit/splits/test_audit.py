@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from splits_squares import squares
 
 from tcpipe.splits.audit import (
+    Ground,
     audit_leakage,
     compute_nearest_m,
     compute_shared_fraction,
-    iterate_near_pairs,
+    find_near_pairs,
     pair_distances,
     pair_overlaps,
 )
@@ -16,7 +18,13 @@ def audit(split, centres, run=None, start=None, **keywords):
     n = len(split)
     run = np.unique(run or ["r"] * n, return_inverse=True)[1]
     start = np.arange(n) if start is None else np.array(start)
-    return audit_leakage(np.array(split), run, start, squares(centres, **keywords), chord_m=1.0)
+    train, *held = (np.array(split) == name for name in ("train", "test", "unseen"))
+    held = dict(zip(("test", "unseen"), held, strict=True))
+    return audit_leakage(train, held, run, start, squares(centres, **keywords), chord_m=1.0)
+
+
+def ground(corners):
+    return Ground(corners, np.arange(len(corners)))
 
 
 def test_nothing_trains():
@@ -51,8 +59,8 @@ def test_the_nearest_square_is_found_though_many_centres_are_nearer(count):
     centres[-1] = 3.1, 0.0
     course = np.append(np.zeros(count - 1), np.pi / 4)
     ours = squares([(0.0, 0.0)])
-    assert compute_nearest_m(ours, squares(centres, course)) == pytest.approx([3.1 - np.sqrt(0.5) - 0.5])
-    assert compute_nearest_m(ours, squares(centres[:-1])) == pytest.approx([2.0])
+    assert compute_nearest_m(ours, ground(squares(centres, course))) == pytest.approx([3.1 - np.sqrt(0.5) - 0.5])
+    assert compute_nearest_m(ours, ground(squares(centres[:-1]))) == pytest.approx([2.0])
 
 
 def both(a, b):
@@ -82,17 +90,16 @@ def test_squares_along_the_axes(centre, distance, area):
 
 def test_each_footprint_is_held_against_its_nearest_however_many_there_are():
     ours, theirs = squares([(0, 0), (50, 0)]), squares([(3 + i, 0) for i in range(40)])
-    assert compute_nearest_m(ours, theirs) == pytest.approx([2.0, 7.0])
-    assert compute_nearest_m(ours, theirs[:0]).size == 0
-    assert compute_nearest_m(ours[:0], theirs).size == 0
+    assert compute_nearest_m(ours, ground(theirs)) == pytest.approx([2.0, 7.0])
+    assert compute_nearest_m(ours, Ground(theirs, np.arange(10, 40))) == pytest.approx([12.0, 7.0])
+    assert compute_nearest_m(ours, ground(theirs[:0])).size == 0
+    assert compute_nearest_m(ours[:0], ground(theirs)).size == 0
 
 
 def test_pairs_are_all_within_reach_and_in_order():
     ours, theirs = np.array([[0.0, 0.0], [9.0, 0.0], [3.0, 0.0]]), np.array([[1.0, 0.0], [0.0, 2.0], [50.0, 0.0]])
-    ((i, j),) = iterate_near_pairs(ours, theirs, within_m=2.0)
+    i, j = find_near_pairs(ours, cKDTree(theirs), within_m=2.0)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == [(0, 0), (0, 1), (2, 0)]
-    assert list(iterate_near_pairs(ours[:0], theirs, within_m=2.0)) == []
-    assert list(iterate_near_pairs(ours, theirs[:0], within_m=2.0)) == []
 
 
 def test_a_share_is_of_our_own_ground():

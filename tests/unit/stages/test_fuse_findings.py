@@ -12,7 +12,7 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.stages.fuse_sections import Fused, make_section_facts
-from tcpipe.tables.facts import Disagreement, GateReset, StretchFacts
+from tcpipe.tables.facts import ChangeFacts, Disagreement, GateReset, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
@@ -33,6 +33,16 @@ def warned(inputs, *stretches, skipped_s=0.0):
 
 def counts(**said):
     return {"invalid": 0, "repeated": 0, "variances_replaced": 0} | said
+
+
+def test_changes_of_one_kind_that_overlap_are_one_finding():
+    def change(kind, start_s, end_s, size):
+        return ChangeFacts(kind, "gnss", round(start_s * 1e9), round(end_s * 1e9), size)
+
+    first = (change("wander", 5, 45, 0.3), change("antenna", 30, 60, 0.2), change("wander", 40, 80, 0.7))
+    findings = warned(FusionInputs(PLACE), stretch(changes=first), stretch(changes=(change("wander", 90, 95, 0.1),)))
+    found = [(each.span_s, each.numbers["off_m"]) for each in findings if each.code == "sensor-changed"]
+    assert found == [((5.0, 80.0), 0.7), ((30.0, 60.0), 0.2), ((90.0, 95.0), 0.1)]
 
 
 def test_stretches_add_up_and_their_innovations_are_averaged_by_count():
@@ -58,12 +68,9 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
     told = make_section_facts(TrackSection(2, 10, 20, heard), began, found)
     assert (told.clock_epoch, told.start_ns, told.end_ns, told.rows) == (2, 10, 20, 4)
     assert set(told.sensors) == {"gnss", "imu"}
-    assert (told.gyro_noise_radps, told.accelerometer_noise_mps2) == (0.01, 0.1)
-    assert told.initial_yaw_rad == pytest.approx(0.5)
-    assert (told.initial_yaw_std_rad, told.heading_from) == (0.3, "orientation")
+    assert (told.gyro_noise_radps, told.heading_from) == (0.01, "orientation")
     alone = make_section_facts(TrackSection(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
     assert alone.gyro_noise_radps is None
-    assert alone.accelerometer_noise_mps2 is None
 
 
 def test_nothing_is_said_where_nothing_is_odd():

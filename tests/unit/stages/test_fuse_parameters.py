@@ -9,7 +9,7 @@ from suggested_recipes import proposed
 
 from tcpipe.stages.fuse_findings import find_parameter_findings, make_fuse_facts
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.tables.facts import ParameterFacts, StretchFacts
+from tcpipe.tables.facts import ChangeFacts, ParameterFacts, StretchFacts
 from tcpipe.tables.levels import Sensor, Streams
 
 ARM_M = (0.1, 0.0, 0.9)
@@ -21,11 +21,11 @@ def streams(placed_by="tf_static"):
     return Streams({}, {"gnss": gnss, "imu": imu}, "husky")
 
 
-def make_findings(log, **parameters):
+def make_findings(log, changes=(), **parameters):
     """Return what is found of a run with sections that show nothing, and parameters, by name with spaces as underscores."""
     shown = {name.replace("_", " "): ParameterFacts(*of) for name, of in parameters.items()}
     long = StretchFacts({}, {}, {}, start_ns=0, end_ns=100, parameters=shown)
-    sections = [StretchFacts({}, {}, {}, end_ns=9), long]
+    sections = [StretchFacts({}, {}, {}, end_ns=9, changes=changes), long]
     facts = make_fuse_facts(FusionInputs(None), sections, rows=0, skipped_s=0.0)
     return tuple(find_parameter_findings(FusionInputs(None), facts, log))
 
@@ -76,7 +76,7 @@ def test_a_scale_that_is_surely_not_one_is_stated_beside_what_is_stated_already(
     assert make_findings(log, camera_scale=((0.02,), (0.001,), (0.05,))) == ()
 
 
-def test_a_camera_whose_scale_varies_is_named_and_wheels_which_always_slip_are_not():
+def test_a_camera_whose_scale_varies_is_named_and_wheels_which_always_slip_only_where_it_explains_the_run():
     def vary(std):
         return (0.0,), (0.01,), (0.05,), (std,)
 
@@ -84,3 +84,9 @@ def test_a_camera_whose_scale_varies_is_named_and_wheels_which_always_slip_are_n
     assert (finding.code, finding.subject.name) == ("odometry-scale-varies", "visual_odometry")
     assert finding.numbers["variation_fraction"] == pytest.approx(0.02)
     assert make_findings(streams(), camera_scale=vary(0.002), wheel_scale=vary(0.02)) == ()
+    changes = [ChangeFacts("varies", role, 1, 9, 0.08) for role in ("visual_odometry", "wheel_odometry")]
+    findings = make_findings(streams(), changes, camera_scale=vary(0.02))
+    assert [(each.subject.name, each.numbers["variation_fraction"]) for each in findings] == [
+        ("visual_odometry", 0.08),
+        ("wheel_odometry", 0.08),
+    ]

@@ -1,5 +1,8 @@
 """A window of a GeoTIFF on a server: the pixels that rasterio reads of the whole file, and one line for whatever a server does."""
 
+import errno
+import io
+
 import numpy as np
 import pytest
 import rasterio
@@ -10,7 +13,7 @@ from rasterio import Affine
 from rasterio.enums import ColorInterp
 from rasterio.windows import Window
 
-from tcpipe.errors import MapError
+from tcpipe.errors import MapError, StoreError
 from tcpipe.formats import https
 from tcpipe.formats.https import HttpsClient
 from tcpipe.formats.maps import remote_geotiff
@@ -204,7 +207,7 @@ def refuse(server, url, path, match, **how):
         ("cut", "ended after 32768 of 65536 bytes"),
         ("http://localhost/x.tif", "http://localhost/x.tif: expected an https:// URL"),
         ("https://other.example/x.tif", r"is on other.example, which the catalogue's entry does not name \(localhost:"),
-        ("file:///etc/passwd", "HTTP Error 302"),
+        ("file:///etc/passwd", "file:///etc/passwd: expected an https:// URL"),
         ("https://127.0.0.1/x.tif", "is on 127.0.0.1, which the catalogue's entry does not name"),
         ("https://localhost@169.254.169.254/x", "does not name"),
         ([None, "changing"], r"asked for bytes \d+ to \d+, got \d+ .* run the command again"),
@@ -257,7 +260,7 @@ def test_sizes_are_bounded(server, put, tmp_path, monkeypatch):
         server,
         url,
         tmp_path / "part.tif",
-        "of 0.2 MB in all that one command may read",
+        "would be .* of 0.2 MB a command are left; name fewer runs",
         of=client(server, most_bytes=200_000),
     )
     monkeypatch.setattr(remote_geotiff, "_MOST_PIXELS", 1000)
@@ -304,3 +307,22 @@ def test_a_raster_that_declares_huge_sizes_costs_little(server, tmp_path):
     cut(client(server, most_bytes=20_000_000), server.put("/huge.tif", path.read_bytes()), tmp_path / "part.tif")
     with rasterio.open(tmp_path / "part.tif") as part:
         assert part.read(1)[: 1024 - BOX[1]].mean() == 1.0
+
+
+def test_a_raster_on_the_other_side_of_the_earth_has_no_window(server, put):
+    url = put()
+    with open_window(client(server), url, shapely.box(-150.0, -40.0, -149.99, -39.99), crs="EPSG:2056") as window:
+        assert window is None
+
+
+def test_a_full_disk_is_one_line(server, put, tmp_path, monkeypatch):
+    class Full(io.BytesIO):
+        def write(self, data):
+            if self.tell() > 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return super().write(data)
+
+    monkeypatch.setattr(remote_geotiff.tempfile, "TemporaryFile", Full)
+    with pytest.raises((StoreError, OSError), match="No space left"):
+        cut(client(server), put(layout="cog"), tmp_path / "part.tif")
+    assert not list(tmp_path.glob("cache/*/*"))
