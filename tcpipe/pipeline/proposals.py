@@ -102,7 +102,9 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
         low = {
             name[4:]: format_number(name, value) for name, value in finding.numbers.items() if name.startswith("low_")
         }
-        ends = (f"{text} to {format_number(name, finding.numbers[f'high_{name}'])}" for name, text in low.items())
+        ends = (
+            f"{text} to {format_number(f'high_{name}', finding.numbers[f'high_{name}'])}" for name, text in low.items()
+        )
         notes = {**finding.names, "power_sources": ", ".join(ends)}
         for remedy in finding.remedies:
             lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
