@@ -16,11 +16,11 @@ from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, list_number_fields
+from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, Columns, list_number_fields
 from tcpipe.logs.fix_quality import find_quality
 from tcpipe.logs.messages import LOG_TIME, count_frames
 from tcpipe.logs.roles import TWIST, TWIST_STAMPED, RoleAssignment
-from tcpipe.power.sources import Columns, find_sources, list_power_lists, read_rails
+from tcpipe.power.sources import find_sources, list_power_lists, read_rails
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.recipe.suggestions import (
     ProposedLine,
