@@ -201,6 +201,14 @@ class Place:
         size = self.size(name)
         return None if size is None else self._hash_pieces(name, size)
 
+    def copy(self, name: str, to: Path) -> Checksum | None:
+        """Copy a file to this machine, and return its `checksum`: every byte is read once."""
+        size = self.size(name)
+        if size is None:
+            return None
+        with to.open("wb") as target:
+            return self._hash_pieces(name, size, target)
+
     def delete(self, name: str) -> None:
         """Remove a file; where there is none nothing happens. Directories above it that it leaves empty go, too."""
 

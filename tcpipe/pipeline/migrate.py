@@ -8,7 +8,6 @@ and one that is done does nothing.
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
@@ -21,7 +20,7 @@ from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.commits import CallRecord, Dataset, Entries, Failure, LogSnapshot, Problem, State, Superseded
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD
-from tcpipe.formats.integrity import Checksum, compute_checksum, find_wrong_checksum, seal_document, verify_document
+from tcpipe.formats.integrity import Checksum, find_wrong_checksum, seal_document, verify_document
 from tcpipe.formats.json_files import Json, parse_typed, to_json, to_plain
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.object_storage import is_url, run_side_by_side
@@ -228,8 +227,7 @@ def _copy_folder(
         def fetch(name: str) -> None:
             path = directory / name.removeprefix(f"{prefix}/")
             path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source.local(name, digests[name]), path)
-            if wrong := find_wrong_checksum(source.where(name), compute_checksum(path), digests[name]):
+            if wrong := find_wrong_checksum(source.where(name), source.copy(name, path), digests[name]):
                 raise StoreError(f"{wrong}; not copied")
 
         source.map(fetch, [*digests])

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment, open_bucket
-from storage_server import OVERWRITING, READ_ONLY, object_store
+from object_gateway import open_bucket
+from storage_server import OVERWRITING, READ_ONLY
 from stored_files import manifest, table
 from synthetic_store import add_run, commit_run, lanes, segments
 
@@ -169,13 +169,10 @@ def test_a_store_is_moved_by_copying_its_files(root, tmp_path):
     assert verify(tmp_path / "moved").problems == ()
 
 
-def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp_path, monkeypatch):
-    (tmp_path / "served" / "tests").mkdir(parents=True)
+def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp_path, monkeypatch, served):
     (tmp_path / f"tcpipe-{os.getuid()}-0123abcd" / "new").mkdir(parents=True)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        open_store("s3://tests/store", create=True)
+    open_store("s3://tests/store", create=True)
     assert not list(tmp_path.glob("tcpipe-*"))
 
 
@@ -187,60 +184,52 @@ def test_a_store_of_a_later_layout_is_refused(tmp_path, monkeypatch):
         open_store(tmp_path / "store")
 
 
-def test_a_bucket_that_keeps_no_two_writers_apart_or_cannot_be_written_is_refused(tmp_path, monkeypatch):
+def test_a_bucket_that_keeps_no_two_writers_apart_or_cannot_be_written_is_refused(tmp_path, served):
     for name in (OVERWRITING, READ_ONLY):
         (tmp_path / "served" / name).mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        overwrites = r"s3://overwriting/x: this object store overwrites what is there"
-        with pytest.raises(StoreError, match=overwrites):
-            open_store("s3://overwriting/x", create=True)
-        with pytest.raises(StoreError, match=overwrites):
-            open_store("s3://overwriting/x", create=True).check_writable()
-        with pytest.raises(
-            StoreError, match=r"s3://read-only/x/store.json: it cannot be written \(the credentials .*; name another"
-        ):
-            open_store("s3://read-only/x", create=True)
-        with pytest.raises(UsageError, match="s3://read-only/x: there is no store here"):
-            open_store("s3://read-only/x")
+    overwrites = r"s3://overwriting/x: this object store overwrites what is there"
+    with pytest.raises(StoreError, match=overwrites):
+        open_store("s3://overwriting/x", create=True)
+    with pytest.raises(StoreError, match=overwrites):
+        open_store("s3://overwriting/x", create=True).check_writable()
+    with pytest.raises(
+        StoreError, match=r"s3://read-only/x/store.json: it cannot be written \(the credentials .*; name another"
+    ):
+        open_store("s3://read-only/x", create=True)
+    with pytest.raises(UsageError, match="s3://read-only/x: there is no store here"):
+        open_store("s3://read-only/x")
 
 
-def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, monkeypatch):
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        store = open_store("s3://tests/store", create=True)
-        put(store)
-        for _ in range(2):
-            assert counted(store) == [10]
-        assert sum(name.endswith("segments.parquet") for name in fetched) == 1
-        for copy in filter(Path.is_file, (tmp_path / "cache").rglob("*")):
-            copy.write_bytes(b"x" * copy.stat().st_size)
-        assert counted(store) == [10], "what is damaged here is fetched anew"
-        (path,) = (tmp_path / "served").rglob("segments.parquet")
-        path.write_bytes(b"x" * path.stat().st_size)
-        shutil.rmtree(tmp_path / "cache")
-        with pytest.raises(StoreError, match=r"s3://tests/store/runs/north/.*/segments.parquet: its sha256 is"):
-            store.runs()[0].segments()
-        assert any("segments.parquet: its sha256 is" in problem for problem in verify("s3://tests/store").problems)
+def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, served):
+    store = open_store("s3://tests/store", create=True)
+    put(store)
+    for _ in range(2):
+        assert counted(store) == [10]
+    assert sum(name.endswith("segments.parquet") for name in served) == 1
+    for copy in filter(Path.is_file, (tmp_path / "cache").rglob("*")):
+        copy.write_bytes(b"x" * copy.stat().st_size)
+    assert counted(store) == [10], "what is damaged here is served anew"
+    (path,) = (tmp_path / "served").rglob("segments.parquet")
+    path.write_bytes(b"x" * path.stat().st_size)
+    shutil.rmtree(tmp_path / "cache")
+    with pytest.raises(StoreError, match=r"s3://tests/store/runs/north/.*/segments.parquet: its sha256 is"):
+        store.runs()[0].segments()
+    assert any("segments.parquet: its sha256 is" in problem for problem in verify("s3://tests/store").problems)
 
 
-def test_a_map_whose_answer_is_lost_is_there_and_one_that_another_adds_first_stays(tmp_path, monkeypatch):
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        store = open_store("s3://tests/store", create=True)
+def test_a_map_whose_answer_is_lost_is_there_and_one_that_another_adds_first_stays(served):
+    store = open_store("s3://tests/store", create=True)
 
-        def add(text):
-            with store.new_map("site") as directory:
-                directory.mkdir()
-                (directory / "tile").write_text(text)
-                fetched.lost = 3
+    def add(text):
+        with store.new_map("site") as directory:
+            directory.mkdir()
+            (directory / "tile").write_text(text)
+            served.lost = 3
 
-        add("mine")
-        assert store.maps() == ["site"]
-        with pytest.raises(StoreError, match="another process has written it meanwhile"):
-            add("another's")
+    add("mine")
+    assert store.maps() == ["site"]
+    with pytest.raises(StoreError, match="another process has written it meanwhile"):
+        add("another's")
 
 
 @pytest.mark.parametrize("name", ["store.json", "manifest-1.json", "run-1.json", "track.parquet"])

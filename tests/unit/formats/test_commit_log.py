@@ -6,8 +6,7 @@ import sys
 from dataclasses import replace
 
 import pytest
-from object_gateway import in_environment, open_bucket
-from storage_server import object_store
+from object_gateway import open_bucket
 
 from tcpipe.errors import StoreError
 from tcpipe.formats import commit_log
@@ -198,32 +197,26 @@ def test_killed_at_any_put_the_log_is_whole(tmp_path, monkeypatch):
         assert [read_commit(place.below("log"), number)[0].number for number in numbers] == [*numbers]
 
 
-def test_a_lost_answer_is_no_second_commit(tmp_path, monkeypatch):
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        place = Place("s3://tests/store")
-        fetched.lost = 3
-        state = write(place, 2)
-        assert (state.number, read_state(place)) == (2, state)
+def test_a_lost_answer_is_no_second_commit(served):
+    place = Place("s3://tests/store")
+    served.lost = 3
+    state = write(place, 2)
+    assert (state.number, read_state(place)) == (2, state)
 
 
-def test_reading_a_log_in_a_bucket_takes_a_constant_number_of_requests(tmp_path, monkeypatch):
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        monkeypatch.setattr(commit_log, "_EVERY", 8)
-        place, counts = Place("s3://tests/store"), []
-        state = State()
-        for _ in range(5):
-            state = write(place, 16, state)
-            before, fetched.requests = len(fetched), 0
-            assert read_state(place) == state
-            counts.append((len(fetched) - before, fetched.requests))
-        assert counts == [(1, 3)] * 5, "the snapshot; and two listings"
-        fetched.requests = 0
-        assert refresh(place, state) == state
-        assert fetched.requests == 1
+def test_reading_a_log_in_a_bucket_takes_a_constant_number_of_requests(monkeypatch, served):
+    monkeypatch.setattr(commit_log, "_EVERY", 8)
+    place, counts = Place("s3://tests/store"), []
+    state = State()
+    for _ in range(5):
+        state = write(place, 16, state)
+        before, served.requests = len(served), 0
+        assert read_state(place) == state
+        counts.append((len(served) - before, served.requests))
+    assert counts == [(1, 3)] * 5, "the snapshot; and two listings"
+    served.requests = 0
+    assert refresh(place, state) == state
+    assert served.requests == 1
 
 
 def test_a_log_that_cannot_be_written_is_an_error(place, monkeypatch):

@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from object_gateway import in_environment
-from storage_server import object_store
 from synthetic_store import add_run, add_world, commit_run, lanes, segments
 
 from tcpipe.dataset import open_dataset
@@ -135,18 +133,15 @@ def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_comm
     assert "so 'tcpipe prune' does not know the runs of this dataset" in caplog.text
 
 
-def test_a_build_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(store, tmp_path, monkeypatch):
+def test_a_build_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(store, tmp_path, served):
     """Beyond one request for each commit that no snapshot has yet."""
-    (tmp_path / "served" / "tests").mkdir(parents=True)
     store.root.rename(tmp_path / "served" / "tests" / "store")
     counts = []
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        there = open_store("s3://tests/store")
-        for number in range(3):
-            add_run(there, f"d{number}", segments(f"d{number}", *lanes(9.0 + 3.0 * number, -10.0, 10.0)))
-            build_dataset(tmp_path / "out", store=there.root, recipe=Recipe())
-            commits, fetched.requests = there.state().number, 0
-            assert build_dataset(tmp_path / "out", store=there.root, recipe=Recipe()).status == "unchanged"
-            counts.append(fetched.requests - commits)
+    there = open_store("s3://tests/store")
+    for number in range(3):
+        add_run(there, f"d{number}", segments(f"d{number}", *lanes(9.0 + 3.0 * number, -10.0, 10.0)))
+        build_dataset(tmp_path / "out", store=there.root, recipe=Recipe())
+        commits, served.requests = there.state().number, 0
+        assert build_dataset(tmp_path / "out", store=there.root, recipe=Recipe()).status == "unchanged"
+        counts.append(served.requests - commits)
     assert len(set(counts)) == 1, counts

@@ -5,8 +5,6 @@ import os
 import shutil
 
 import pytest
-from object_gateway import in_environment
-from storage_server import object_store
 from wheel_drives import START_NS, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
@@ -305,20 +303,17 @@ def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit
     assert str(found["second.mcap"].run.run_id).startswith("first-")
 
 
-def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, monkeypatch):
+def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, served):
     """Beyond one request for each commit that no snapshot has yet."""
-    (tmp_path / "served" / "tests").mkdir(parents=True)
     store, logs, counts = "s3://tests/store", tmp_path / "logs", {"new log": [], "nothing new": [], "status": []}
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        for number in range(4):
-            drive_at(logs / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
-            calls = {"new log": ingest, "nothing new": ingest, "status": find_status}
-            for what, call in calls.items():
-                commits = Store(store).state().number
-                fetched.requests = 0
-                assert call([logs], store=store, recipe=Recipe()).exit_code == 0
-                counts[what].append(fetched.requests - commits)
+    for number in range(4):
+        drive_at(logs / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
+        calls = {"new log": ingest, "nothing new": ingest, "status": find_status}
+        for what, call in calls.items():
+            commits = Store(store).state().number
+            served.requests = 0
+            assert call([logs], store=store, recipe=Recipe()).exit_code == 0
+            counts[what].append(served.requests - commits)
     assert {what: len(set(of[1:])) for what, of in counts.items()} == dict.fromkeys(counts, 1), counts
 
 

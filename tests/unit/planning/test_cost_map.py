@@ -14,11 +14,9 @@ import pyproj
 import pytest
 import rasterio
 from map_worlds import ArrayMap
-from object_gateway import in_environment
 from physics_model import PhysicsModel, energy_joule, power_watt, velocity_mps
 from planning_worlds import plane
 from ruamel.yaml import YAML
-from storage_server import object_store
 
 from tcpipe.errors import MapError, ModelError, UsageError
 from tcpipe.execution import Outcome
@@ -285,17 +283,15 @@ def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew
         make_cost_map(MODEL, source, out, cell_size_m=2.0, origin_deg=lonlat[::-1])
 
 
-def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_generation(made, tmp_path, monkeypatch):
+def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_generation(made, tmp_path, served):
     source, result = made
     source = replace(source, reads=Counter())
     (tmp_path / "served" / "maps").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        told = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0)
-        assert (told.path, told.status, told.card.checksums) == ("s3://maps/of a site", "done", result.card.checksums)
-        there = open_cost_map(fetch_directory("s3://maps/of a site"), told.card)
-        np.testing.assert_array_equal(there.power_watt, open_cost_map(Path(result.path), result.card).power_watt)
-        assert make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0).status == "unchanged"
-        other = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=2.0)
-        assert other.status == "done"
-        assert read_cost_map_card(fetch_directory("s3://maps/of a site")) == other.card
+    told = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0)
+    assert (told.path, told.status, told.card.checksums) == ("s3://maps/of a site", "done", result.card.checksums)
+    there = open_cost_map(fetch_directory("s3://maps/of a site"), told.card)
+    np.testing.assert_array_equal(there.power_watt, open_cost_map(Path(result.path), result.card).power_watt)
+    assert make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0).status == "unchanged"
+    other = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=2.0)
+    assert other.status == "done"
+    assert read_cost_map_card(fetch_directory("s3://maps/of a site")) == other.card

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from object_gateway import in_environment
-from storage_server import object_store
 from stored_files import read_files as files
 from synthetic_store import add_run, add_world, lanes, segments
 
@@ -78,11 +76,9 @@ def test_workers_make_the_bytes_of_this_machine_and_leave_no_spool(made, store, 
     assert not (store.root / "spool").exists()
 
 
-def test_workers_of_a_store_in_a_bucket_make_them_too(made, tmp_path, monkeypatch):
+def test_workers_of_a_store_in_a_bucket_make_them_too(made, tmp_path, served):
     shutil.copytree(made / "store", tmp_path / "served" / "bucket" / "store")
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        build("s3://bucket/store", tmp_path / "far")
+    build("s3://bucket/store", tmp_path / "far")
     assert files(tmp_path / "far") == files(made / "zarr")
     assert not [path for path in (tmp_path / "served").rglob("spool/**/*") if path.is_file()]
 
