@@ -20,7 +20,8 @@ from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, list_number_fields
 from tcpipe.logs.fix_quality import find_quality
 from tcpipe.logs.messages import LOG_TIME, count_frames
 from tcpipe.logs.roles import TWIST, TWIST_STAMPED, RoleAssignment
-from tcpipe.power.sources import Columns, find_sources, list_power_lists, read_rails
+from tcpipe.power.joints import Columns
+from tcpipe.power.sources import find_sources, list_power_lists, read_rails
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.recipe.suggestions import (
     ProposedLine,

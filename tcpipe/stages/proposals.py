@@ -18,9 +18,9 @@ from tcpipe.logs.field_mapping import list_number_fields, match_field_names
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
+from tcpipe.power.joints import Columns
 from tcpipe.power.sources import (
     FLOAT_TYPES,
-    Columns,
     find_quantity,
     find_rejection,
     is_of_drives,
