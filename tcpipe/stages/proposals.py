@@ -18,7 +18,6 @@ from tcpipe.logs.field_mapping import Columns, list_number_fields, match_field_n
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
-from tcpipe.power.joints import Columns
 from tcpipe.power.sources import (
     FLOAT_TYPES,
     find_quantity,
