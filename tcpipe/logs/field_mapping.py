@@ -174,7 +174,8 @@ def read_fields(
 ) -> dict[str, FieldSource] | list[str]:
     """Return by field what the recipe makes it of, or every problem.
 
-    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none.
+    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none;
+    that of an expression has to be stated where its columns have another one than the field.
     """
     found: dict[str, FieldSource] = {}
     problems: list[str] = []
@@ -198,7 +199,7 @@ def read_fields(
         elif name == "voltage" and not expression.operands():
             problems.append(f"{place} is the constant {text}; state nominal_voltage_volt, which has an uncertainty")
         else:
-            factor = _choose_factor(MAPPED[role][name].unit, expression.column, units.get(name))
+            factor = _choose_factor(MAPPED[role][name].unit, expression, units.get(name))
             if isinstance(factor, str):
                 problems.append(f"{place}: {factor}")
             else:
@@ -206,8 +207,18 @@ def read_fields(
     return problems or found
 
 
-def _choose_factor(unit: str, column: str | None, stated: str | None) -> float | str:
+def find_other_unit(expression: Expression, unit: str) -> str | None:
+    """Return the unit that an expression's columns state, if it is not the field's own but of its quantity (for rad/s also a speed's)."""
+    others = UNITS[unit] | (UNITS["m/s"] if unit == "rad/s" else {})
+    named = [split_unit(column)[1] for column, _ in expression.operands()]
+    return next((of for of in named if of and others.get(of, 1.0) != 1.0), None)
+
+
+def _choose_factor(unit: str, expression: Expression, stated: str | None) -> float | str:
     """Return what one of a column's unit is in a field's, or what is unclear about that."""
+    column = expression.column
+    if stated is None and column is None and (other := find_other_unit(expression, unit)):
+        return f"its columns are in {other}; state the unit of the expression under units: {', '.join(UNITS[unit])}"
     _, named, in_brackets = split_unit("" if stated or column is None else column)
     if unit == "1" or (stated or named) is None:
         return 1.0
@@ -383,11 +394,15 @@ _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
 """No receiver's message is longer or has more numbers; one that is made to hurt does not cost minutes."""
 
 
+def _simplify(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", split_unit(name)[0].strip().lower())
+
+
 def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     """Return the name of each field of a role; {} where one is missing that the role needs."""
     found: dict[str, str] = {}
     for field, pattern in CALLED[role].items():
-        match = next((name for name in names if re.fullmatch(pattern, split_unit(name)[0].lower())), None)
+        match = next((name for name in names if re.fullmatch(pattern, _simplify(name))), None)
         if match is not None and match not in found.values():
             found[field] = match
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}

@@ -65,7 +65,7 @@ def split_codes(text: str) -> tuple[str | None, str]:
 
 def find_quality(names: Iterable[str]) -> list[str]:
     """Return the first name that may be a fix quality, with the codes that are likeliest: ``gga: quality``; [] where none is."""
-    likely = {"gga": r"(.*[_.])?(qual(ity)?|mode|fix_?(type|mode))", "navsat": r"(.*[_.])?status"}
+    likely = {"gga": r"(.*[_. ])?(qual(ity)?|mode|fix[_ ]?(type|mode)?)", "navsat": r"(.*[_. ])?status"}
     found = [f"{codes}: {name}" for codes, of in likely.items() for name in names if re.fullmatch(of, name.lower())]
     return found[:1]
 

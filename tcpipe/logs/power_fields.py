@@ -97,9 +97,11 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
     """
     speeds = [name for name in names if {"vel", "velocity", "speed"} & set(split_words(name))]
     sides = {"l", "left", "r", "right", "fl", "fr", "rl", "rr"}
-    sided = [name for name in speeds if sides & set(split_words(name)) and split_unit(name)[1] not in _TURNS]
+    sided = [name for name in speeds if sides & set(split_words(name))]
+    units = {split_unit(name.replace("`", ""))[1] for name in sided}
     left = [name for name in sided if {"l", "left", "fl", "rl"} & set(split_words(name))]
-    if not left or 2 * len(left) != len(sided) or len({split_sides(name)[0] for name in sided}) != 1:
+    cores = {split_sides(name)[0] for name in sided}
+    if not left or 2 * len(left) != len(sided) or len(cores) != 1 or len(units) != 1 or units & {*_TURNS}:
         return {}
     right = [name for name in sided if name not in left]
     turn = f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)} / 0.5"

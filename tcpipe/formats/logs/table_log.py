@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -71,7 +71,10 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages
         problems.append(f"{where}.file is {mapping.file!r}; expected a name that ends in {', '.join(TABLE_SUFFIXES)}")
     elif not path.is_file():
         held = ", ".join(str(file.relative_to(folder)) for file in list_table_files(folder)[:20])
-        problems.append(f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}")
+        problems.append(
+            f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}. "
+            f"Add it, or ingest this run with a recipe without tables.{name}"
+        )
     if problems:
         return problems
     try:
@@ -93,6 +96,8 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages
         for column, (_, row, text) in cells.texts.items()
         if not np.isfinite(cells.columns[column]).any()
     ]
+    twice = [note for column in (stamp, *numbers) if (note := describe_duplicate(column, names))]
+    cells = replace(cells, notes=(*cells.notes, *twice))
     stamp_ns = _read_stamps(cells, stamp, mapping)
     if isinstance(stamp_ns, str):
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
@@ -196,6 +201,12 @@ class Cells:
 def read_column_names(path: Path) -> list[str]:
     """Return what the columns of a table are called; `LogError` where it cannot be read."""
     return _scan(path).collect_schema().names()
+
+
+def describe_duplicate(column: str, names: Sequence[str]) -> str:
+    """Return what a header that has a column's name several times means; "" where it has not."""
+    second = f"{column}_duplicated_0"
+    return f"several columns are called {column}: the first is read, {second} is the next" if second in names else ""
 
 
 def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[str] = ()) -> Cells:

@@ -185,7 +185,7 @@ def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_pat
     )  # fmt: skip
     found = inspect(folder, recipe=Recipe())
     assert found.kind == "tables"
-    assert "notes.csv" not in found.recipe
+    assert "notes.csv is not used" in found.recipe
     recipe = from_values(Recipe, parse_toml(found.recipe), where="proposed")
     assert {table.role or name for name, table in recipe.tables.items()} == {
         "gnss",
