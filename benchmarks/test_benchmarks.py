@@ -44,6 +44,7 @@ class Smallest:
 
 NUMBER = r"\d+(?:\.\d+)?"
 SMALLEST = {
+    "autopilots": Smallest("--minutes 2", rf"pymavlink {NUMBER} s: {NUMBER} of its time", package="pyulog"),
     "buckets": Smallest("ingest {bucket} {out} 1", rf"wall .*: {NUMBER} x; CPU .*: {NUMBER} x"),
     "build_dataset": Smallest("{out} 300", rf"floors: .*: {NUMBER} x"),
     "campaign": Smallest("--out {out} --cells ^GNSS,.wheels.10.Hz:.clean --quick", r"w \d.* E \d"),

@@ -44,8 +44,9 @@ class Autopilot:
             return {}
         row = np.searchsorted(time_us, at_us, side="right") - 1
         stale = (row < 0) | (at_us - time_us[row] > within_us)
-        numbers = {name: of for name, of in fields.items() if of.ndim == 1 and of.dtype.kind in "fiu"}
-        return {name: np.where(stale, np.nan, of[row].astype(np.float64)) for name, of in numbers.items()}
+        return {
+            name: np.where(stale, np.nan, of[row].astype(np.float64)) for name, of in fields.items() if of.ndim == 1
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,10 +71,12 @@ def make_role_messages(log: Autopilot) -> tuple[list[RoleMessages], list[Finding
         present = next((found for name in names.split() if (found := log.list_instances(name))), [])
         for name in present if role == "power" else present[:1]:
             try:
-                with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
-                    time_us, values = convert(log, name, *log.messages[name])
-            except KeyError as error:
-                what = {"role": role, "fields": str(error.args[0])}
+                time_us, values = convert(log, name, *log.messages[name])
+                lacking = "" if all(np.shape(of) == time_us.shape for of in values.values()) else "single numbers"
+            except (KeyError, ValueError, TypeError) as error:
+                lacking = str(error.args[0])
+            if lacking:
+                what = {"role": role, "fields": lacking}
                 findings.append(make_finding("fields-missing", Subject("topic", f"/{name}"), names=what))
                 continue
             of_gps_fix = "speed" in values
@@ -83,6 +86,14 @@ def make_role_messages(log: Autopilot) -> tuple[list[RoleMessages], list[Finding
     if any(of.type_name == MAPPED_TYPES["gnss"] for of in made) and _find_ellipsoidal(log) is None:
         findings.append(make_finding("geoid-separation-missing", GNSS))
     return made, findings
+
+
+def select_fields(columns: Columns) -> Columns:
+    """Return the fields that can be converted: single numbers, and lists where a list is expected."""
+    return {name: of for name, of in columns.items() if of.dtype.kind in "iuf" and (of.ndim == 1 or name in _LISTS)}
+
+
+_LISTS = ("gyro_rad", "accelerometer_m_s2", "wheel_speed", "velocity")
 
 
 def find_places(parameters: Mapping[str, float]) -> dict[str, tuple[float, float, float]]:
@@ -145,7 +156,11 @@ def _make_fix(log: Autopilot, kind: Int64, sea_m: Floats) -> Columns:
     """Return status and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
     ellipsoidal = _find_ellipsoidal(log)
     height = np.where(kind >= _IN_3D, sea_m if ellipsoidal is None else ellipsoidal, np.nan)
-    return {"status": _STATUS[np.minimum(kind, len(_STATUS) - 1)], "altitude": height}
+    return {"status": _find_status(kind), "altitude": height}
+
+
+def _find_status(kind: Int64) -> Int64:
+    return _STATUS[np.clip(kind, 0, len(_STATUS) - 1).astype(np.int64)]
 
 
 def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[str, Floats]:
@@ -228,7 +243,7 @@ def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Co
     accuracy, unknown = _find_accuracy(log, name, time_us), np.full(len(time_us), np.nan)
     error = 2.0 * accuracy.get("SAcc", unknown)
     climb = np.where(accuracy.get("VV", unknown) == 1, -f["VZ"], np.nan)
-    status = np.where(f["Status"] >= _IN_3D, _STATUS[np.minimum(f["Status"], len(_STATUS) - 1)], -1)
+    status = np.where(f["Status"] >= _IN_3D, _find_status(f["Status"]), -1)
     values = {"speed": f["Spd"], "track": f["GCrs"], "climb": climb, "err_speed": error, "err_climb": error}
     return time_us, {**values, "status.status": status}
 

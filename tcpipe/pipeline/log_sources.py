@@ -64,8 +64,9 @@ class LogSource:
     def stem(self) -> str:
         """What the run is called after: the first name without its suffix, as text that can be printed and be a file name."""
         path = self.paths[0]
-        suffix = next((end for end in sorted(LOG_SUFFIXES, key=len, reverse=True) if path.name.endswith(end)), "")
-        stem = path.name if path.is_dir() else path.name.removesuffix(suffix)
+        name, suffixes = path.name.lower(), sorted(LOG_SUFFIXES, key=len, reverse=True)
+        suffix = next((end for end in suffixes if name.endswith(end) and not path.is_dir()), "")
+        stem = path.name[: len(path.name) - len(suffix)]
         if is_table(path.name) and not path.is_dir():
             stem = f"{path.parent.name}_{path.stem}"
         return clean_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")

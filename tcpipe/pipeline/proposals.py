@@ -16,17 +16,17 @@ from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, list_number_fields
+from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, Columns, list_number_fields
 from tcpipe.logs.fix_quality import find_quality
 from tcpipe.logs.messages import LOG_TIME, count_frames
 from tcpipe.logs.roles import TWIST, TWIST_STAMPED, RoleAssignment
-from tcpipe.power.sources import Columns, find_sources, list_power_lists, read_rails
+from tcpipe.power.sources import find_sources, list_power_lists, read_rails
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.recipe.suggestions import (
     ProposedLine,
     ProposedRecipe,
     format_first,
-    propose_extrinsics,
+    propose_decisions,
     propose_lines,
     propose_quality,
 )
@@ -35,6 +35,7 @@ from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read_roles import decide_roles
 from tcpipe.stages.read_sources import place_frames
+from tcpipe.store import is_store
 from tcpipe.tables.findings import Finding
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ def propose_recipe(
     LogError, UsageError : there is nothing to read.
     """
     path = path if is_url(path) else Path(path)
+    if isinstance(path, Path) and (is_store(path) or (path / "dataset.json").is_file()):
+        raise UsageError(f"{path}: tcpipe wrote this; expected a log or a folder of tables")
     if isinstance(path, Path) and (is_table(path.name) or (path.is_dir() and not is_one_bag(path))):
         logs = list_logs_below(path) if path.is_dir() else []
         if not logs:
@@ -99,15 +102,21 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
         low = {
             name[4:]: format_number(name, value) for name, value in finding.numbers.items() if name.startswith("low_")
         }
-        ends = (f"{text} to {format_number(name, finding.numbers[f'high_{name}'])}" for name, text in low.items())
+        ends = (
+            f"{text} to {format_number(f'high_{name}', finding.numbers[f'high_{name}'])}" for name, text in low.items()
+        )
         notes = {**finding.names, "power_sources": ", ".join(ends)}
         for remedy in finding.remedies:
             lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
         if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
             fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
             lines += [propose_quality("read.fields", "gnss.quality", of) for of in fields]
-    unplaced = [(role, frames[role]) for role, (_, by) in places.items() if by == "assumed"]
-    return ProposedRecipe([*head, "", "These need no line."], [*lines, *propose_extrinsics(unplaced)], path)
+    unplaced = [
+        (role, frames[role]) for role, (_, by) in places.items() if by == "assumed" and role != "wheel_odometry"
+    ]
+    return ProposedRecipe(
+        [*head, "", "These need no line."], [*lines, *propose_decisions(unplaced, [*decided, *used.values()])], path
+    )
 
 
 def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterator[ProposedLine]:

@@ -23,7 +23,7 @@ from tcpipe.recipe.suggestions import (
     ProposedRecipe,
     TomlValue,
     format_first,
-    propose_extrinsics,
+    propose_decisions,
     propose_quality,
 )
 from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, judge_fields
@@ -93,7 +93,7 @@ def propose_tables(folder: Path, files: Sequence[Path]) -> ProposedRecipe:
         lines += [replace(line, note=f"{line.note}: {apart}", is_certain=False) for line in mine] if apart else mine
         log = table.path if "*" in table.file else log
         head += [f"{other.file}, {other.rows} rows, could be {role} as well" for other, _ in candidates[1:]]
-    lines += propose_extrinsics((role, "") for role in roles if role in ("gnss", "imu", "pose"))
+    lines += propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)
     return ProposedRecipe(head, lines, format_path(log))
 
 

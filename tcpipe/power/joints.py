@@ -39,8 +39,7 @@ class JointMotion:
 def select_joints(columns: Columns, source: PowerSource) -> JointMotion:
     """Return the joints of a source, which messages may hold in any order; ``columns`` are those of messages that have all three fields."""
     layouts = _find_layouts(columns[NAMES])
-    wanted = re.compile(source.joints)
-    joints = sorted({name for layout in layouts for name in layout if name and wanted.fullmatch(name)})
+    joints = sorted({name for layout in layouts for name in layout if name and re.fullmatch(source.joints, name)})
     values = np.full((2, len(columns[NAMES]), len(joints)), np.nan)
     for value, field in zip(values, (TORQUE, SPEED), strict=True):
         for layout, rows in layouts.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import isfinite
@@ -97,13 +97,13 @@ class ProposedRecipe:
         return f"{left}then: tcpipe preflight {shlex.quote(self.log)}"
 
     def toml(self) -> str:
-        """Return the file. The head of a table of decisions alone is a comment too, except below ``read``, where it may be empty."""
+        """Return the file. The head of a table of decisions alone is a comment too; those of ``read`` and ``mask`` may be empty."""
         what = "Comments below it need a decision: remove the # and correct the value."
         text = ["# Proposed by tcpipe init --from. " + what, *(f"# {line}".rstrip() for line in self.head)]
         tables = dict.fromkeys(line.table for line in sorted(self.lines, key=lambda line: bool(line.table)))
         for table in tables:
             mine = [line for line in self.lines if line.table == table]
-            is_open = any(line.is_certain for line in mine) or table.startswith("read.")
+            is_open = any(line.is_certain for line in mine) or table.startswith(("read.", "mask"))
             text += ["", *([f"{'' if is_open else '# '}[{table}]"] if table else [])]
             for line in mine:
                 note = f"  # {' '.join(line.note.split())}" if line.note else ""
@@ -127,12 +127,15 @@ def propose_lines(
                 yield ProposedLine(table, name, text, notes.get(name.rpartition(".")[2], doubt), not doubt)
 
 
-def propose_extrinsics(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLine]:
-    """Yield the lines that place sensors, by role and frame: nobody but a person knows where they are mounted."""
+def propose_decisions(frames: Iterable[tuple[str, str]], roles: Collection[str]) -> Iterator[ProposedLine]:
+    """Yield what only a person knows: where sensors are mounted, by role and frame, and whether a robot with fixes alone reversed."""
     for role, frame in frames:
         turn = {} if role == "gnss" else {"rpy_rad": [0.0, 0.0, 0.0]}
         note = f"measure it from base_link: nothing places {frame or 'it'}"
         yield ProposedLine("read.extrinsics", role, {"xyz_m": [0.0, 0.0, 0.0], **turn}, note, is_certain=False)
+    if "gnss" in roles and not {"wheel_odometry", "visual_odometry"} & {*roles}:
+        note = "if it never reversed: fixes alone do not tell forward from backward"
+        yield ProposedLine("mask", "keep_reversing", True, note, is_certain=False)
 
 
 def propose_quality(table: str, key: str, source: str) -> ProposedLine:

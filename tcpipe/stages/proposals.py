@@ -7,24 +7,22 @@ made; one that the values do not settle says in ``doubt`` what remains to be che
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.logs.field_mapping import list_number_fields, match_field_names
+from tcpipe.logs.field_mapping import Columns, list_number_fields, match_field_names
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import (
     FLOAT_TYPES,
-    Columns,
     find_quantity,
     find_rejection,
     is_of_drives,
-    list_power_lists,
     make_rail_name,
     read_rails,
     reject_power,
@@ -46,11 +44,23 @@ _UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
 def find_proposals(
     log: LogReader, assignment: RoleAssignment, config: ReadConfig, known: Profiles
 ) -> tuple[Finding, ...]:
-    """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of."""
+    """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of. The log is read once."""
     free = [topic for topic in log.topics.values() if _is_free(topic, config)]
-    settled = {*assignment.roles, *config.topics}
-    power = () if "power" in settled else _propose_power(log, free, known)
-    return (*_propose_roles(log, free, settled), *power)
+    settled, types = {*assignment.roles, *config.topics}, {topic.type_name for topic in free}
+    told = {*known.types(), *(of for types in ROLE_TYPES.values() for of in types)}
+    of_role = {
+        (role, topic): fields
+        for role in _PROPOSED
+        if role not in settled and not types & set(ROLE_TYPES[role])
+        for topic in free
+        if (fields := match_field_names(role, [of for of in list_number_fields(topic) if "[]" not in of]))
+    }
+    of_power = [topic for topic in free if "power" not in settled and _may_be_power(topic, told)]
+    lists = {topic.name: [of for of in [*list_number_fields(topic), "name[]"] if "[]" in of] for topic in of_power}
+    tables = log.tables(list(dict.fromkeys([*(topic.name for _, topic in of_role), *lists])))
+    columns = {name: make_message_arrays(table, lists.get(name, ())) for name, table in tables.items()}
+    readable = [topic for topic in of_power if topic.name in columns]
+    return (*_propose_roles(of_role, columns), *_propose_power(readable, columns))
 
 
 def _is_free(topic: Topic, config: ReadConfig) -> bool:
@@ -58,33 +68,29 @@ def _is_free(topic: Topic, config: ReadConfig) -> bool:
     return readable and topic.name not in config.ignore_topics and not topic.name.startswith(OVERLAY)
 
 
-def read_columns(log: LogReader, topic: str, in_lists: Iterable[str] = ()) -> Columns:
-    """Return a topic's messages by field; {} where they cannot be decoded."""
-    tables = log.tables([topic])
-    return make_message_arrays(tables[topic], [*in_lists]) if topic in tables else {}
+def _may_be_power(topic: Topic, told: Collection[str]) -> bool:
+    if topic.type_name in FLOAT_TYPES:
+        return bool(_find_bare_quantity(topic.name))
+    is_own = topic.type_name not in told
+    return topic.type_name == JOINT_STATE or (is_own and match_power_fields(list_number_fields(topic)) is not None)
 
 
 _PROPOSED = ("gnss", "imu")
 """Roles whose fields are called so that nothing else is taken for them."""
 
 
-def _propose_roles(log: LogReader, free: Sequence[Topic], settled: set[str]) -> Iterator[Finding]:
+def _propose_roles(
+    matched: Mapping[tuple[str, Topic], Mapping[str, str]], columns: Mapping[str, Columns]
+) -> Iterator[Finding]:
     """Yield a finding for each message type that no role knows and whose fields are called as those of a role that nothing can play."""
-    types = {topic.type_name for topic in free}
-    for role in _PROPOSED:
-        if role in settled or types & set(ROLE_TYPES[role]):
-            continue
-        for topic in free:
-            fields = [name for name in list_number_fields(topic) if "[]" not in name]
-            if found := match_field_names(role, fields):
-                columns = read_columns(log, topic.name)
-                if not set(found.values()) <= set(columns):
-                    continue
-                mapped, doubt = judge_fields(role, found, {name: columns[of] for name, of in found.items()})
-                remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: mapped}})
-                names = {field: format_first(columns[of]) for field, of in found.items() if field != "quality"}
-                names |= {"role": role, "type": topic.type_name, **({"doubt": doubt} if doubt else {})}
-                yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
+    for (role, topic), found in matched.items():
+        own = columns.get(topic.name, {})
+        if set(found.values()) <= set(own):
+            mapped, doubt = judge_fields(role, found, {name: own[of] for name, of in found.items()})
+            remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: mapped}})
+            names = {field: format_first(own[of]) for field, of in found.items() if field != "quality"}
+            names |= {"role": role, "type": topic.type_name, **({"doubt": doubt} if doubt else {})}
+            yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
 
 
 def judge_fields(role: str, found: Mapping[str, str], columns: Columns) -> tuple[dict[str, str], str]:
@@ -107,13 +113,13 @@ def _largest(values: Floats) -> float:
 
 def _judge_fixes(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dict[str, str], str]:
     latitude, longitude = (_largest(values[name]) for name in ("latitude", "longitude"))
-    doubt = ""
+    doubt = "" if np.isfinite(latitude + longitude) else "no position in the log"
     is_whole = not any(np.any(values[name] % 1.0) for name in ("latitude", "longitude"))
     if is_whole and 90.0 < latitude <= 90e7 and longitude <= 180e7:  # as in u-blox' messages, whose heights are in mm
         found |= {name: f"{found[name]} * 1e-7" for name in ("latitude", "longitude")}
         found |= {"altitude": f"{found['altitude']} * 0.001"} if "altitude" in found else {}
         values = {**values, "altitude": values.get("altitude", np.zeros(0)) * 0.001}
-    elif not (latitude <= 90.0 and longitude <= 180.0):
+    elif latitude > 90.0 or longitude > 180.0:
         doubt = f"latitudes to {latitude:.6g} are no degrees: convert them"
     elif latitude <= np.pi / 2 and longitude <= np.pi:
         doubt = "check that these are degrees: the values could be radians"
@@ -142,17 +148,17 @@ class _Candidate:
     doubt: str = ""
 
 
-def _propose_power(log: LogReader, free: Sequence[Topic], known: Profiles) -> Iterator[Finding]:
+def _propose_power(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[Finding]:
     """Yield what could be power in a log without a power topic: bare numbers, then messages of the user's own, then torques."""
-    told = {*known.types(), *(of for types in ROLE_TYPES.values() for of in types)}
-    own = [topic for topic in free if topic.type_name not in told]
-    found = [*_find_bare(log, free)] or [*_find_own(log, own)] or [*_find_joints(log, free)]
+    bare = [topic for topic in topics if topic.type_name in FLOAT_TYPES]
+    own = [topic for topic in topics if topic.type_name not in (*FLOAT_TYPES, JOINT_STATE)]
+    found = [*_find_bare(bare, columns)] or [*_find_own(own, columns)] or [*_find_joints(topics, columns)]
     found.sort(key=lambda of: bool(of.doubt))
     for best in found[:1]:
         rivals = [name for of in found[1:] if not of.doubt for name in of.topics]
         doubt = best.doubt or (f"{', '.join(rivals)} could be meant as well" if rivals else "")
-        topics = [name for of in found for name in of.topics]
-        names = {"topics": ", ".join(topics), **({"doubt": doubt} if doubt else {})}
+        listed = [name for of in found for name in of.topics]
+        names = {"topics": ", ".join(listed), **({"doubt": doubt} if doubt else {})}
         used = list(dict.fromkeys(str(keys["topic"]) for keys in best.sources if "topic" in keys))
         used = used or (
             [*best.topics] if len(best.topics) > 1 else []
@@ -162,23 +168,22 @@ def _propose_power(log: LogReader, free: Sequence[Topic], known: Profiles) -> It
         remedies = suggest("use", recipe) if best.sources else ()
         subject = Subject("role", "power")
         yield make_finding(
-            "power-candidates", subject, names=names, remedies=remedies, topics_count=len(topics), **best.numbers
+            "power-candidates", subject, names=names, remedies=remedies, topics_count=len(listed), **best.numbers
         )
 
 
 _THOUSANDTHS = {"voltage-in-millivolts": "voltage_scale", "current-in-milliamperes": "current_scale"}
 
 
-def _judge_source(log: LogReader, topic: Topic, keys: Keys, numbers: dict[str, float]) -> Keys | None:
+def _judge_source(columns: Columns, topic: str, keys: Keys, numbers: dict[str, float]) -> Keys | None:
     """Return a power source with the factors that make its values plausible, and add their range to ``numbers``; None where none does."""
     made: dict[str, Any] = {**keys}
-    columns = read_columns(log, topic.name, list_power_lists(topic.type_name, [PowerSource(**made)]))
     for _ in range(3):
-        found = read_rails(columns, [PowerSource(**made)], topic.name) if columns else []
-        if isinstance(found, Finding) or not found:
+        found = read_rails(columns, [PowerSource(**made)], topic)
+        if isinstance(found, Finding):
             return None
         rail = found[0]
-        why = find_rejection(rail, topic.name, columns)
+        why = find_rejection(rail, topic, columns)
         scale = _THOUSANDTHS.get(why.names["reason"], "") if why else ""
         if scale in {"", *made}:
             break
@@ -187,22 +192,27 @@ def _judge_source(log: LogReader, topic: Topic, keys: Keys, numbers: dict[str, f
     for values, unit in ((getattr(rail, name), unit) for name, unit in (("voltage_volt", "volt"), drawn)):
         known = values[np.isfinite(values)]
         if why is None and known.size and ("voltage" in made or unit != "volt"):
-            why = None if known.any() else reject_power(topic.name, "no-numbers")
+            why = None if known.any() else reject_power(topic, "no-numbers")
             numbers[f"low_{unit}"] = min(numbers.get(f"low_{unit}", np.inf), float(known.min()))
             numbers[f"high_{unit}"] = max(numbers.get(f"high_{unit}", -np.inf), float(known.max()))
     return made if why is None else None
 
 
-def _find_bare(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
+def _find_bare_quantity(topic: str) -> str:
+    """Return what a bare number is by its topic's name: a voltage, a current, a power; "" where it does not say."""
+    is_watt = bool({"power", "watt", "watts"} & set(split_words(topic.rpartition("/")[2])))
+    return find_quantity(topic) or ("power" if is_watt else "")
+
+
+def _find_bare(bare: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[_Candidate]:
     """Yield what topics of bare numbers make: rails of voltage and current, or powers, or currents without a voltage."""
     numbers = dict[str, float]()
     judged: dict[str, list[Keys]] = {"voltage": [], "current": [], "power": []}
-    for topic in free:
-        is_watt = bool(_WATT & set(split_words(topic.name.rpartition("/")[2])))
-        what = (find_quantity(topic.name) or ("power" if is_watt else "")) if topic.type_name in FLOAT_TYPES else ""
+    for topic in bare:
+        what = _find_bare_quantity(topic.name)
         unsettled = _UNSETTLED if what == "power" else {"rail": make_rail_name(topic.name), "sign": "auto"}
         keys = {"type": topic.type_name, "topic": topic.name, what: "data", **unsettled}
-        if what and (found := _judge_source(log, topic, keys, numbers)):
+        if found := _judge_source(columns[topic.name], topic.name, keys, numbers):
             judged[what].append(found)
     sources, doubt = _pair_rails(judged["voltage"], judged["current"]), "uncomment if these feed the drives"
     if not sources and judged["power"]:
@@ -214,7 +224,6 @@ def _find_bare(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
         yield _Candidate(tuple(topics), tuple(sources), numbers, doubt)
 
 
-_WATT = {"power", "watt", "watts"}
 NOMINAL: Keys = {"nominal_voltage_volt": 24.0}
 NO_VOLTAGE = "nothing is a voltage: state that of the battery"
 
@@ -231,7 +240,7 @@ def _pair_rails(voltages: Sequence[Keys], currents: Sequence[Keys]) -> list[Keys
     return used
 
 
-def _find_own(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
+def _find_own(own: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[_Candidate]:
     """Yield the messages of the user's own that hold voltage and current, or power; topics of a type that differ by side are summed."""
     groups: dict[tuple[str, tuple[str, ...]], list[Topic]] = {}
     for topic in own:
@@ -249,7 +258,7 @@ def _find_own(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
             assumed = NOMINAL if lacks_voltage else {}
             keys: Keys | None = {"type": type_name, **named, **rail, **scales, **_UNSETTLED, **assumed}
             for topic in group:
-                keys = keys and _judge_source(log, topic, keys, numbers)
+                keys = keys and _judge_source(columns[topic.name], topic.name, keys, numbers)
             sources += [keys] if keys else []
         if len(sources) == len(matched.rails):
             yield _Candidate(tuple(topic.name for topic in group), tuple(sources), numbers, doubt)
@@ -258,13 +267,13 @@ def _find_own(log: LogReader, own: Sequence[Topic]) -> Iterator[_Candidate]:
 _DRIVING = re.compile(r".*(wheel|drive|motor|track|axle)(?!.*steer).*")
 
 
-def _find_joints(log: LogReader, free: Sequence[Topic]) -> Iterator[_Candidate]:
+def _find_joints(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[_Candidate]:
     """Yield the joint states that have efforts and velocities of what drives."""
-    for topic in free:
-        columns = read_columns(log, topic.name, ["name[]"]) if topic.type_name == JOINT_STATE else {}
-        names = [str(name) for name in np.unique(columns.get("name[]", np.zeros(0, "U1"))).tolist()]
+    for topic in topics:
+        own = columns[topic.name] if topic.type_name == JOINT_STATE else {}
+        names = [str(name) for name in np.unique(own.get("name[]", np.zeros(0, "U1"))).tolist()]
         wheels = "|".join(re.escape(name) for name in names if _DRIVING.fullmatch(name.lower()))
-        if wheels and all(np.any(np.nan_to_num(columns.get(of, np.zeros(1)))) for of in ("velocity", "effort")):
+        if wheels and all(np.any(np.nan_to_num(own.get(of, np.zeros(1)))) for of in ("velocity", "effort")):
             keys: Keys = {"type": topic.type_name, "joints": wheels, "sign": "auto"}
             yield _Candidate(
                 (topic.name,), (keys,), doubt="uncomment if efforts are torques [N m]: mechanical power alone"

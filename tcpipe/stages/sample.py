@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 import pyarrow as pa
@@ -32,7 +31,6 @@ from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_pro
 
 Shifts = Mapping[str, tuple[float, float, float]]
 """By run: what is added to its positions to find their ground on a map, x and y, and the DRMS of that [m]."""
-NO_SHIFTS: Shifts = MappingProxyType({})
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -64,7 +62,7 @@ def sample_segments(
     *,
     gnss_crs: str,
     pool: TilePool | None = None,
-    shifts: Shifts = NO_SHIFTS,
+    shifts: Shifts | None = None,
 ) -> Sampled:
     """Return the patches of all segments that are on the map.
 
@@ -82,8 +80,9 @@ def sample_segments(
     """
     PLACED_SEGMENTS.check(segments, more=True)
     chord_m, projection = to_floats(segments, "chord_m"), find_map_projection(source, gnss_crs)
-    moved = (shifts.get(run_id, (0.0, 0.0, 0.0)) for run_id in segments.column("run_id").to_pylist())
-    shift_m = np.array(list(moved)).reshape(-1, 3)
+    shift_m = np.zeros((segments.num_rows, 3))
+    if shifts:
+        shift_m[:] = [shifts.get(run_id, (0.0, 0.0, 0.0)) for run_id in segments.column("run_id").to_pylist()]
     start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m[:, :2] for name in ("start", "end"))
     frames = make_patch_frames(start, end, chord_m)
     corners = compute_footprints(frames, config.patch_m)
@@ -171,7 +170,7 @@ def sample_on_maps(
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)
     waiting = np.arange(segments.num_rows)
     parts: list[Sampled] = []
-    each = zip(sources, pools or [None] * len(sources), shifts or [NO_SHIFTS] * len(sources), strict=True)
+    each = zip(sources, pools or [None] * len(sources), shifts or [{}] * len(sources), strict=True)
     for number, (source, pool, moved) in enumerate(each):
         here = segments if len(waiting) == segments.num_rows else segments.take(pa.array(waiting))
         found = sample_segments(here, source, config, gnss_crs=gnss_crs, pool=pool, shifts=moved)

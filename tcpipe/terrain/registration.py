@@ -356,9 +356,8 @@ def _descend(
         without = [_find_bottom(np.delete(excess_m, rows, axis=0), np.delete(tilt, rows, axis=0))[0] for rows in blocks]
         found.append(_estimate_covariance(np.stack(without)))
     most = int(np.argmax([np.trace(covariance) for covariance in found]))
-    independent = 2.0 * least / len(excess_m) * np.linalg.inv(curvature)
-    is_bottom = bool((np.linalg.eigvalsh(curvature) > _RIDGE).all())
-    return step_m, _FEW_BLOCKS * found[most] + independent if is_bottom else np.eye(2) / _RIDGE, groupings[most]
+    covariance = _FEW_BLOCKS * found[most] + 2.0 * least / len(excess_m) * np.linalg.inv(curvature)
+    return step_m, covariance if np.linalg.eigvalsh(curvature)[0] > _RIDGE else np.eye(2) / _RIDGE, groupings[most]
 
 
 def _find_bottom(excess_m: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray, float]:

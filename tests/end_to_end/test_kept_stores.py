@@ -317,6 +317,16 @@ def test_what_is_damaged_or_not_known_is_left_and_named(untouched):
         migrate(untouched / "site")
 
 
+def test_what_a_killed_migration_left_goes_with_the_next_one_and_empty_folders_are_no_problem(untouched):
+    store = untouched / "store"
+    migrate(store)
+    (store / ".tmp-new-01234567").mkdir()
+    (store / "records" / "calls").mkdir(parents=True)
+    assert migrate(store).exit_code == 0
+    assert not list(store.glob(".tmp-*"))
+    assert verify(store).problems == ()
+
+
 def test_a_store_is_brought_into_a_bucket(untouched, tmp_path, monkeypatch):
     (tmp_path / "served" / "tests").mkdir(parents=True)
     before = contents(untouched / "store")

@@ -1,6 +1,9 @@
 """Autopilot logs against the tools of their makers, pyulog and pymavlink; and what roles get of them against numbers written by hand."""
 
 import json
+import shutil
+import struct
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,11 +13,14 @@ import pytest
 from autopilot_files import AMP, ANTENNA_FRD, SPEED_MPS, VOLT, DataFlash, Drive, Ulog, write_dataflash, write_ulog
 from installed_command import tcpipe as run_tcpipe
 from shared_data import shared_data
+from storage_server import object_store
 
 import tcpipe
+from tcpipe.errors import RoleError
 from tcpipe.formats.logs.autopilot_records import read_records
 from tcpipe.logs.topics import split_notes
-from tcpipe.recipe import ReadConfig
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.robots import Profiles
 from tcpipe.stages.read import read_run
 
@@ -254,6 +260,29 @@ def test_wheels_of_px4_need_a_radius(tmp_path):
     assert read_one(log, tmp_path / "a.ulg", "/wheel_encoders/odometry")["twist.twist.linear.x"] == 1.875
 
 
+@pytest.mark.parametrize("letter", ["n", "a", "B", "f", "q"])
+def test_fields_of_another_kind_than_they_should_be_break_nothing(tmp_path, letter):
+    fields = {
+        "GPS": "Status,GMS,GWk,Lat,Lng,Alt,Spd,GCrs,VZ", "GPA": "HAcc,VAcc,SAcc,VV,AEl", "IMU": "GyrX,GyrY,GyrZ,AccX,AccY,AccZ,GH",
+        "BAT": "Volt,Curr", "WENC": "Dist0,Dist1", "THR": "DesSpeed", "STER": "DesTurnRate", "PARM": "Name,Value", "DSF": "Dp",
+    }  # fmt: skip
+    log, rng = DataFlash(), np.random.default_rng(1)
+    for name, listed in fields.items():
+        labels = ",".join(listed.split(",")[: 3 if letter == "a" else None])  # a message has 255 bytes at most
+        log.format(name, "Q" + letter * len(labels.split(",")), f"TimeUS,{labels}")
+        size = struct.calcsize(log.codes[name][1]) - 8
+        for second in range(20):
+            log.parts.append(
+                b"\xa3\x95" + bytes([log.codes[name][0]]) + struct.pack("<Q", second * 10**6) + rng.bytes(size)
+            )
+    (tmp_path / "a.bin").write_bytes(log.bytes())
+    with tcpipe.read_log(tmp_path / "a.bin") as opened:
+        assert opened.tables(opened.topics).keys() >= {f"/{name}" for name in fields}
+        assert ("/IMU/imu" in opened.topics) == (letter in "Bfq")
+        with suppress(RoleError):  # most are no measurements
+            read_run(opened, ReadConfig(), robot=None, known=Profiles({}, ()))
+
+
 # ---------------------------------------------------------------- from the command to labels
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_drive_is_ingested_without_a_recipe(tmp_path, kind):
@@ -266,6 +295,7 @@ def test_a_drive_is_ingested_without_a_recipe(tmp_path, kind):
     done = run_tcpipe("ingest", path, "--store", "store", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "position, time and energy usable" in done.stdout
+    assert f"{path.stem}-" in done.stdout
     (segments,) = (tmp_path / "store").rglob("segments.parquet")
     table = pq.read_table(segments)
     energy, seconds = (np.array(table[name].to_pylist()) for name in ("energy_joule", "duration_s"))
@@ -289,3 +319,17 @@ def test_a_bin_that_is_no_log_is_passed_over_in_a_folder(tmp_path):
     assert Path(told["path"]).name == "1.BIN"
     refused = run_tcpipe("inspect", "000000.bin", cwd=tmp_path)
     assert (refused.returncode != 0, "not a log" in refused.stderr) == (True, True)
+
+
+def test_logs_of_autopilots_lie_in_object_storage(logs, tmp_path, monkeypatch):
+    folder = tmp_path / "store" / "drives"
+    folder.mkdir(parents=True)
+    with object_store(tmp_path / "store") as (settings, _):
+        for name, value in settings.items():
+            monkeypatch.setenv(name, value)
+        for kind, suffix in (("ulog", "ulg"), ("dataflash", "BIN")):
+            shutil.copyfile(logs[kind], folder / f"run.{suffix}")
+            with tcpipe.read_log(f"s3://drives/run.{suffix}") as there, tcpipe.read_log(logs[kind]) as here:
+                assert there.topics == here.topics
+                assert (there.sha256(), there.size_bytes) == (here.sha256(), here.size_bytes)
+        assert inspect("s3://drives", recipe=Recipe()).path == "s3://drives/run.ulg"  # a .bin of a bucket must be named

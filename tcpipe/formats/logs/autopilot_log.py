@@ -24,6 +24,7 @@ from tcpipe.logs.autopilot import (
     find_places,
     find_utc_offset_us,
     make_role_messages,
+    select_fields,
 )
 from tcpipe.logs.roles import ODOMETRY, TRANSFORMS
 from tcpipe.logs.topics import AutopilotKind, Topic, find_damage
@@ -37,10 +38,11 @@ def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> Tab
     """Read a ``ulog`` or ``dataflash`` log; ``stack`` is closed with it. `LogError`: it cannot be read."""
     records = read_records(path, kind)
     known = {name: of for name, of in records.messages.items() if _find_base(name) in CONVERTED}
-    messages = {name: (of.time_us, of.read_columns(records.data)) for name, of in known.items()}
+    messages = {name: (of.time_us, select_fields(of.read_columns(records.data))) for name, of in known.items()}
     log = Autopilot(kind, messages, records.parameters)
-    converted, findings = make_role_messages(log)
-    offset_us, places = find_utc_offset_us(log), find_places(log.parameters)
+    with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
+        converted, findings = make_role_messages(log)
+        offset_us, places = find_utc_offset_us(log), find_places(log.parameters)
     own = [_make_own(records, name, of, _OWN_TYPES[kind], offset_us) for name, of in records.messages.items()]
     of_roles = [_make_of_role(of, places, offset_us) for of in converted]
     findings += find_damage(records.damage)

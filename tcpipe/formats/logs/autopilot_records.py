@@ -68,7 +68,6 @@ def _gather_field(data: bytes, places: Int64, layout: Layout, name: str) -> Int6
 
 _CLOCKS = {"timestamp": 1, "TimeUS": 1, "T": 1000, "TimeMS": 1000}
 """What one of a time is [µs], by name; ArduPilot's were in milliseconds before 2015, when TimeMS of a GPS was of the week."""
-_UNSCALED: Mapping[str, float] = {}
 
 
 @dataclass(slots=True)
@@ -104,14 +103,11 @@ class AutopilotRecords:
         )
         return end
 
-    def add(
-        self, name: str, instance: int, layout: Layout, places: Int64, scales: Mapping[str, float] = _UNSCALED
-    ) -> None:
+    def add(self, name: str, instance: int, layout: Layout, places: Int64, scales: Mapping[str, float]) -> None:
         """Add the messages of an instance; without a time they cannot be used."""
         clock = next((of for of in _CLOCKS if of in (layout.names or ()) and layout[of].str in ("<u8", "<u4")), None)
         if clock is None:
-            reason = f"{name} has no time"
-            self.note("messages-not-decoded", f"/{name}", 0, reason=reason)
+            self.note("messages-not-decoded", f"/{name}", 0, reason=f"{name} has no time")
             return
         if len(self.messages) >= MAX_TOPICS:
             raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; no such log is read")
@@ -192,6 +188,10 @@ class _UlogTopic:
     most_bytes: int
     places: list[int] = field(default_factory=list)
 
+    def fits(self, size: int) -> bool:
+        """Return whether a message of so many bytes, behind its head, can be one of it."""
+        return self.layout.itemsize <= size - 2 <= self.most_bytes
+
 
 class _UlogWalk:
     """One walk over the messages of a ULog."""
@@ -212,16 +212,14 @@ class _UlogWalk:
             size, kind, number = _ULOG_HEAD.unpack_from(self._data, at)
             end = at + 3 + size
             of = self._by_id.get(number) if kind == _DATA else None
-            if end > end_of_data or (of is None and not (kind in _ULOG_KINDS and self._is_head(end))):
-                at = self._records.skip(at, self._find_next(at + 1))
-            elif of is None:
-                self._take(kind, at + 3, size)
-                at = end
-            elif of.layout.itemsize <= size - 2 <= of.most_bytes:
+            fits = of.fits(size) if of else kind in _ULOG_KINDS and self._is_head(end)
+            if not fits or end > end_of_data:
+                end = self._records.skip(at, self._find_next(at + 1))
+            elif of:
                 of.places.append(at + 5)
-                at = end
             else:
-                at = self._records.skip(at, self._find_next(at + 1))
+                self._take(kind, at + 3, size)
+            at = end
         if at < end_of_data:
             self._records.skip(at, end_of_data)
         for number, count in self._unknown.items():
@@ -229,7 +227,7 @@ class _UlogWalk:
             self._records.note("messages-not-decoded", lost=count, reason=reason)
         for of in self._topics.values():
             if of.places:
-                self._records.add(of.name, of.instance, of.layout, np.array(of.places))
+                self._records.add(of.name, of.instance, of.layout, np.array(of.places), {})
 
     def _is_head(self, at: int) -> bool:
         return at >= len(self._data) or (at + 3 <= len(self._data) and self._data[at + 2] in _ULOG_KINDS)
@@ -239,8 +237,7 @@ class _UlogWalk:
         at = self._data.find(_DATA, start + 2)
         while 0 <= at <= len(self._data) - 3:
             size, _, number = _ULOG_HEAD.unpack_from(self._data, at - 2)
-            of = self._by_id.get(number)
-            if of is not None and of.layout.itemsize <= size - 2 <= of.most_bytes:
+            if number in self._by_id and self._by_id[number].fits(size):
                 return at - 2
             at = self._data.find(_DATA, at + 1)
         return len(self._data)
@@ -356,12 +353,15 @@ def _read_dataflash(records: AutopilotRecords) -> None:
             records.note("messages-not-decoded", f"/{name}", len(of), reason=reason)
         elif len(of) and name not in _WITHOUT_TIME:
             _add_instances(records, name, layout, of, scales)
-        if len(of) and name == "PARM" and {"Name", "Value"} <= set(layout.names or ()):
-            columns = Messages(name, layout, of, of, scales).read_columns(data)
+        columns = Messages(name, layout, of, of, scales).read_columns(data) if name in ("PARM", "DSF") else {}
+        if name == "PARM" and [columns[key].dtype.str for key in ("Name", "Value") if key in columns] == [
+            "|S16",
+            "<f4",
+        ]:
             names = (text.decode("ascii", "replace") for text in columns["Name"].tolist())
             records.parameters |= dict(zip(names, columns["Value"].tolist(), strict=True))
-    if (dropped := records.messages.get("DSF")) and "Dp" in (dropped.layout.names or ()):
-        records.dropouts = int(dropped.read_columns(data)["Dp"].max())
+        if "Dp" in columns and columns["Dp"].dtype.kind == "u":
+            records.dropouts = int(columns["Dp"].max(initial=0))
 
 
 def _find_message(data: bytes, start: int, lengths: list[int]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.logs.messages import Columns
 from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
@@ -103,7 +102,7 @@ def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64
     return {"header.stamp.sec": second, "header.stamp.nanosec": rest}
 
 
-def make_message_table(stamp_ns: NDArray[np.int64], columns: Columns) -> pa.Table:
+def make_message_table(stamp_ns: NDArray[np.int64], columns: Mapping[str, NDArray[np.generic]]) -> pa.Table:
     """Return messages as a table: both log times are the stamps [ns]; columns of shape (N, k) become lists, those of bytes texts."""
     times = {"log_time_ns": number_column(stamp_ns), "publish_time_ns": number_column(stamp_ns)}
     return pa.table({**times, **{name: _make_column(values) for name, values in columns.items()}})

@@ -64,11 +64,12 @@ def register_runs(
     projection = find_map_projection(source, recipe.read.gnss_crs)
     registrations, findings = list[MapRegistration](), list[Finding]()
     for run in runs:
-        registration, expected_m, is_on_map = _register(run, source, projection, recipe.sample)
-        reason = _find_obstacle(registration, expected_m, recipe.sample) if recipe.sample.align else "not wanted"
+        registration, expected_m, track_std_m = _register(run, source, projection, recipe.sample)
+        left_m = float(np.sqrt(recipe.sample.max_position_std_m**2 - track_std_m**2))
+        reason = _find_obstacle(registration, expected_m, left_m) if recipe.sample.align else "not wanted"
         if registration is not None and registration.scale.is_feet():
             raise MapError(_describe_feet(registration, run.run_id, source.name))
-        if recipe.sample.align and reason and is_on_map:
+        if recipe.sample.align and reason and np.isfinite(track_std_m):
             names = {"map": source.name, "reason": reason}
             findings.append(make_finding("map-not-aligned", Subject("run", run.run_id), names=names))
         if registration is None:
@@ -77,29 +78,30 @@ def register_runs(
         findings += _find_shift(registration, run.run_id, source.name, is_applied=not reason)
         findings += _find_other_heights(registration, expected_m, run.run_id, source.name)
     if recipe.sample.align:
-        west, south, east, north = projection.area_deg
-        geoid_m = compute_geoid_height((west + east) / 2.0, (south + north) / 2.0)
+        geoid_m = compute_geoid_height(*np.reshape(projection.area_deg, (2, 2)).mean(axis=0).tolist())
         findings += _find_height_datum(registrations, source.name, geoid_m)
     return tuple(registrations), findings
 
 
 def _register(
     run: RunDirectory, source: MapFile, projection: Projection, config: SampleConfig
-) -> tuple[Registration | None, float, bool]:
-    """Return the map's registration against a run, the expected misfit [m], and whether any of the run is on the map."""
+) -> tuple[Registration | None, float, float]:
+    """Return the map's registration against a run, the expected misfit, and the median DRMS of the track on the map, NaN beside it [m]."""
     track = run.table("track", _COLUMNS)
     lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(track, name) for name in _COLUMNS)
-    certain: NDArray[np.bool_] = np.hypot(x_std_m, y_std_m) <= config.max_position_std_m
+    std_m = np.hypot(x_std_m, y_std_m)
+    certain: NDArray[np.bool_] = std_m <= config.max_position_std_m
     lonlat = np.stack([lon, lat], axis=1)[certain]
     map_error_m = read_threshold("map-heights-differ", "map_error_m")
     expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[certain] ** 2)), map_error_m)) if certain.any() else map_error_m
     xy_m = projection.forward(lonlat)
-    is_on_map = bool(source.grid.contains(np.where(np.isfinite(xy_m), xy_m, np.inf)).any())
-    return register_track(source, xy_m, height_m[certain], with_tilt=config.align), expected_m, is_on_map
+    here_m = std_m[certain][source.grid.contains(np.where(np.isfinite(xy_m), xy_m, np.inf))]
+    track_std_m = float(np.median(here_m)) if here_m.size else float("nan")
+    return register_track(source, xy_m, height_m[certain], with_tilt=config.align), expected_m, track_std_m
 
 
-def _find_obstacle(found: Registration | None, expected_m: float, config: SampleConfig) -> str:
-    """Return why the shift of a run cannot be applied; "" where it can."""
+def _find_obstacle(found: Registration | None, expected_m: float, max_std_m: float) -> str:
+    """Return why the shift of a run cannot be applied; "" where it can: its DRMS is at most what the track's own leaves."""
     if found is None:
         return "too few points on the map"
     if found.scale.is_off():
@@ -107,8 +109,8 @@ def _find_obstacle(found: Registration | None, expected_m: float, config: Sample
     if found.at_reach:
         return f"the shift may be beyond {TILTED_REACH_M:g} m"
     if not np.isfinite(found.position_std_m):
-        return "the ground is too even"
-    if found.position_std_m > config.max_position_std_m:
+        return "the ground does not determine the shift"
+    if found.position_std_m > max_std_m:
         return f"the shift is known only to {found.position_std_m:.2f} m"
     return "heights differ" if _has_other_heights(found, expected_m) else ""
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.logs.table_log import TableLog
+from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
 from tcpipe.pipeline.proposals import propose_recipe
 
@@ -48,7 +48,7 @@ def test_stamps_since_1970_go_before_those_from_the_start_and_texts_cut_to_secon
     assert values["tables"]["gnss"]["stamp"] == "timestamp (ns)"
     assert values["tables"]["gnss"]["columns"]["altitude"] == "alt_msl"
     assert values["tables"]["power"] == {"file": "b/power.csv", "stamp": "stamp_ns", "columns": {"power": "Power (w)"}}
-    topics = TableLog(tmp_path, recipe.tables).topics
+    topics = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables).topics
     assert {name: topic.message_count for name, topic in topics.items()} == {"/gnss": ROWS, "/power": ROWS}
 
 
@@ -125,3 +125,23 @@ def test_a_folder_without_known_names_says_so(tmp_path):
     write(tmp_path / "notes.csv", week=SECONDS, done=1.0)
     with pytest.raises(UsageError, match="no table with columns of known names"):
         propose_recipe(tmp_path)
+
+
+def test_what_tcpipe_wrote_is_no_table(tmp_path):
+    write(tmp_path / "samples.csv", time=SECONDS + UTC_S, **FIXES)
+    (tmp_path / "dataset.json").write_text("{}")
+    with pytest.raises(UsageError, match="tcpipe wrote this"):
+        propose_recipe(tmp_path)
+
+
+def test_tables_of_two_drives_are_not_mixed(tmp_path):
+    write(tmp_path / "gps.csv", time=np.arange(ROWS) + UTC_S, **FIXES)
+    write(
+        tmp_path / "other" / "log.csv",
+        time=np.arange(ROWS) + UTC_S + 9e5,
+        battery_voltage=24.0 + SECONDS,
+        battery_current=2.0 + SECONDS,
+    )
+    values, _, text = proposed(tmp_path)
+    assert set(values["tables"]) == {"gnss"}
+    assert "no time in common" in text

@@ -170,14 +170,17 @@ def test_a_run_is_known_by_all_tables_of_its_folder_not_by_what_is_mapped(tmp_pa
 
 
 def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_path):
+    def rows(cells):
+        return "".join(f"17604564{85 + k // 10}.{k % 10},{cells.format(k=k % 10)}\n" for k in range(50))
+
     folder = folder_with(
         tmp_path,
         odom=odometry(text="time,vx,yaw_rate\n"),
         cmd_vel=odometry(text="stamp,linear.x,angular.z\n"),
-        imu="t,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z\n1760456485.1,0,0,0,0,0,9.8\n",
-        fixes="t,Latitude (deg),Longitude (deg),height\n1760456485.1,47,15,400\n",
-        voltage_left="timestamp,value\n1760456485.1,48\n",
-        current_left="timestamp,value\n1760456485.1,4\n",
+        imu="t,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z\n" + rows("0.{k},0.1{k},0.2{k},0.1{k},0.2,9.8{k}"),
+        fixes="t,Latitude (deg),Longitude (deg),height\n" + rows("47.{k},15.{k},40{k}"),
+        voltage_left="timestamp,value\n" + rows("48.{k}"),
+        current_left="timestamp,value\n" + rows("4.{k}"),
         notes="a,b,c\n1,2,3\n",
     )  # fmt: skip
     found = inspect(folder, recipe=Recipe())
@@ -207,7 +210,7 @@ def test_a_folder_of_tables_is_ingested_as_one_log_and_what_is_in_the_way_is_sai
     folder = folder_with(tmp_path, odom=odometry())
     with pytest.raises(UsageError) as caught:
         ingest([folder], store=tmp_path / "store", recipe=Recipe())
-    assert "it contains 1 tables (odom.csv, …): map them in the recipe" in caught.value.problems[1]
+    assert "it contains 1 tables (odom.csv, …): 'tcpipe init --from" in caught.value.problems[1]
     wrong = Recipe(tables={"gnss": TableMapping("fixes.csv")})
     with pytest.raises(UsageError) as caught:
         ingest([folder], store=tmp_path / "store", recipe=wrong)
@@ -218,6 +221,6 @@ def test_a_folder_of_tables_is_ingested_as_one_log_and_what_is_in_the_way_is_sai
     assert "tables.imu.columns: imu needs angular_velocity_x" in failed.problems[0]
     recipe = Recipe(tables={"wheel_odometry": WHEELS})
     (done,) = ingest([tmp_path], store=tmp_path / "store", recipe=recipe).results
-    assert (done.status, done.run.run_id[:8]) == ("done", "session-")
+    assert (done.status, done.run.run_id[:8]) == ("empty", "session-")  # a second of driving has no metre
     (again,) = ingest([folder], store=tmp_path / "store", recipe=recipe).results
     assert (again.status, again.run.run_id) == ("unchanged", done.run.run_id)

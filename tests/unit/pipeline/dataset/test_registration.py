@@ -121,6 +121,24 @@ def test_an_aligned_sample_is_explained_by_the_same_shift(moved):
 
 
 @pytest.mark.parametrize(
+    ("shift_m", "rows", "limit_m", "reason"),
+    [
+        ((-1.5, 0.8), 1200, 0.08, "the shift is known only to 0.1"),
+        ((-1.5, 0.8), 1200, 0.1, "the shift is known only to 0.1"),  # with the track's own deviation it is too much
+        ((3.9, 0.0), 3000, 0.1, "the ground does not determine the shift"),
+    ],
+)
+def test_a_shift_that_is_not_known_well_enough_is_not_applied(tmp_path, shift_m, rows, limit_m, reason):
+    recipe = Recipe(sample=SampleConfig(align=True, max_position_std_m=limit_m))
+    xy = winding()[:rows]
+    found = build_with(tmp_path, track_at(xy, np.add(xy, shift_m), std_m=0.03), recipe)
+    (refused,) = select_findings(found.findings, "map-not-aligned")
+    assert refused.names["reason"].startswith(reason)
+    assert not select_findings(found.findings, "map-aligned")
+    assert found.card.maps[0].registration[0].applied_std_m is None
+
+
+@pytest.mark.parametrize(
     ("geoid_m", "reason"),
     [
         (None, "probably ellipsoid against geoid"),
