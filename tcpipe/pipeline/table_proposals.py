@@ -91,9 +91,9 @@ def propose_tables(folder: Path, files: Sequence[Path]) -> ProposedRecipe:
     for name, path in _group_files(folder, [folder / file for file in columns]).items():
         names = columns[path.relative_to(folder).as_posix()]
         table = _read_table(name, path, names)
-        found = list(_iterate_roles(table)) if table else []
-        for role, lines in found:
-            roles.setdefault(role, []).append((table, lines))
+        found = [(role, (table, lines)) for role, lines in _iterate_roles(table)] if table else []
+        for role, candidate in found:
+            roles.setdefault(role, []).append(candidate)
         if not found:
             why = "no known fields" if table else "no stamps"
             head.append(f"{name} is not used, {why} in its columns {', '.join(names)}")
