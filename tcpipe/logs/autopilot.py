@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
+from tcpipe.logs.fix_quality import classify_fixes, find_status
 from tcpipe.logs.messages import GNSS, Columns
 from tcpipe.logs.roles import GPS_FIXES
 from tcpipe.logs.topics import AutopilotKind
@@ -23,6 +24,7 @@ Int64 = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Stamped = tuple[Int64, Columns]
 """Times since boot [µs], shape (N,), and fields by name."""
+Places = dict[str, tuple[float, float, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +98,9 @@ def select_fields(columns: Columns) -> Columns:
 _LISTS = ("gyro_rad", "accelerometer_m_s2", "wheel_speed", "velocity")
 
 
-def find_places(parameters: Mapping[str, float]) -> dict[str, tuple[float, float, float]]:
+def find_places(parameters: Mapping[str, float]) -> Places:
     """Return where sensors are, forward, left and up of base_link [m], by frame, as parameters say; all zero says nothing."""
-    found: dict[str, tuple[float, float, float]] = {}
+    found: Places = {}
     for frame, prefixes in _PLACES.items():
         stated = ([parameters.get(f"{prefix}_{axis}", 0.0) for axis in "XYZ"] for prefix in prefixes.split())
         if frd := next((place for place in stated if any(place) and np.isfinite(place).all()), None):
@@ -147,20 +149,19 @@ def _find_ellipsoidal(log: Autopilot) -> Floats | None:
 
 
 _HIGHEST_M = 1e5
-_STATUS = np.array([-1, -1, 0, 0, 1, 2, 2, -1])
-"""NavSatStatus by type of fix: none, none, 2D, 3D, differential, RTK float, RTK fixed; those beyond are no measurements."""
-_IN_3D = 3
+_IN_3D, _RTK_FIXED = 3, 6
+"""Types of fixes; those beyond are no measurements."""
 
 
 def _make_fix(log: Autopilot, kind: Int64, sea_m: Floats) -> Columns:
-    """Return status and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
+    """Return quality and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
     ellipsoidal = _find_ellipsoidal(log)
     height = np.where(kind >= _IN_3D, sea_m if ellipsoidal is None else ellipsoidal, np.nan)
-    return {"status": _find_status(kind), "altitude": height}
+    return {"quality": _find_quality(kind), "altitude": height}
 
 
-def _find_status(kind: Int64) -> Int64:
-    return _STATUS[np.clip(kind, 0, len(_STATUS) - 1).astype(np.int64)]
+def _find_quality(kind: Int64) -> Floats:
+    return classify_fixes(np.where(kind > _RTK_FIXED, 0, kind), "mavlink")
 
 
 def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[str, Floats]:
@@ -243,7 +244,7 @@ def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Co
     accuracy, unknown = _find_accuracy(log, name, time_us), np.full(len(time_us), np.nan)
     error = 2.0 * accuracy.get("SAcc", unknown)
     climb = np.where(accuracy.get("VV", unknown) == 1, -f["VZ"], np.nan)
-    status = np.where(f["Status"] >= _IN_3D, _find_status(f["Status"]), -1)
+    status = find_status(_find_quality(np.where(f["Status"] >= _IN_3D, f["Status"], 0)))
     values = {"speed": f["Spd"], "track": f["GCrs"], "climb": climb, "err_speed": error, "err_climb": error}
     return time_us, {**values, "status.status": status}
 

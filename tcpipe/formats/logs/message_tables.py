@@ -102,13 +102,15 @@ def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64
     return {"header.stamp.sec": second, "header.stamp.nanosec": rest}
 
 
-def make_message_table(stamp_ns: NDArray[np.int64], columns: Mapping[str, NDArray[np.generic]]) -> pa.Table:
+def make_message_table(stamp_ns: NDArray[np.int64], columns: Mapping[str, NDArray[np.generic] | pa.Array]) -> pa.Table:
     """Return messages as a table: both log times are the stamps [ns]; columns of shape (N, k) become lists, those of bytes texts."""
     times = {"log_time_ns": number_column(stamp_ns), "publish_time_ns": number_column(stamp_ns)}
     return pa.table({**times, **{name: _make_column(values) for name, values in columns.items()}})
 
 
-def _make_column(values: NDArray[np.generic]) -> pa.Array:
+def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
+    if isinstance(values, pa.Array):
+        return values
     if values.dtype.kind == "S":
         return make_text_column(text.decode(errors="replace") for text in values.tolist())
     if values.ndim == 1:
