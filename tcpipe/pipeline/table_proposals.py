@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.table_log import read_cells, read_column_names
+from tcpipe.formats.logs.table_log import read_cells, read_column_names, read_values
 from tcpipe.formats.object_storage import format_path
 from tcpipe.logs.expressions import split_unit
 from tcpipe.logs.field_mapping import MAPPED, STAMP_UNITS, match_field_names, parse_stamps_ns, read_fields
@@ -26,6 +26,7 @@ from tcpipe.recipe.suggestions import (
     propose_decisions,
     propose_quality,
 )
+from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, judge_fields
 
 Floats = NDArray[np.float64]
@@ -35,7 +36,6 @@ _BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
 _STAMP = re.compile(r"t|stamp|.*time(stamp|string)?|gpst|utc|date")
 _PLAIN = re.compile(r"[A-Za-z_]\w*")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
-_FASTEST_MPS = 15.0
 _OVER_TRACK = "/ 0.5"
 
 
@@ -207,11 +207,7 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[s
     fields = read_fields("", role, columns, {}, table.names)
     if isinstance(fields, list):
         return {}
-    used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
-    numbers = [column for name, named in used.items() if name != "quality" for column in named]
-    cells = read_cells(table.path, stamp=table.stamp, columns=numbers, words=used.get("quality", ()))
-    rows = len(cells.stamp)
-    found = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
+    _, found = read_values(table.path, table.stamp, fields)
     return {name: values for name, values in found.items() if np.isfinite(values).any()}
 
 
@@ -231,5 +227,5 @@ def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats])
         volt, amp = (values.get(of, np.full(1, np.nan)) for of in ("voltage", "current"))
         return _IMPOSSIBLE if find_rejection(RailReadings("", volt, amp), "", {}) else ""
     speed = values.get("linear_x", np.zeros(1))
-    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > _FASTEST_MPS
+    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > MAX_PLAUSIBLE_MPS
     return "its largest values are no m/s: state the unit" if is_fast else ""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.logs.expressions import UNITS
 from tcpipe.logs.field_mapping import Columns, list_number_fields, match_field_names
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
@@ -36,7 +37,7 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 Floats = NDArray[np.float64]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-_GRAVITY_MPS2 = 9.80665
+_GRAVITY_MPS2 = UNITS["m/s2"]["g"]
 _UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
 """What no name says of a current."""
 

@@ -6,17 +6,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tcpipe.formats.logs.autopilot_records import read_records
-from tcpipe.formats.logs.message_tables import TableLog, TopicMessages, make_message_table, make_stamp_fields
+from tcpipe.formats.logs.message_tables import Fields, TableLog, make_stamp_fields, make_topic
 from tcpipe.logs.autopilot import (
     CONVERTED,
     Autopilot,
@@ -29,7 +27,7 @@ from tcpipe.logs.autopilot import (
     select_fields,
 )
 from tcpipe.logs.roles import ODOMETRY, TRANSFORMS
-from tcpipe.logs.topics import AutopilotKind, Topic, find_damage
+from tcpipe.logs.topics import AutopilotKind, find_damage
 from tcpipe.tables.arrays import make_column
 from tcpipe.tables.findings import Subject, make_finding
 
@@ -46,7 +44,7 @@ def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> Tab
         converted, findings = make_role_messages(log)
         offset_us, places = find_utc_offset_us(log), find_places(log.parameters)
     topics = [
-        _make_topic(
+        make_topic(
             f"/{name}",
             f"{_OWN_PACKAGES[kind]}/msg/{_find_base(name)}",
             (of.time_us + offset_us) * 1000,
@@ -56,10 +54,10 @@ def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> Tab
     ]
     for role in converted:
         stamp_ns = (role.time_us + offset_us) * 1000
-        topics.append(_make_topic(role.topic, role.type_name, stamp_ns, partial(_make_stamped, role, stamp_ns, places)))
+        topics.append(make_topic(role.topic, role.type_name, stamp_ns, partial(_make_stamped, role, stamp_ns, places)))
     if places and converted:
         start_ns = (converted[0].time_us[:1] + offset_us) * 1000
-        topics.append(_make_topic("/tf_static", TRANSFORMS[0], start_ns, partial(_make_transforms, places)))
+        topics.append(make_topic("/tf_static", TRANSFORMS[0], start_ns, partial(_make_transforms, places)))
     findings += find_damage(records.damage)
     if records.dropouts:
         findings.append(make_finding("logger-dropouts", Subject("file", path.name), dropouts_count=records.dropouts))
@@ -71,14 +69,7 @@ def _find_base(name: str) -> str:
     return re.sub(r"_\d+$", "", name)
 
 
-def _make_topic(
-    name: str, type_name: str, stamp_ns: Int64, read_columns: Callable[[], Mapping[str, Any]]
-) -> TopicMessages:
-    topic = Topic(name, type_name, len(stamp_ns), int(stamp_ns[0]), int(stamp_ns[-1]), "table", "")
-    return TopicMessages(topic, lambda: make_message_table(stamp_ns, read_columns()))
-
-
-def _make_stamped(of: RoleMessages, stamp_ns: Int64, places: Places) -> Mapping[str, Any]:
+def _make_stamped(of: RoleMessages, stamp_ns: Int64, places: Places) -> Fields:
     """Return a message's fields with stamp and frame; what its values are given in is base_link where nothing places an IMU."""
     frame = "base_link" if of.frame == "imu" and of.frame not in places else of.frame
     column = "child_frame_id" if of.type_name == ODOMETRY else "header.frame_id"
@@ -98,7 +89,7 @@ _TRANSFORM = pa.struct(
 _NO_TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 
 
-def _make_transforms(places: Places) -> Mapping[str, Any]:
+def _make_transforms(places: Places) -> Fields:
     """Return the places of sensors as one message of static transforms."""
     rows = [
         {
