@@ -355,7 +355,6 @@ CALLED: Mapping[str, Mapping[str, str]] = {
     },
     "command": {**_VELOCITY, **_TURN},
     "wheel_odometry": {**_VELOCITY, **_TURN},
-    "power": {"voltage": r"(.*[_.])?volt(age)?", "current": r"(.*[_.])?(curr(ent)?|amps?)"},
     "pose": {
         "x": r"[tp]?x|pos(ition)?[_.]?x|east(ing)?",
         "y": r"[tp]?y|pos(ition)?[_.]?y|north(ing)?",

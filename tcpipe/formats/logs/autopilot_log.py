@@ -19,9 +19,9 @@ from tcpipe.logs.autopilot import (
     CONVERTED,
     Autopilot,
     Int64,
-    Places,
+    LeverArms,
     RoleMessages,
-    find_places,
+    find_lever_arms,
     find_utc_offset_us,
     make_role_messages,
     select_fields,
@@ -42,7 +42,7 @@ def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> Tab
     log = Autopilot(kind, messages, records.parameters)
     with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
         converted, findings = make_role_messages(log)
-        offset_us, places = find_utc_offset_us(log), find_places(log.parameters)
+        offset_us, lever_arms = find_utc_offset_us(log), find_lever_arms(log.parameters)
     topics = [
         make_topic(
             f"/{name}",
@@ -54,10 +54,12 @@ def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> Tab
     ]
     for role in converted:
         stamp_ns = (role.time_us + offset_us) * 1000
-        topics.append(make_topic(role.topic, role.type_name, stamp_ns, partial(_make_stamped, role, stamp_ns, places)))
-    if places and converted:
+        topics.append(
+            make_topic(role.topic, role.type_name, stamp_ns, partial(_make_stamped, role, stamp_ns, lever_arms))
+        )
+    if lever_arms and converted:
         start_ns = (converted[0].time_us[:1] + offset_us) * 1000
-        topics.append(make_topic("/tf_static", TRANSFORMS[0], start_ns, partial(_make_transforms, places)))
+        topics.append(make_topic("/tf_static", TRANSFORMS[0], start_ns, partial(_make_transforms, lever_arms)))
     findings += find_damage(records.damage)
     if records.dropouts:
         findings.append(make_finding("logger-dropouts", Subject("file", path.name), dropouts_count=records.dropouts))
@@ -69,9 +71,9 @@ def _find_base(name: str) -> str:
     return re.sub(r"_\d+$", "", name)
 
 
-def _make_stamped(of: RoleMessages, stamp_ns: Int64, places: Places) -> Fields:
+def _make_stamped(of: RoleMessages, stamp_ns: Int64, lever_arms: LeverArms) -> Fields:
     """Return a message's fields with stamp and frame; what its values are given in is base_link where nothing places an IMU."""
-    frame = "base_link" if of.frame == "imu" and of.frame not in places else of.frame
+    frame = "base_link" if of.frame == "imu" and of.frame not in lever_arms else of.frame
     column = "child_frame_id" if of.type_name == ODOMETRY else "header.frame_id"
     return {**make_stamp_fields(stamp_ns), **of.columns, column: pa.repeat(frame, len(stamp_ns))}
 
@@ -89,14 +91,14 @@ _TRANSFORM = pa.struct(
 _NO_TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 
 
-def _make_transforms(places: Places) -> Fields:
-    """Return the places of sensors as one message of static transforms."""
+def _make_transforms(lever_arms: LeverArms) -> Fields:
+    """Return the lever arms of sensors as one message of static transforms."""
     rows = [
         {
             "header": {"frame_id": "base_link"},
             "child_frame_id": frame,
             "transform": {"translation": dict(zip("xyz", xyz_m, strict=True)), "rotation": _NO_TURN},
         }
-        for frame, xyz_m in places.items()
+        for frame, xyz_m in lever_arms.items()
     ]
     return {"transforms": make_column([rows], pa.list_(_TRANSFORM))}

@@ -19,7 +19,6 @@ from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
-_HASH_BYTES = 1 << 20
 Fields = Mapping[str, "NDArray[Any] | pa.Array"]
 
 
@@ -80,8 +79,7 @@ class TableLog:
         digest = hashlib.sha256()
         for file in self._files:
             with file.open("rb") as stream:
-                while block := stream.read(_HASH_BYTES):
-                    digest.update(block)
+                hashlib.file_digest(stream, lambda: digest)
         return digest.hexdigest()
 
     def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:

@@ -200,7 +200,7 @@ def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[st
     `LogError`: the file cannot be read as a table.
     """
     wanted = [name for name in dict.fromkeys(columns) if name not in words]
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             frame = _collect_columns(path, [*dict.fromkeys([stamp, *wanted, *words])], numbers=wanted)
@@ -223,7 +223,7 @@ def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[st
         {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()}
         | {name: frame[name].to_numpy() for name in words},
         texts,
-        tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in said)),
+        tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in caught)),
     )
 
 
@@ -320,9 +320,9 @@ def _is_name(field: bytes) -> bool:
 
 def _find_column_names(comments: list[bytes], count: int, *, spaced: bool) -> list[str]:
     """Return the names of a table without a header: those of its last comment where they are as many, TUM's, or numbers."""
-    told = comments[-1].lstrip(b"#% ").replace(b",", b" ").split() if comments else []
-    if len(told) == count:
-        return [name.decode(errors="replace") for name in told]
+    names = comments[-1].lstrip(b"#% ").replace(b",", b" ").split() if comments else []
+    if len(names) == count:
+        return [name.decode(errors="replace") for name in names]
     if spaced and count == len(TUM):
         return list(TUM)
     return [f"column_{number}" for number in range(1, count + 1)]
