@@ -170,10 +170,7 @@ def _iterate_power(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     if named and not found:
         found = {re.sub(r"\W+", "_", table.path.stem): {named[0]: table.names[1]}}
     for name, rail in found.items():
-        columns = {
-            of: text.strip("`") if text.count("`") == 2 and text[0] == text[-1] else text for of, text in rail.items()
-        }
-        if lines := _make_lines(table, name, "power", columns, doubt):
+        if lines := _make_lines(table, name, "power", rail, doubt):
             yield name, lines
 
 

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +19,7 @@ from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
-Fields = Mapping[str, "NDArray[Any] | pa.Array"]
+Fields = Mapping[str, "NDArray[np.generic] | pa.Array"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def make_topic(
     return TopicMessages(topic, make, damage)
 
 
-def _make_column(values: NDArray[Any] | pa.Array) -> pa.Array:
+def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
     """Return a column of messages: rows of shape (N, k) become lists, bytes texts."""
     if isinstance(values, pa.Array):
         return values
