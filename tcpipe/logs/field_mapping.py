@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs import roles
-from tcpipe.logs.expressions import FORM, Expression, ExpressionError, parse_expression, split_unit
-from tcpipe.logs.fix_quality import CODES, classify_fixes, find_status, split_codes
+from tcpipe.logs.expressions import FORM, UNITS, Expression, ExpressionError, parse_expression, split_unit
+from tcpipe.logs.fix_quality import CODES, CODES_OF_NAMES, classify_fixes, find_status, split_codes
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
@@ -111,20 +111,6 @@ MAPPED_TYPES = {
     "pose": roles.POSE_WITH_COVARIANCE_STAMPED,
 }
 """The message as which a role's fields are read."""
-
-UNITS: dict[str, dict[str, float]] = {
-    "deg": {"deg": 1.0, "rad": 180.0 / np.pi, "1e-7 deg": 1e-7},
-    "m": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
-    "m/s": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600},
-    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
-    "m/s2": {"m/s2": 1.0, "g": 9.80665, "mg": 0.00980665},
-    "V": {"V": 1.0, "mV": 0.001},
-    "A": {"A": 1.0, "mA": 0.001},
-    "W": {"W": 1.0, "mW": 0.001, "kW": 1000.0},
-    "J": {"J": 1.0, "kJ": 1000.0, "mWh": 3.6, "Wh": 3600.0, "kWh": 3.6e6},
-    "1": {"1": 1.0},
-}
-"""What one of a unit is in the field's own."""
 
 STAMP_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 """What one of a unit of stamps is in [ns]."""
@@ -372,7 +358,7 @@ CALLED: Mapping[str, Mapping[str, str]] = {
         "east_std": r"sde",
         "north_std": r"sdn",
         "up_std": r"sdu",
-        "quality": r"q|(.*[_.])?carr(ier)?_?sol\w*|(.*[_.])?(gga|fix|gps)_?qual(ity)?",
+        "quality": "|".join(CODES_OF_NAMES.values()),
     },
     "imu": {
         **_match_axes("w|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),
@@ -380,7 +366,6 @@ CALLED: Mapping[str, Mapping[str, str]] = {
     },
     "command": {**_VELOCITY, **_TURN},
     "wheel_odometry": {**_VELOCITY, **_TURN},
-    "power": {"voltage": r"(.*[_.])?volt(age)?", "current": r"(.*[_.])?(curr(ent)?|amps?)"},
     "pose": {
         "x": r"[tp]?x|pos(ition)?[_.]?x|east(ing)?",
         "y": r"[tp]?y|pos(ition)?[_.]?y|north(ing)?",

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.table_log import describe_duplicate, read_cells, read_column_names
+from tcpipe.formats.logs.table_log import describe_duplicate, read_cells, read_column_names, read_values
 from tcpipe.formats.object_storage import format_path
-from tcpipe.logs.expressions import parse_expression, split_unit
+from tcpipe.logs.expressions import UNITS, parse_expression, split_unit
 from tcpipe.logs.field_mapping import (
     MAPPED,
     STAMP_UNITS,
-    UNITS,
     find_other_unit,
     match_field_names,
     parse_stamps_ns,
@@ -34,6 +33,7 @@ from tcpipe.recipe.suggestions import (
     propose_decisions,
     propose_quality,
 )
+from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, judge_fields
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,6 @@ _BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
 _STAMP = re.compile(r"t|stamp|.*time(stamp|string)?|gpst|utc|date")
 _PLAIN = re.compile(r"[A-Za-z_]\w*")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
-_FASTEST_MPS = 15.0
 _OVER_TRACK = "/ 0.5"
 
 
@@ -190,10 +189,7 @@ def _iterate_power(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     if counters and not found:
         found = {"power": {"energy": counters[0]}}
     for name, rail in found.items():
-        columns = {
-            of: text.strip("`") if text.count("`") == 2 and text[0] == text[-1] else text for of, text in rail.items()
-        }
-        if lines := _make_lines(table, name, "power", columns, doubt):
+        if lines := _make_lines(table, name, "power", rail, doubt):
             yield name, lines
 
 
@@ -254,11 +250,7 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[s
     fields = read_fields("", role, columns, _find_units(table, role, columns), table.names)
     if isinstance(fields, list):
         return {}
-    used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
-    numbers = [column for name, named in used.items() if name != "quality" for column in named]
-    cells = read_cells(table.path, stamp=table.stamp, columns=numbers, words=used.get("quality", ()))
-    rows = len(cells.stamp)
-    found = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
+    _, found = read_values(table.path, table.stamp, fields)
     return {name: values for name, values in found.items() if np.isfinite(values).any()}
 
 
@@ -280,5 +272,5 @@ def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats])
         volt, amp = (values.get(of, np.full(1, np.nan)) for of in ("voltage", "current"))
         return _IMPOSSIBLE if find_rejection(RailReadings("", volt, amp), "", {}) else ""
     speed = values.get("linear_x", np.zeros(1))
-    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > _FASTEST_MPS
+    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > MAX_PLAUSIBLE_MPS
     return "its largest values are no m/s: state the unit" if is_fast else ""
