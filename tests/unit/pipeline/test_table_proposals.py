@@ -47,7 +47,11 @@ def test_stamps_since_1970_go_before_those_from_the_start_and_texts_cut_to_secon
     values, recipe, _ = proposed(tmp_path)
     assert values["tables"]["gnss"]["stamp"] == "timestamp (ns)"
     assert values["tables"]["gnss"]["columns"]["altitude"] == "alt_msl"
-    assert values["tables"]["power"] == {"file": "b/power.csv", "stamp": "stamp_ns", "columns": {"power": "`Power (w)`"}}
+    assert values["tables"]["power"] == {
+        "file": "b/power.csv",
+        "stamp": "stamp_ns",
+        "columns": {"power": "`Power (w)`"},
+    }
     topics = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables).topics
     assert {name: topic.message_count for name, topic in topics.items()} == {"/gnss": ROWS, "/power": ROWS}
 
