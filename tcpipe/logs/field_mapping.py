@@ -156,12 +156,13 @@ class FieldSource:
 
 
 def read_fields(
-    where: str, role: str, columns: Mapping[str, str], units: Mapping[str, str], known: Collection[str]
+    where: str, role: str, columns: Mapping[str, str], units: Mapping[str, str] | None, known: Collection[str]
 ) -> dict[str, FieldSource] | list[str]:
     """Return by field what the recipe makes it of, or every problem.
 
     ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none;
-    that of an expression has to be stated where its columns have another one than the field.
+    that of an expression has to be stated where its columns have another one than the field. Where a recipe cannot state units (None),
+    an expression converts.
     """
     found: dict[str, FieldSource] = {}
     problems: list[str] = []
@@ -185,7 +186,7 @@ def read_fields(
         elif name == "voltage" and not expression.operands():
             problems.append(f"{place} is the constant {text}; state nominal_voltage_volt, which has an uncertainty")
         else:
-            factor = _choose_factor(MAPPED[role][name].unit, expression, units.get(name))
+            factor = _choose_factor(MAPPED[role][name].unit, expression, name, units)
             if isinstance(factor, str):
                 problems.append(f"{place}: {factor}")
             else:
@@ -200,17 +201,22 @@ def find_other_unit(expression: Expression, unit: str) -> str | None:
     return next((of for of in named if of and others.get(of, 1.0) != 1.0), None)
 
 
-def _choose_factor(unit: str, expression: Expression, stated: str | None) -> float | str:
+def _choose_factor(unit: str, expression: Expression, name: str, units: Mapping[str, str] | None) -> float | str:
     """Return what one of a column's unit is in a field's, or what is unclear about that."""
-    column = expression.column
-    if stated is None and column is None and (other := find_other_unit(expression, unit)):
+    column, stated = expression.column, units.get(name) if units else None
+    if units is not None and stated is None and column is None and (other := find_other_unit(expression, unit)):
         return f"its columns are in {other}; state the unit of the expression under units: {', '.join(UNITS[unit])}"
     _, named, in_brackets = split_unit("" if stated or column is None else column)
     if unit == "1" or (stated or named) is None:
         return 1.0
     factor = UNITS[unit].get(stated or named or "")
     if factor is None and (in_brackets or len(named or "") > _CLEARLY_A_UNIT):
-        return f"the column is called {column}, and {unit} are expected; state its unit under units: {', '.join(UNITS[unit])}"
+        advice = (
+            f"state its unit under units: {', '.join(UNITS[unit])}"
+            if units is not None
+            else f"convert it, as {column} * 0.001"
+        )
+        return f"the column is called {column}, and {unit} are expected; {advice}"
     return 1.0 if factor is None else factor
 
 
@@ -310,7 +316,7 @@ def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) 
     problems = list(find_mapping_problems(where, role, fields, {}))
     known = [field for field in columns if not field.endswith("time_ns")]
     mapped = {name: text for name, text in fields.items() if name in MAPPED[role]}
-    found = read_fields(where, role, mapped, {}, known)
+    found = read_fields(where, role, mapped, None, known)
     if isinstance(found, list):
         return problems + found
     rows = len(columns["log_time_ns"])
