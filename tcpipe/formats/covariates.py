@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.integrity import Checksum, compute_checksum
-from tcpipe.logs.field_mapping import parse_stamps_ns
+from tcpipe.logs.field_mapping import STAMP_UNITS, parse_stamps_ns
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
-_UNITS = ("s", "ms", "us", "ns")
 _TIME_NAMES = ("time", "stamp", "timestamp", "datetime", "date", "date_time", "time_utc", "utc")
 _NO_VALUE = ["", "NA", "N/A", "n/a", "NaN", "nan", "null", "NULL", "None"]
 _STAMP, _FOUND, _ROW = "tcpipe stamp", "tcpipe found", "tcpipe row"
@@ -145,7 +144,7 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
         if wanted not in table.columns:
             raise DatasetError(f"{path}: no column {wanted!r} ({_COLUMN}); there are {there}")
         return wanted
-    endings = ("", *(f"_{unit}" for unit in _UNITS))
+    endings = ("", *(f"_{unit}" for unit in STAMP_UNITS))
     found = [name for name in table.columns if name.lower() in {f"{of}{end}" for of in _TIME_NAMES for end in endings}]
     if len(found) != 1:
         said = (
@@ -183,7 +182,9 @@ def _convert_numeric_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl
     """Return stamps that are numbers [ns], in the unit that is asked for, the one at the end of the name, or the one of their size."""
     ending = column.name.lower().rsplit("_", 1)[-1]
     numbers = column if column.dtype.is_integer() else column.set(~column.is_finite(), None)
-    stamps = parse_stamps_ns(numbers.drop_nulls().to_numpy(), ending if unit == "auto" and ending in _UNITS else unit)
+    stamps = parse_stamps_ns(
+        numbers.drop_nulls().to_numpy(), ending if unit == "auto" and ending in STAMP_UNITS else unit
+    )
     if isinstance(stamps, str):
         raise DatasetError(f"{path}: {column.name}: {stamps} ({format_recipe_key('covariates.time_unit')})")
     made = np.zeros(len(numbers), np.int64)

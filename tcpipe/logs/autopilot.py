@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
+from tcpipe.logs.fix_quality import classify_fixes, find_status
 from tcpipe.logs.messages import GNSS, Columns
 from tcpipe.logs.roles import GPS_FIXES
 from tcpipe.logs.topics import AutopilotKind
@@ -23,6 +24,7 @@ Int64 = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Stamped = tuple[Int64, Columns]
 """Times since boot [µs], shape (N,), and fields by name."""
+LeverArms = dict[str, tuple[float, float, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,24 +95,24 @@ def select_fields(columns: Columns) -> Columns:
     return {name: of for name, of in columns.items() if of.dtype.kind in "iuf" and (of.ndim == 1 or name in _LISTS)}
 
 
-_LISTS = ("gyro_rad", "accelerometer_m_s2", "wheel_speed", "velocity")
+_LISTS = ("gyro_rad", "accelerometer_m_s2", "wheel_speed")
 
 
-def find_places(parameters: Mapping[str, float]) -> dict[str, tuple[float, float, float]]:
-    """Return where sensors are, forward, left and up of base_link [m], by frame, as parameters say; all zero says nothing."""
-    found: dict[str, tuple[float, float, float]] = {}
-    for frame, prefixes in _PLACES.items():
+def find_lever_arms(parameters: Mapping[str, float]) -> LeverArms:
+    """Return the lever arms of sensors by frame: forward, left and up of base_link [m], as parameters state; all zero states nothing."""
+    found: LeverArms = {}
+    for frame, prefixes in _LEVER_ARMS.items():
         stated = ([parameters.get(f"{prefix}_{axis}", 0.0) for axis in "XYZ"] for prefix in prefixes.split())
         if frd := next((place for place in stated if any(place) and np.isfinite(place).all()), None):
             found[frame] = (frd[0], -frd[1], -frd[2])
     return found
 
 
-_PLACES = {"gps": "EKF2_GPS_POS GPS1_POS GPS_POS1 GPS_POS", "imu": "EKF2_IMU_POS INS_POS1"}
+_LEVER_ARMS = {"gps": "EKF2_GPS_POS GPS1_POS GPS_POS1 GPS_POS", "imu": "EKF2_IMU_POS INS_POS1"}
 
 
 def find_utc_offset_us(log: Autopilot) -> int:
-    """Return what a receiver's UTC is ahead of the time since boot [µs], the median over its messages; 0 where none told the time."""
+    """Return what a receiver's UTC is ahead of the time since boot [µs], the median over its messages; 0 where none knew the time."""
     _, time_us, fields = _find_receiver(log)
     if "time_utc_usec" in fields:
         utc_us = fields["time_utc_usec"].astype(np.int64)
@@ -132,7 +134,7 @@ _RECEIVERS = "vehicle_gps_position sensor_gps GPS"
 
 
 def _find_receiver(log: Autopilot) -> tuple[str, Int64, Columns]:
-    """Return the name and messages of the first receiver; none are as one at time 0 that tells nothing."""
+    """Return the name and messages of the first receiver; without any one message at time 0 that has no fields."""
     names = [found for name in _RECEIVERS.split() for found in log.list_instances(name)]
     return (names[0], *log.messages[names[0]]) if names else ("", np.zeros(1, np.int64), {})
 
@@ -147,20 +149,19 @@ def _find_ellipsoidal(log: Autopilot) -> Floats | None:
 
 
 _HIGHEST_M = 1e5
-_STATUS = np.array([-1, -1, 0, 0, 1, 2, 2, -1])
-"""NavSatStatus by type of fix: none, none, 2D, 3D, differential, RTK float, RTK fixed; those beyond are no measurements."""
-_IN_3D = 3
+_IN_3D, _RTK_FIXED = 3, 6
+"""Types of fixes; those beyond are no measurements."""
 
 
 def _make_fix(log: Autopilot, kind: Int64, sea_m: Floats) -> Columns:
-    """Return status and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
+    """Return quality and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
     ellipsoidal = _find_ellipsoidal(log)
     height = np.where(kind >= _IN_3D, sea_m if ellipsoidal is None else ellipsoidal, np.nan)
-    return {"status": _find_status(kind), "altitude": height}
+    return {"quality": _find_quality(kind), "altitude": height}
 
 
-def _find_status(kind: Int64) -> Int64:
-    return _STATUS[np.clip(kind, 0, len(_STATUS) - 1).astype(np.int64)]
+def _find_quality(kind: Int64) -> Floats:
+    return classify_fixes(np.where(kind > _RTK_FIXED, 0, kind), "mavlink")
 
 
 def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[str, Floats]:
@@ -209,12 +210,9 @@ def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Int64, f: Columns) 
 
 
 def _convert_px4_command(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
-    if (name := next((name for name in _PX4_SPEEDS if name in f), None)) is not None:
-        speed = f[name]
-    else:  # of trajectory_setpoint, which had other names until 2022
-        speed = np.hypot(*(f["velocity"].T[:2] if "velocity" in f else (f["vx"], f["vy"])))
+    speed = f[next((name for name in _PX4_SPEEDS if name in f), _PX4_SPEEDS[0])]
     turn = {**log.find_last("rover_rate_setpoint", time_us, within_us=_HELD_US), **f}
-    right = next((turn[name] for name in ("yaw_rate_setpoint", "yaw_rate", "yawspeed") if name in turn), 0.0 * speed)
+    right = next((turn[name] for name in ("yaw_rate_setpoint", "yaw_rate") if name in turn), 0.0 * speed)
     return time_us, {"linear_x": speed, "angular_z": -np.nan_to_num(right)}
 
 
@@ -243,7 +241,7 @@ def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Co
     accuracy, unknown = _find_accuracy(log, name, time_us), np.full(len(time_us), np.nan)
     error = 2.0 * accuracy.get("SAcc", unknown)
     climb = np.where(accuracy.get("VV", unknown) == 1, -f["VZ"], np.nan)
-    status = np.where(f["Status"] >= _IN_3D, _find_status(f["Status"]), -1)
+    status = find_status(_find_quality(np.where(f["Status"] >= _IN_3D, f["Status"], 0)))
     values = {"speed": f["Spd"], "track": f["GCrs"], "climb": climb, "err_speed": error, "err_climb": error}
     return time_us, {**values, "status.status": status}
 
@@ -284,7 +282,7 @@ def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Int64, f: Co
 
 _Convert = Callable[[Autopilot, str, Int64, Columns], tuple[Int64, Columns]]
 _PX4_COMMANDS = """rover_speed_setpoint rover_differential_setpoint rover_ackermann_setpoint rover_mecanum_setpoint
-differential_drive_setpoint trajectory_setpoint"""
+differential_drive_setpoint"""
 _SOURCES: dict[str, tuple[tuple[str, str, str, str, _Convert], ...]] = {
     "ulog": (
         (_RECEIVERS, "fix", "gnss", "gps", _convert_px4_fix),

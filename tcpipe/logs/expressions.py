@@ -92,6 +92,20 @@ def parse_expression(text: str, known: Collection[str] = ()) -> Expression:
     return made
 
 
+UNITS: dict[str, dict[str, float]] = {
+    "deg": {"deg": 1.0, "rad": 180.0 / np.pi, "1e-7 deg": 1e-7},
+    "m": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
+    "m/s": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600},
+    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
+    "m/s2": {"m/s2": 1.0, "g": 9.80665, "mg": 0.00980665},
+    "V": {"V": 1.0, "mV": 0.001},
+    "A": {"A": 1.0, "mA": 0.001},
+    "W": {"W": 1.0, "mW": 0.001, "kW": 1000.0},
+    "J": {"J": 1.0, "kJ": 1000.0, "mWh": 3.6, "Wh": 3600.0, "kWh": 3.6e6},
+    "1": {"1": 1.0},
+}
+"""What one of a unit is in another: that by which they are grouped."""
+
 _UNIT_NAMES = """
 deg degree degrees °; rad radian radians; m meter meters metre metres; cm; mm; km; ft feet; m/s mps m_s; cm/s cmps; mm/s mmps; km/h kmh kph;
 mph; kn kt kts knot knots; rad/s radps rads rad_s; deg/s degps degs dps deg_s °/s; rpm; m/s2 m/s^2 m/s² m/s/s mps2; g; mg; V volt volts;

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs import roles
-from tcpipe.logs.expressions import FORM, Expression, ExpressionError, parse_expression, split_unit
-from tcpipe.logs.fix_quality import CODES, classify_fixes, find_status, split_codes
+from tcpipe.logs.expressions import FORM, UNITS, Expression, ExpressionError, parse_expression, split_unit
+from tcpipe.logs.fix_quality import CODES, CODES_OF_NAMES, classify_fixes, find_status, split_codes
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
@@ -112,20 +112,6 @@ MAPPED_TYPES = {
 }
 """The message as which a role's fields are read."""
 
-UNITS: dict[str, dict[str, float]] = {
-    "deg": {"deg": 1.0, "rad": 180.0 / np.pi, "1e-7 deg": 1e-7},
-    "m": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
-    "m/s": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600},
-    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
-    "m/s2": {"m/s2": 1.0, "g": 9.80665, "mg": 0.00980665},
-    "V": {"V": 1.0, "mV": 0.001},
-    "A": {"A": 1.0, "mA": 0.001},
-    "W": {"W": 1.0, "mW": 0.001, "kW": 1000.0},
-    "J": {"J": 1.0, "kJ": 1000.0, "mWh": 3.6, "Wh": 3600.0, "kWh": 3.6e6},
-    "1": {"1": 1.0},
-}
-"""What one of a unit is in the field's own."""
-
 STAMP_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 """What one of a unit of stamps is in [ns]."""
 _YEARS_S = (3e8, 1e10)
@@ -174,7 +160,8 @@ def read_fields(
 ) -> dict[str, FieldSource] | list[str]:
     """Return by field what the recipe makes it of, or every problem.
 
-    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none.
+    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none;
+    that of an expression has to be stated where its columns have another one than the field.
     """
     found: dict[str, FieldSource] = {}
     problems: list[str] = []
@@ -198,7 +185,7 @@ def read_fields(
         elif name == "voltage" and not expression.operands():
             problems.append(f"{place} is the constant {text}; state nominal_voltage_volt, which has an uncertainty")
         else:
-            factor = _choose_factor(MAPPED[role][name].unit, expression.column, units.get(name))
+            factor = _choose_factor(MAPPED[role][name].unit, expression, units.get(name))
             if isinstance(factor, str):
                 problems.append(f"{place}: {factor}")
             else:
@@ -206,8 +193,18 @@ def read_fields(
     return problems or found
 
 
-def _choose_factor(unit: str, column: str | None, stated: str | None) -> float | str:
+def find_other_unit(expression: Expression, unit: str) -> str | None:
+    """Return the unit that an expression's columns state, if it is not the field's own but of its quantity (for rad/s also a speed's)."""
+    others = UNITS[unit] | (UNITS["m/s"] if unit == "rad/s" else {})
+    named = [split_unit(column)[1] for column, _ in expression.operands()]
+    return next((of for of in named if of and others.get(of, 1.0) != 1.0), None)
+
+
+def _choose_factor(unit: str, expression: Expression, stated: str | None) -> float | str:
     """Return what one of a column's unit is in a field's, or what is unclear about that."""
+    column = expression.column
+    if stated is None and column is None and (other := find_other_unit(expression, unit)):
+        return f"its columns are in {other}; state the unit of the expression under units: {', '.join(UNITS[unit])}"
     _, named, in_brackets = split_unit("" if stated or column is None else column)
     if unit == "1" or (stated or named) is None:
         return 1.0
@@ -361,7 +358,7 @@ CALLED: Mapping[str, Mapping[str, str]] = {
         "east_std": r"sde",
         "north_std": r"sdn",
         "up_std": r"sdu",
-        "quality": r"q|(.*[_.])?carr(ier)?_?sol\w*|(.*[_.])?(gga|fix|gps)_?qual(ity)?",
+        "quality": "|".join(CODES_OF_NAMES.values()),
     },
     "imu": {
         **_match_axes("w|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),
@@ -369,7 +366,6 @@ CALLED: Mapping[str, Mapping[str, str]] = {
     },
     "command": {**_VELOCITY, **_TURN},
     "wheel_odometry": {**_VELOCITY, **_TURN},
-    "power": {"voltage": r"(.*[_.])?volt(age)?", "current": r"(.*[_.])?(curr(ent)?|amps?)"},
     "pose": {
         "x": r"[tp]?x|pos(ition)?[_.]?x|east(ing)?",
         "y": r"[tp]?y|pos(ition)?[_.]?y|north(ing)?",
@@ -383,11 +379,15 @@ _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
 """No receiver's message is longer or has more numbers; one that is made to hurt does not cost minutes."""
 
 
+def _simplify(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", split_unit(name)[0].strip().lower())
+
+
 def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     """Return the name of each field of a role; {} where one is missing that the role needs."""
     found: dict[str, str] = {}
     for field, pattern in CALLED[role].items():
-        match = next((name for name in names if re.fullmatch(pattern, split_unit(name)[0].lower())), None)
+        match = next((name for name in names if re.fullmatch(pattern, _simplify(name))), None)
         if match is not None and match not in found.values():
             found[field] = match
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}

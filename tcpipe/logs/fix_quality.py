@@ -46,11 +46,12 @@ _WORDS: tuple[tuple[str, float], ...] = (
     (r"dgps|dgnss|diff|sbas|waas|egnos|ppp", _DIFFERENTIAL),
     (r"single|auto|stand|\bspp|\bsps|gps|gnss|fix|[23]d", _SINGLE),
 )
-_CODES_OF_NAMES = {
+CODES_OF_NAMES = {
     "rtklib": r"q",
     "ublox": r"(.*[_.])?carr(ier)?_?sol\w*",
     "gga": r"(.*[_.])?(gga|fix|gps)_?qual(ity)?",
 }
+"""What a column is called whose name says what its codes are, as patterns in lower case."""
 _EQUAL_FEWEST = 20
 
 
@@ -59,13 +60,13 @@ def split_codes(text: str) -> tuple[str | None, str]:
     codes, colon, column = text.partition(":")
     if colon and codes.strip() in CODES:
         return codes.strip(), column.strip()
-    named = (codes for codes, pattern in _CODES_OF_NAMES.items() if re.fullmatch(pattern, text.lower()))
+    named = (codes for codes, pattern in CODES_OF_NAMES.items() if re.fullmatch(pattern, text.lower()))
     return next(named, None), text
 
 
 def find_quality(names: Iterable[str]) -> list[str]:
     """Return the first name that may be a fix quality, with the codes that are likeliest: ``gga: quality``; [] where none is."""
-    likely = {"gga": r"(.*[_.])?(qual(ity)?|mode|fix_?(type|mode))", "navsat": r"(.*[_.])?status"}
+    likely = {"gga": r"(.*[_. ])?(qual(ity)?|mode|fix[_ ]?(type|mode)?)", "navsat": r"(.*[_. ])?status"}
     found = [f"{codes}: {name}" for codes, of in likely.items() for name in names if re.fullmatch(of, name.lower())]
     return found[:1]
 

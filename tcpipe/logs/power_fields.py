@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from tcpipe.logs.expressions import split_unit
+from tcpipe.logs.expressions import UNITS, split_unit
 
 SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr", "bl", "br"})
 
@@ -17,9 +17,10 @@ _QUANTITIES = {
     "power": re.compile(r"power|watts?"),
 }
 _UNITS = {
-    "V": ("voltage", 1.0), "mV": ("voltage", 0.001), "A": ("current", 1.0), "mA": ("current", 0.001), "W": ("power", 1.0),
-    "mW": ("power", 0.001), "kW": ("power", 1000.0),
-}  # fmt: skip
+    name: (quantity, factor)
+    for quantity, unit in (("voltage", "V"), ("current", "A"), ("power", "W"))
+    for name, factor in UNITS[unit].items()
+}
 _SUPPLY = re.compile(
     r"bat|batt|battery|bms|pack|bus|supply|input|in|main|dc|source|vin|iin|[vi](bat|batt|in|bus|pack)|esc"
 )
@@ -29,9 +30,6 @@ _OTHER = re.compile(
     r"cells?|status|fault|error|id|iq|vd|vq|per|pred|true|std|cov|variance|health|design|supply_?status|technology|mode|button|acc|lin|ang|vel"
 )
 _PHASE = re.compile(r"phase|motors?|q|d|rms")
-
-
-_TURNS = ("rpm", "rad/s", "deg/s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +95,11 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
     """
     speeds = [name for name in names if {"vel", "velocity", "speed"} & set(split_words(name))]
     sides = {"l", "left", "r", "right", "fl", "fr", "rl", "rr"}
-    sided = [name for name in speeds if sides & set(split_words(name)) and split_unit(name)[1] not in _TURNS]
+    sided = [name for name in speeds if sides & set(split_words(name))]
+    units = {split_unit(name.replace("`", ""))[1] for name in sided}
     left = [name for name in sided if {"l", "left", "fl", "rl"} & set(split_words(name))]
-    if not left or 2 * len(left) != len(sided) or len({split_sides(name)[0] for name in sided}) != 1:
+    cores = {split_sides(name)[0] for name in sided}
+    if not left or 2 * len(left) != len(sided) or len(cores) != 1 or len(units) != 1 or units & {*UNITS["rad/s"]}:
         return {}
     right = [name for name in sided if name not in left]
     turn = f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)} / 0.5"

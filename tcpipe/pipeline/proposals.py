@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -65,9 +66,15 @@ def propose_recipe(
             if not found.lines:
                 raise UsageError(f"{path}: it contains no log, and no table with columns of known names", *found.head)
             return found
+        others = [f"proposed for the first of {len(logs)} logs"] if len(logs) > 1 else []
+        if tables := [file.name for file in list_table_files(path)]:
+            others += [f"tables, not used: {', '.join(tables)}; to use them, tcpipe init --from a folder without logs"]
         path = logs[0]
+    else:
+        others = []
     with open_single_log(path, message_definitions=message_definitions, tables=None) as log:
-        return _propose_for_log(log, robot, format_path(path))
+        found = _propose_for_log(log, robot, format_path(path))
+        return replace(found, head=[*others, *found.head])
 
 
 def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> ProposedRecipe:

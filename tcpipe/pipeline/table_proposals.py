@@ -11,10 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.table_log import read_cells, read_column_names
+from tcpipe.formats.logs.table_log import describe_duplicate, read_cells, read_column_names, read_values
 from tcpipe.formats.object_storage import format_path
-from tcpipe.logs.expressions import split_unit
-from tcpipe.logs.field_mapping import MAPPED, STAMP_UNITS, match_field_names, parse_stamps_ns, read_fields
+from tcpipe.logs.expressions import UNITS, parse_expression, split_unit
+from tcpipe.logs.field_mapping import (
+    MAPPED,
+    STAMP_UNITS,
+    find_other_unit,
+    match_field_names,
+    parse_stamps_ns,
+    read_fields,
+)
 from tcpipe.logs.fix_quality import find_quality
 from tcpipe.logs.power_fields import match_power_fields, match_sided_velocities
 from tcpipe.power.sources import RailReadings, find_rejection
@@ -26,6 +33,7 @@ from tcpipe.recipe.suggestions import (
     propose_decisions,
     propose_quality,
 )
+from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, judge_fields
 
 Floats = NDArray[np.float64]
@@ -35,7 +43,6 @@ _BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
 _STAMP = re.compile(r"t|stamp|.*time(stamp|string)?|gpst|utc|date")
 _PLAIN = re.compile(r"[A-Za-z_]\w*")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
-_FASTEST_MPS = 15.0
 _OVER_TRACK = "/ 0.5"
 
 
@@ -79,12 +86,18 @@ def propose_tables(folder: Path, files: Sequence[Path]) -> ProposedRecipe:
     """Return the recipe for the tables that have known names: of several for a role, that which covers the drive of the others best."""
     columns, problems = read_columns(folder, files)
     roles: dict[str, list[tuple[_Table, list[ProposedLine]]]] = {}
+    head = [*problems.values()]
     for name, path in _group_files(folder, [folder / file for file in columns]).items():
-        if table := _read_table(name, path, columns[path.relative_to(folder).as_posix()]):
-            for role, lines in _iterate_roles(table):
-                roles.setdefault(role, []).append((table, lines))
+        names = columns[path.relative_to(folder).as_posix()]
+        table = _read_table(name, path, names)
+        found = [(role, (table, lines)) for role, lines in _iterate_roles(table)] if table else []
+        for role, candidate in found:
+            roles.setdefault(role, []).append(candidate)
+        if not found:
+            why = "no known fields" if table else "no stamps"
+            head.append(f"{name} is not used, {why} in its columns {', '.join(names)}")
     ranked = [of for candidates in roles.values() for of in sorted(candidates, key=lambda of: -of[0].rows)[:1]]
-    head, lines, log = [*problems.values()], list[ProposedLine](), folder
+    lines, log = list[ProposedLine](), folder
     for role, candidates in roles.items():
         first = ranked[0][0]
         candidates.sort(key=lambda of: (-of[0].overlap_ns(first), -of[0].rows))
@@ -150,6 +163,9 @@ def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     found["command"] = match_field_names("command", commands)
     if not found["gnss"]:
         sided = match_sided_velocities([_quote(name) for name in measured])
+        if sided and (other := find_other_unit(parse_expression(sided["angular_z"]), "rad/s")):
+            to_mps = f"* {UNITS['m/s'][other]:.9g} {_OVER_TRACK}"
+            sided["angular_z"] = sided["angular_z"].removesuffix(_OVER_TRACK) + to_mps
         found["wheel_odometry"] = match_field_names("wheel_odometry", measured) or sided
         found["pose"] = {} if found["wheel_odometry"] else match_field_names("pose", measured)
     for role, columns in found.items():
@@ -169,11 +185,11 @@ def _iterate_power(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     found = {f"power_{number}" if len(rails) > 1 else "power": rail for number, rail in enumerate(rails, 1)}
     if named and not found:
         found = {re.sub(r"\W+", "_", table.path.stem): {named[0]: table.names[1]}}
+    counters = [name for name in table.names if split_unit(name)[1] in UNITS["J"]]
+    if counters and not found:
+        found = {"power": {"energy": counters[0]}}
     for name, rail in found.items():
-        columns = {
-            of: text.strip("`") if text.count("`") == 2 and text[0] == text[-1] else text for of, text in rail.items()
-        }
-        if lines := _make_lines(table, name, "power", columns, doubt):
+        if lines := _make_lines(table, name, "power", rail, doubt):
             yield name, lines
 
 
@@ -183,7 +199,9 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     mapped = {of: text for of, text in columns.items() if of in values}
     if not mapped or any(of not in mapped for of, known in MAPPED[role].items() if known.needed):
         return []
-    doubt = doubt or _find_doubt(role, mapped, values)
+    used = [name for name in table.names if name in " ".join(mapped.values())]
+    twice = next(filter(None, (describe_duplicate(name, table.names) for name in used)), "")
+    doubt = doubt or _find_doubt(role, mapped, values) or twice
     if doubt == _IMPOSSIBLE:
         return []
     keys: dict[str, tuple[TomlValue, str]] = {"role": ("power", "")} if name != role else {}
@@ -191,27 +209,48 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     keys |= {"stamp_unit": (table.stamp_unit, "by its steps")} if table.stamp_unit else {}
     samples = {of: "" if of == "quality" else format_first(values[of]) for of in mapped}
     keys |= {f"columns.{of}": (text, samples[of]) for of, text in mapped.items()}
+    keys |= {f"units.{of}": (unit, "") for of, unit in _find_units(table, role, mapped).items() if of != "angular_z"}
     head = f"tables.{name}"
     lines = [ProposedLine(head, key, value, note, is_certain=not doubt) for key, (value, note) in keys.items()]
     if mapped.get("angular_z", "").endswith(_OVER_TRACK):
-        lines[-1] = replace(lines[-1], note="state the track width in place of 0.5 m", is_certain=False)
+        note = "state the track width in place of 0.5 m"
+        lines = [
+            replace(line, note=note, is_certain=False) if line.key == "columns.angular_z" else line for line in lines
+        ]
+        turn_units = _find_units(table, role, mapped).get("angular_z")
+        lines += [ProposedLine(head, "units.angular_z", turn_units, is_certain=False)] if turn_units else []
     if role == "gnss" and "quality" not in mapped:
-        lines += [propose_quality(head, "columns.quality", of) for of in find_quality(table.names)]
+        lines += [_propose_quality(table, head, of) for of in find_quality(table.names)]
     if role == "power" and set(mapped) == {"current"}:
         lines += [ProposedLine(head, of, volt, NO_VOLTAGE, is_certain=False) for of, volt in NOMINAL.items()]
     return lines
 
 
+def _propose_quality(table: _Table, head: str, source: str) -> ProposedLine:
+    """Return the line of a fix quality: texts are words, what numbers mean is for a person to decide."""
+    column = source.partition(": ")[2]
+    values = read_cells(table.path, stamp=table.stamp, columns=[], words=[column]).columns[column]
+    if np.issubdtype(values.dtype, np.number):
+        return propose_quality(head, "columns.quality", source)
+    return ProposedLine(head, "columns.quality", f"words: {column}", str(values[0]))
+
+
+def _find_units(table: _Table, role: str, columns: Mapping[str, str]) -> dict[str, str]:
+    """Return the units that the recipe has to state: of expressions whose columns have another one than the field."""
+    found: dict[str, str] = {}
+    for of, text in columns.items():
+        unit, expression = MAPPED[role][of].unit, parse_expression(text.rpartition(": ")[2], table.names)
+        if expression.column is None and (other := find_other_unit(expression, unit)):
+            found[of] = other if other in UNITS[unit] else unit
+    return found
+
+
 def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[str, Floats]:
     """Return the values of columns by field, in its unit; without those that hold no number."""
-    fields = read_fields("", role, columns, {}, table.names)
+    fields = read_fields("", role, columns, _find_units(table, role, columns), table.names)
     if isinstance(fields, list):
         return {}
-    used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
-    numbers = [column for name, named in used.items() if name != "quality" for column in named]
-    cells = read_cells(table.path, stamp=table.stamp, columns=numbers, words=used.get("quality", ()))
-    rows = len(cells.stamp)
-    found = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
+    _, found = read_values(table.path, table.stamp, fields)
     return {name: values for name, values in found.items() if np.isfinite(values).any()}
 
 
@@ -227,9 +266,11 @@ def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats])
         mapped.clear()
         mapped.update(held)
         return doubt
-    if role == "power" and "power" not in values:
+    if "energy" in values and np.ptp(values["energy"]) == 0.0:
+        return _IMPOSSIBLE
+    if role == "power" and not {"power", "energy"} & set(values):
         volt, amp = (values.get(of, np.full(1, np.nan)) for of in ("voltage", "current"))
         return _IMPOSSIBLE if find_rejection(RailReadings("", volt, amp), "", {}) else ""
     speed = values.get("linear_x", np.zeros(1))
-    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > _FASTEST_MPS
+    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > MAX_PLAUSIBLE_MPS
     return "its largest values are no m/s: state the unit" if is_fast else ""

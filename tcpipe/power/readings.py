@@ -99,7 +99,7 @@ def read_power(
         gains += [_find_gain_std(of, rail.joints) for of, rail in zip(found.sources, found.rails, strict=True)]
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
-    rejected = rejected or _find_incomplete(rails)
+    rejected = rejected or _find_incomplete(rails) or _find_too_small(rails)
     if rejected:
         if len(scaled) == len(topics) and all(scaled.values()):
             rejected[0] = replace(rejected[0], remedies=_propose_sources(scaled))
@@ -260,6 +260,21 @@ def _find_incomplete(rails: Rails) -> list[Finding]:
         for quantity, column in (("voltage", "voltage_volt"), ("current", "current_amp"))
         if not any(np.isfinite(getattr(part, column)).any() for _, part in of)
     ]
+
+
+def _find_too_small(rails: Rails) -> list[Finding]:
+    """Return why rails together are no power: no robot drives with so little, their unit is another one."""
+    parts = [(topic, rail) for topic, found in rails.items() for rail in found]
+    volts = {rail.name: np.nanmedian(rail.voltage_volt) for _, rail in parts if np.isfinite(rail.voltage_volt).any()}
+    amps = {
+        rail.name: np.nanquantile(np.abs(rail.current_amp), 0.99)
+        for _, rail in parts
+        if np.isfinite(rail.current_amp).any()
+    }
+    high_watt = float(sum(amp * volts[name] for name, amp in amps.items()))
+    if high_watt >= read_threshold(REJECTED, "min_high_watt"):
+        return []
+    return [reject_power(parts[0][0], "power-too-small", high_watt=high_watt)]
 
 
 def _find_too_few(topic: str, log_time_ns: Floats) -> list[Finding]:

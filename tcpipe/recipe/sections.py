@@ -153,11 +153,17 @@ class TimeWindow:
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield each key whose value cannot be, and what was wanted."""
+        is_read = True
         for key in ("start", "end"):
             try:
                 _find_ns(getattr(self, key), 0, 0)
             except ValueError:
+                is_read = False
                 yield key, "seconds, or UTC as 2025-11-18T21:40:00"
+        if is_read and isinstance(self.start, str) == isinstance(self.end, str):
+            start_ns, end_ns = self.find_bounds_ns(0)
+            if start_ns >= end_ns:
+                yield "end", "a time after start"
 
     def find_bounds_ns(self, first_ns: int) -> tuple[int, int]:
         """Return start and end [ns] in a track that starts at ``first_ns``."""

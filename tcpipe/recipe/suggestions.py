@@ -47,25 +47,18 @@ class RecipeFragment:
 
     def inline(self) -> str:
         """Return it inside a sentence, as ``[read] imu_units = "deg"``."""
-        parts = [
-            (f"[{name}]" if isinstance(keys, Mapping) else f"[[{name}]]", each)
-            for name, keys in self.tables.items()
-            for each in ([keys] if isinstance(keys, Mapping) else keys)
-        ]
-        return " and ".join(f"{head} {', '.join(_format_lines(each))}" for head, each in parts)
+        return " and ".join(f"{head} {', '.join(lines)}" for head, lines in self._format_tables())
 
     def toml(self) -> str:
         """Return it as lines that stand in a recipe as they are."""
-        lines = []
-        for name, keys in self.tables.items():
-            for each in [keys] if isinstance(keys, Mapping) else keys:
-                head = f"[{name}]" if isinstance(keys, Mapping) else f"[[{name}]]"
-                lines += [head, *_format_lines(each)]
-        return "\n".join(lines)
+        return "\n".join(line for head, lines in self._format_tables() for line in (head, *lines))
 
-
-def _format_lines(keys: Keys) -> list[str]:
-    return [f"{name} = {as_toml(value)}" for name, value in keys.items()]
+    def _format_tables(self) -> Iterator[tuple[str, list[str]]]:
+        for name, tables in self.tables.items():
+            is_one = isinstance(tables, Mapping)
+            for keys in [tables] if isinstance(tables, Mapping) else tables:
+                lines = [f"{key} = {as_toml(value)}" for key, value in keys.items()]
+                yield f"[{name}]" if is_one else f"[[{name}]]", lines
 
 
 @dataclass(frozen=True, slots=True)

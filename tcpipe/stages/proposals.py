@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.logs.expressions import UNITS
 from tcpipe.logs.field_mapping import Columns, list_number_fields, match_field_names
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
@@ -36,7 +37,7 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 Floats = NDArray[np.float64]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-_GRAVITY_MPS2 = 9.80665
+_GRAVITY_MPS2 = UNITS["m/s2"]["g"]
 _UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
 """What no name says of a current."""
 
@@ -47,7 +48,7 @@ def find_proposals(
     """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of. The log is read once."""
     free = [topic for topic in log.topics.values() if _is_free(topic, config)]
     settled, types = {*assignment.roles, *config.topics}, {topic.type_name for topic in free}
-    told = {*known.types(), *(of for types in ROLE_TYPES.values() for of in types)}
+    known_types = {*known.types(), *(of for types in ROLE_TYPES.values() for of in types)}
     of_role = {
         (role, topic): fields
         for role in _PROPOSED
@@ -55,7 +56,7 @@ def find_proposals(
         for topic in free
         if (fields := match_field_names(role, [of for of in list_number_fields(topic) if "[]" not in of]))
     }
-    of_power = [topic for topic in free if "power" not in settled and _may_be_power(topic, told)]
+    of_power = [topic for topic in free if "power" not in settled and _may_be_power(topic, known_types)]
     lists = {topic.name: [of for of in [*list_number_fields(topic), "name[]"] if "[]" in of] for topic in of_power}
     tables = log.tables(list(dict.fromkeys([*(topic.name for _, topic in of_role), *lists])))
     columns = {name: make_message_arrays(table, lists.get(name, ())) for name, table in tables.items()}
@@ -68,10 +69,10 @@ def _is_free(topic: Topic, config: ReadConfig) -> bool:
     return readable and topic.name not in config.ignore_topics and not topic.name.startswith(OVERLAY)
 
 
-def _may_be_power(topic: Topic, told: Collection[str]) -> bool:
+def _may_be_power(topic: Topic, known_types: Collection[str]) -> bool:
     if topic.type_name in FLOAT_TYPES:
         return bool(_find_bare_quantity(topic.name))
-    is_own = topic.type_name not in told
+    is_own = topic.type_name not in known_types
     return topic.type_name == JOINT_STATE or (is_own and match_power_fields(list_number_fields(topic)) is not None)
 
 

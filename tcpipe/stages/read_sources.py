@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, cast, get_args
 
-import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, RecipeError, RoleError
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import Timeline
+from tcpipe.logs.expressions import UNITS
 from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
 from tcpipe.logs.messages import (
@@ -120,14 +120,8 @@ def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
     return scale_odometry(readings, config.odometry_scale[role]) if role in config.odometry_scale else readings
 
 
-_STANDARD_GRAVITY_MPS2 = 9.80665
-
-_FACTORS = {
-    "si": (1.0, 1.0),
-    "deg": (np.pi / 180.0, 1.0),
-    "g": (1.0, _STANDARD_GRAVITY_MPS2),
-    "deg_g": (np.pi / 180.0, _STANDARD_GRAVITY_MPS2),
-}
+_DEG, _G = UNITS["rad/s"]["deg/s"], UNITS["m/s2"]["g"]
+_FACTORS = {"si": (1.0, 1.0), "deg": (_DEG, 1.0), "g": (1.0, _G), "deg_g": (_DEG, _G)}
 
 
 def convert_imu_to_si(readings: Readings, units: str) -> Readings:

@@ -60,7 +60,7 @@ def segment_track(masked: MaskedTrack, config: SegmentConfig) -> Segments:
             tables.append(_make_segments(table.slice(first, last + 1 - first), path, cut, info))
     segments = pa.concat_tables(tables).combine_chunks()
     facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), duration_by_reason_s=seconds)
-    findings = [] if segments.num_rows else [_find_why_none(metres, sum(seconds.values()), info.run_id)]
+    findings = [] if segments.num_rows else [_find_why_none(metres, info.run_id)]
     findings += find_losses(metres, Subject("run", info.run_id))
     return Segments(segments, add_findings(info, findings, replace(info.report.facts, segment=facts)), metres)
 
@@ -101,11 +101,10 @@ def _make_lon_lat(end: str, position_m: NDArray[np.float64], datum: Datum | None
     return {f"{end}_lon_deg": lon, f"{end}_lat_deg": lat}
 
 
-def _find_why_none(metres: dict[str, float], span_s: float, run_id: str) -> Finding:
-    """Return the finding that a run has no segment, with the largest loss; a robot that drove for a moment did move."""
+def _find_why_none(metres: dict[str, float], run_id: str) -> Finding:
+    """Return the finding that a run has no segment, with the largest loss."""
     driven_m, reason = sum(metres.values()), max(metres, key=lambda entry: metres[entry])
-    least_m, least_mps = (read_threshold("no-segments", name) for name in ("min_driven_m", "min_mean_mps"))
-    if driven_m < least_m and driven_m <= least_mps * span_s:
+    if driven_m < read_threshold("no-segments", "min_driven_m"):
         return make_finding("robot-did-not-move", Subject("run", run_id), driven_m=driven_m)
     lost_m = metres[reason]
     return make_finding(

@@ -21,6 +21,7 @@ ROWS = 400
 WHEELS = {
     "file": "run_*.csv",
     "columns": {"linear_x": "(left_kmh + right_kmh) / 7.2", "angular_z": "(right_kmh - left_kmh) / 3.6 / 0.6"},
+    "units": {"linear_x": "m/s", "angular_z": "rad/s"},
 }
 
 

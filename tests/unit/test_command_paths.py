@@ -36,6 +36,9 @@ TEXTS = {
     "keep",
     "forget",
     "drives",
+    "stac",
+    "collections",
+    "around",
 }
 """Parameters of commands that are text and no path."""
 

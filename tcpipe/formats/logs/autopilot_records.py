@@ -1,7 +1,7 @@
 """Autopilot logs as columns: PX4 ULog (docs.px4.io, ULog file format) and ArduPilot DataFlash (ardupilot, AP_Logger/LogStructure.h).
 
-Both describe themselves: a format names the fields of a message; a message is a head and packed little-endian fields. One walk over the
-heads notes where the messages of each format lie; numpy reads their columns. Where a head is impossible, the walk goes on at the next
+Both describe themselves: a format names the fields of a message; a message is a head and packed little-endian fields. One pass over the
+heads finds the messages of each format; numpy reads their columns. Where a head is impossible, the pass goes on at the next
 place that fits, and what it skips is damage. A size that a file states is believed only as far as the file reaches.
 
 tcpipe reads both itself. pyulog does not say that a file is cut, and lost messages unsaid or gave up the whole log after a flipped bit (8
@@ -38,7 +38,7 @@ Layout = np.dtype[np.void]
 
 @dataclass(slots=True)
 class Messages:
-    """Messages of one name and instance, in order of time since boot [µs]: where their fields lie in the file, and how.
+    """Messages of one name and instance, in order of time since boot [µs], with the offsets in the file at which their fields begin.
 
     ``scales`` are by field: what one of a whole number is in the field's unit.
     """
@@ -60,10 +60,10 @@ class Messages:
         }
 
 
-def _gather_field(data: bytes, places: Int64, layout: Layout, name: str) -> Int64:
+def _gather_field(data: bytes, offsets: Int64, layout: Layout, name: str) -> Int64:
     """Return a whole number of each message."""
     offset: int = layout.fields[name][1]  # type: ignore[index]  # a layout that has the field has fields
-    return gather_integers(data, places + offset, layout[name].str[1:].replace("u8", "i8"))
+    return gather_integers(data, offsets + offset, layout[name].str[1:].replace("u8", "i8"))
 
 
 _CLOCKS = {"timestamp": 1, "TimeUS": 1, "T": 1000, "TimeMS": 1000}
@@ -86,15 +86,15 @@ class AutopilotRecords:
     """By cause, what could not be read."""
     dropouts: int = 0
 
-    def note(
+    def add_damage(
         self, cause: str, topic: str | None = None, lost: int | None = None, *, reason: str = "", places: int = 1
     ) -> None:
         """Add damage; more than some thousand entries say nothing new."""
         if len(self.damage) < MAX_TOPICS:
-            found = Damage(cause, self.path.name, topic=topic, messages_lost=lost, reason=reason, places=places)
-            self.damage[found] = None
+            damage = Damage(cause, self.path.name, topic=topic, messages_lost=lost, reason=reason, places=places)
+            self.damage[damage] = None
 
-    def skip(self, start: int, end: int) -> int:
+    def skip_to(self, start: int, end: int) -> int:
         """Return ``end``, up to where the file cannot be read from ``start``."""
         cause = "record-damaged" if end < len(self.data) else "file-cut"
         before = self.skipped.get(cause) or Damage(cause, self.path.name, offset=start, bytes_lost=0, places=0)
@@ -103,16 +103,16 @@ class AutopilotRecords:
         )
         return end
 
-    def add(self, name: str, instance: int, layout: Layout, places: Int64, scales: Mapping[str, float]) -> None:
+    def add(self, name: str, instance: int, layout: Layout, offsets: Int64, scales: Mapping[str, float]) -> None:
         """Add the messages of an instance; without a time they cannot be used."""
         clock = next((of for of in _CLOCKS if of in (layout.names or ()) and layout[of].str in ("<u8", "<u4")), None)
         if clock is None:
-            self.note("messages-not-decoded", f"/{name}", 0, reason=f"{name} has no time")
+            self.add_damage("messages-not-decoded", f"/{name}", 0, reason=f"{name} has no time")
             return
         if len(self.messages) >= MAX_TOPICS:
             raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; no such log is read")
-        stamps = _gather_field(self.data, places, layout, clock) * _CLOCKS[clock]
-        self.messages[f"{name}_{instance}" if instance else name] = Messages(name, layout, places, stamps, scales)
+        stamps = _gather_field(self.data, offsets, layout, clock) * _CLOCKS[clock]
+        self.messages[f"{name}_{instance}" if instance else name] = Messages(name, layout, offsets, stamps, scales)
 
     def sort_by_time(self) -> None:
         """Bring messages in order of time; those with a stamp far from those around it, or from the log's end, are left out and counted."""
@@ -121,10 +121,10 @@ class AutopilotRecords:
         for name, of in list(self.messages.items()):
             known = (of.time_us >= 0) & (of.time_us <= latest_us) & ~_find_stray(of.time_us)
             if lost := int(np.count_nonzero(~known)):
-                self.note("time-invalid", f"/{name}", lost)
+                self.add_damage("time-invalid", f"/{name}", lost)
             of.offsets, of.time_us = of.offsets[known], of.time_us[known]
             if late := int(np.count_nonzero(np.diff(of.time_us) < 0)):
-                self.note("messages-unordered", f"/{name}", 0, places=late)
+                self.add_damage("messages-unordered", f"/{name}", 0, places=late)
                 order = np.argsort(of.time_us, kind="stable")
                 of.offsets, of.time_us = of.offsets[order], of.time_us[order]
             if not len(of.time_us):
@@ -137,8 +137,10 @@ def _find_stray(time_us: Int64) -> NDArray[np.bool_]:
     if len(time_us) < _FEW or not (steps < 0).any():
         return np.zeros(len(time_us), np.bool_)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(time_us, _FEW // 2, mode="edge"), _FEW)
-    found: NDArray[np.bool_] = np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(np.abs(steps))
-    return found
+    is_stray: NDArray[np.bool_] = np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(
+        np.abs(steps)
+    )
+    return is_stray
 
 
 def read_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
@@ -147,9 +149,9 @@ def read_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
         records = AutopilotRecords(path, path.read_bytes())
     except OSError as error:
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
-    _UlogWalk(records).read() if kind == "ulog" else _read_dataflash(records)
+    _UlogReader(records).read() if kind == "ulog" else _read_dataflash(records)
     records.damage |= dict.fromkeys(records.skipped.values())
-    records.note("no-checksum", lost=0)
+    records.add_damage("no-checksum", lost=0)
     records.sort_by_time()
     return records
 
@@ -186,15 +188,15 @@ class _UlogTopic:
     instance: int
     layout: Layout
     most_bytes: int
-    places: list[int] = field(default_factory=list)
+    offsets: list[int] = field(default_factory=list)
 
     def fits(self, size: int) -> bool:
         """Return whether a message of so many bytes, behind its head, can be one of it."""
         return self.layout.itemsize <= size - 2 <= self.most_bytes
 
 
-class _UlogWalk:
-    """One walk over the messages of a ULog."""
+class _UlogReader:
+    """Reads the messages of a ULog, in one pass."""
 
     def __init__(self, records: AutopilotRecords) -> None:
         self._records, self._data = records, records.data
@@ -214,20 +216,20 @@ class _UlogWalk:
             of = self._by_id.get(number) if kind == _DATA else None
             fits = of.fits(size) if of else kind in _ULOG_KINDS and self._is_head(end)
             if not fits or end > end_of_data:
-                end = self._records.skip(at, self._find_next(at + 1))
+                end = self._records.skip_to(at, self._find_next(at + 1))
             elif of:
-                of.places.append(at + 5)
+                of.offsets.append(at + 5)
             else:
-                self._take(kind, at + 3, size)
+                self._read_message(kind, at + 3, size)
             at = end
         if at < end_of_data:
-            self._records.skip(at, end_of_data)
+            self._records.skip_to(at, end_of_data)
         for number, count in self._unknown.items():
             reason = f"nothing says what messages of number {number} are"
-            self._records.note("messages-not-decoded", lost=count, reason=reason)
+            self._records.add_damage("messages-not-decoded", lost=count, reason=reason)
         for of in self._topics.values():
-            if of.places:
-                self._records.add(of.name, of.instance, of.layout, np.array(of.places), {})
+            if of.offsets:
+                self._records.add(of.name, of.instance, of.layout, np.array(of.offsets), {})
 
     def _is_head(self, at: int) -> bool:
         return at >= len(self._data) or (at + 3 <= len(self._data) and self._data[at + 2] in _ULOG_KINDS)
@@ -242,7 +244,7 @@ class _UlogWalk:
             at = self._data.find(_DATA, at + 1)
         return len(self._data)
 
-    def _take(self, kind: int, at: int, size: int) -> None:
+    def _read_message(self, kind: int, at: int, size: int) -> None:
         """Read a message that holds no data of a known topic."""
         text = self._data[at : at + size]
         match chr(kind):
@@ -250,11 +252,11 @@ class _UlogWalk:
                 self._unknown[int.from_bytes(text[:2], "little")] += 1
             case "F":
                 name, _, fields = text.decode("ascii", "replace").removesuffix(";").partition(":")
-                found = [of for of in map(_parse_field, fields.split(";")) if of]
-                if len(found) > fields.count(";"):
-                    self._formats.setdefault(name, found)
+                parsed = [of for of in map(_parse_field, fields.split(";")) if of]
+                if len(parsed) > fields.count(";"):
+                    self._formats.setdefault(name, parsed)
                 else:
-                    self._records.skip(at - 3, at + size)
+                    self._records.skip_to(at - 3, at + size)
             case "A" if size > 3:
                 self._subscribe(text[0], int.from_bytes(text[1:3], "little"), text[3:].decode("ascii", "replace"))
             case "P" if size > 5 and len(text) == 5 + text[0]:
@@ -266,23 +268,23 @@ class _UlogWalk:
             case "O":
                 self._records.dropouts += 1
             case "A" | "P":
-                self._records.skip(at - 3, at + size)
+                self._records.skip_to(at - 3, at + size)
             case _:  # texts of the log, facts on it, synchronisation
                 pass
 
     def _subscribe(self, instance: int, number: int, name: str) -> None:
         if name not in self._layouts:
-            self._layouts[name] = self._lay_out(name)
+            self._layouts[name] = self._make_layout(name)
             if self._columns > MAX_COLUMNS:
                 raise LogError(f"{self._records.path}: its topics unfold to more than {MAX_COLUMNS} columns")
-        found = self._layouts[name]
+        layout = self._layouts[name]
         self._by_id.pop(number, None)
-        if isinstance(found, str):
-            self._records.note("messages-not-decoded", f"/{name}", reason=found)
+        if isinstance(layout, str):
+            self._records.add_damage("messages-not-decoded", f"/{name}", reason=layout)
             return
-        self._by_id[number] = self._topics.setdefault((name, instance), _UlogTopic(name, instance, *found))
+        self._by_id[number] = self._topics.setdefault((name, instance), _UlogTopic(name, instance, *layout))
 
-    def _lay_out(self, name: str) -> tuple[Layout, int] | str:
+    def _make_layout(self, name: str) -> tuple[Layout, int] | str:
         """Return how messages of a format lie, and their size with what pads them [byte]; or why nobody knows."""
         fields: list[tuple[str, DTypeLike]] = []
         size = 0
@@ -330,7 +332,7 @@ _WITHOUT_TIME = ("FMT", "FILE")
 def _read_dataflash(records: AutopilotRecords) -> None:
     """Read a whole DataFlash log into the records."""
     data, end_of_data, at = records.data, len(records.data), 0
-    lengths, places = [0] * 256, [list[int]() for _ in range(256)]
+    lengths, offsets = [0] * 256, [list[int]() for _ in range(256)]
     formats: dict[int, tuple[str, Layout, dict[str, float]]] = {}
     lengths[_FORMAT] = _FORMAT_BYTES
     begins = data.startswith
@@ -338,19 +340,19 @@ def _read_dataflash(records: AutopilotRecords) -> None:
         kind = data[at + 2]
         end = at + lengths[kind]
         if end > at and (begins(_HEAD, end) or end == end_of_data) and begins(_HEAD, at):
-            places[kind].append(at + 3)
+            offsets[kind].append(at + 3)
             if kind == _FORMAT:
                 _define_format(data, at + 3, lengths, formats)
             at = end
             continue
-        at = records.skip(at, _find_message(data, at + 1, lengths))
+        at = records.skip_to(at, _find_message(data, at + 1, lengths))
     if at < end_of_data:
-        records.skip(at, end_of_data)
+        records.skip_to(at, end_of_data)
     for kind, (name, layout, scales) in formats.items():
-        of = np.array(places[kind], np.int64)
+        of = np.array(offsets[kind], np.int64)
         if len(of) and not layout.names:
             reason = f"the format of {name} contradicts itself"
-            records.note("messages-not-decoded", f"/{name}", len(of), reason=reason)
+            records.add_damage("messages-not-decoded", f"/{name}", len(of), reason=reason)
         elif len(of) and name not in _WITHOUT_TIME:
             _add_instances(records, name, layout, of, scales)
         columns = Messages(name, layout, of, of, scales).read_columns(data) if name in ("PARM", "DSF") else {}
@@ -396,13 +398,13 @@ def _define_format(
 
 
 def _add_instances(
-    records: AutopilotRecords, name: str, layout: Layout, places: Int64, scales: Mapping[str, float]
+    records: AutopilotRecords, name: str, layout: Layout, offsets: Int64, scales: Mapping[str, float]
 ) -> None:
     """Add messages, those of each instance of a sensor apart."""
     instance = next((of for of in _INSTANCES if of in (layout.names or ()) and layout[of].str == "|u1"), None)
     if instance is None:
-        records.add(name, 0, layout, places, scales)
+        records.add(name, 0, layout, offsets, scales)
         return
-    number = _gather_field(records.data, places, layout, instance)
+    number = _gather_field(records.data, offsets, layout, instance)
     for one in np.unique(number).tolist():
-        records.add(name, one, layout, places[number == one], scales)
+        records.add(name, one, layout, offsets[number == one], scales)

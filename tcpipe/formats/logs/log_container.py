@@ -15,7 +15,7 @@ from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompress_file
 from tcpipe.formats.logs.sqlite_file import SqlitePart
 from tcpipe.logs.topics import AutopilotKind
 
-WANTED = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg or ArduPilot's .bin"
+WANTED = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg, ArduPilot's .bin or tables that the recipe maps"
 _AUTOPILOTS: dict[bytes, AutopilotKind] = {b"ULog\x01\x12\x35": "ulog", b"\xa3\x95\x80\x80\x59": "dataflash"}
 """How their logs begin; DataFlash's with the format of formats."""
 _KNOWN_MAGIC = (

@@ -19,7 +19,7 @@ from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
-_HASH_BYTES = 1 << 20
+Fields = Mapping[str, "NDArray[np.generic] | pa.Array"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +79,7 @@ class TableLog:
         digest = hashlib.sha256()
         for file in self._files:
             with file.open("rb") as stream:
-                while block := stream.read(_HASH_BYTES):
-                    digest.update(block)
+                hashlib.file_digest(stream, lambda: digest)
         return digest.hexdigest()
 
     def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
@@ -102,13 +101,27 @@ def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64
     return {"header.stamp.sec": second, "header.stamp.nanosec": rest}
 
 
-def make_message_table(stamp_ns: NDArray[np.int64], columns: Mapping[str, NDArray[np.generic]]) -> pa.Table:
-    """Return messages as a table: both log times are the stamps [ns]; columns of shape (N, k) become lists, those of bytes texts."""
-    times = {"log_time_ns": number_column(stamp_ns), "publish_time_ns": number_column(stamp_ns)}
-    return pa.table({**times, **{name: _make_column(values) for name, values in columns.items()}})
+def make_topic(
+    name: str,
+    type_name: str,
+    stamp_ns: NDArray[np.int64],
+    read_fields: Callable[[], Fields],
+    damage: Sequence[Damage] = (),
+) -> TopicMessages:
+    """Return a topic by the stamps of its messages [ns], which are both log times too; `_make_column` says what fields become."""
+
+    def make() -> pa.Table:
+        times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
+        return pa.table({name: _make_column(values) for name, values in (times | {**read_fields()}).items()})
+
+    topic = Topic(name, type_name, len(stamp_ns), int(stamp_ns[0]), int(stamp_ns[-1]), "table", "")
+    return TopicMessages(topic, make, damage)
 
 
-def _make_column(values: NDArray[np.generic]) -> pa.Array:
+def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
+    """Return a column of messages: rows of shape (N, k) become lists, bytes texts."""
+    if isinstance(values, pa.Array):
+        return values
     if values.dtype.kind == "S":
         return make_text_column(text.decode(errors="replace") for text in values.tolist())
     if values.ndim == 1:

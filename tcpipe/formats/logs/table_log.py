@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -22,11 +22,12 @@ import polars as pl
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.message_tables import TableLog, TopicMessages, make_message_table, make_stamp_fields
+from tcpipe.formats.logs.message_tables import Fields, TableLog, TopicMessages, make_stamp_fields, make_topic
 from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
 from tcpipe.logs.expressions import split_unit
 from tcpipe.logs.field_mapping import (
     STAMP_UNITS,
+    FieldSource,
     find_mapping_problems,
     find_topic,
     make_message_fields,
@@ -34,7 +35,7 @@ from tcpipe.logs.field_mapping import (
     read_fields,
     utc_from_gps_ns,
 )
-from tcpipe.logs.topics import Damage, Topic
+from tcpipe.logs.topics import Damage
 from tcpipe.power.sources import FLOAT_TYPES
 from tcpipe.recipe import TableMapping
 
@@ -71,7 +72,10 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages
         problems.append(f"{where}.file is {mapping.file!r}; expected a name that ends in {', '.join(TABLE_SUFFIXES)}")
     elif not path.is_file():
         held = ", ".join(str(file.relative_to(folder)) for file in list_table_files(folder)[:20])
-        problems.append(f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}")
+        problems.append(
+            f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}. "
+            f"Add it, or ingest this run with a recipe without tables.{name}"
+        )
     if problems:
         return problems
     try:
@@ -83,9 +87,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages
             problems.append(f"{where}.stamp: {mapping.file} has no column {stamp}; it has {', '.join(names)}")
         if isinstance(fields, list) or problems:
             return problems
-        used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
-        numbers = [column for name, columns in used.items() if name != "quality" for column in columns]
-        cells = read_cells(path, stamp=stamp, columns=numbers, words=used.get("quality", ()))
+        cells, values = read_values(path, stamp, fields)
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
@@ -93,13 +95,13 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages
         for column, (_, row, text) in cells.texts.items()
         if not np.isfinite(cells.columns[column]).any()
     ]
+    twice = [note for column in (stamp, *cells.columns) if (note := describe_duplicate(column, names))]
+    cells = replace(cells, notes=(*cells.notes, *twice))
     stamp_ns = _read_stamps(cells, stamp, mapping)
     if isinstance(stamp_ns, str):
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
     if empty:
         return empty
-    rows = len(cells.stamp)
-    values = {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
     source = mapping.make_power_source(name)
     read_as = find_topic(name, role, mapping.columns, source.type if source else None)
     return _read_messages((*read_as, role), mapping, cells, values, stamp_ns)
@@ -135,19 +137,18 @@ def _read_messages(
         for column, (count, row, text) in cells.texts.items()
     ]
     damage += [Damage("table-cells", mapping.file, messages_lost=0, reason=note) for note in cells.notes]
-    order = slice(None) if not lost else np.flatnonzero(cells.stamp_known)
+    order = np.flatnonzero(cells.stamp_known)
     if backward := int(np.count_nonzero(np.diff(stamp_ns) < 0)):
         damage.append(Damage("messages-unordered", mapping.file, messages_lost=0, places=backward))
         by_time = np.argsort(stamp_ns, kind="stable")
-        order, stamp_ns = np.flatnonzero(cells.stamp_known)[by_time], stamp_ns[by_time]
+        order, stamp_ns = order[by_time], stamp_ns[by_time]
     values = {field: value[order] for field, value in values.items()}
+    fields: Fields
     if kind in FLOAT_TYPES:
-        table = make_message_table(stamp_ns, {"data": next(iter(values.values()))})
+        fields = {"data": next(iter(values.values()))}
     else:
-        fields = make_message_fields(role, values, stamp_ns.size)
-        table = make_message_table(stamp_ns, {**make_stamp_fields(stamp_ns), **fields})
-    span = (int(stamp_ns[0]), int(stamp_ns[-1]))
-    return TopicMessages(Topic(topic, kind, stamp_ns.size, *span, "table", ""), lambda: table, damage)
+        fields = {**make_stamp_fields(stamp_ns), **make_message_fields(role, values, stamp_ns.size)}
+    return make_topic(topic, kind, stamp_ns, lambda: fields, damage)
 
 
 def _find_clock_mismatch(read: Iterable[TopicMessages]) -> Iterator[str]:
@@ -198,13 +199,19 @@ def read_column_names(path: Path) -> list[str]:
     return _scan(path).collect_schema().names()
 
 
+def describe_duplicate(column: str, names: Sequence[str]) -> str:
+    """Return what a header that has a column's name several times means; "" where it has not."""
+    second = f"{column}_duplicated_0"
+    return f"several columns are called {column}: the first is read, {second} is the next" if second in names else ""
+
+
 def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[str] = ()) -> Cells:
     """Read a column of stamps, columns of numbers and of ``words`` or numbers; every other column is passed over.
 
     `LogError`: the file cannot be read as a table.
     """
     wanted = [name for name in dict.fromkeys(columns) if name not in words]
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             frame = _collect_columns(path, [*dict.fromkeys([stamp, *wanted, *words])], numbers=wanted)
@@ -227,8 +234,19 @@ def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[st
         {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()}
         | {name: frame[name].to_numpy() for name in words},
         texts,
-        tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in said)),
+        tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in caught)),
     )
+
+
+def read_values(
+    path: Path, stamp: str, fields: Mapping[str, FieldSource]
+) -> tuple[Cells, dict[str, NDArray[np.float64]]]:
+    """Return the cells that fields are made of, and the fields' values, shape (rows,)."""
+    used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
+    numbers = [column for name, columns in used.items() if name != "quality" for column in columns]
+    cells = read_cells(path, stamp=stamp, columns=numbers, words=used.get("quality", ()))
+    rows = len(cells.stamp)
+    return cells, {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
 
 
 def _collect_columns(path: Path, columns: list[str], numbers: list[str] | None) -> pl.DataFrame:
@@ -313,9 +331,9 @@ def _is_name(field: bytes) -> bool:
 
 def _find_column_names(comments: list[bytes], count: int, *, spaced: bool) -> list[str]:
     """Return the names of a table without a header: those of its last comment where they are as many, TUM's, or numbers."""
-    told = comments[-1].lstrip(b"#% ").replace(b",", b" ").split() if comments else []
-    if len(told) == count:
-        return [name.decode(errors="replace") for name in told]
+    names = comments[-1].lstrip(b"#% ").replace(b",", b" ").split() if comments else []
+    if len(names) == count:
+        return [name.decode(errors="replace") for name in names]
     if spaced and count == len(TUM):
         return list(TUM)
     return [f"column_{number}" for number in range(1, count + 1)]

@@ -162,14 +162,14 @@ def _iterate_items(page: Any, url: str, pattern: str) -> Iterator[Item]:
                 'choose by asset = "PATTERN" below the collection in a TOML file for --stac'
             )
         for key in sorted(assets, key=lambda key: float(sizes[key] or 0.0))[:1]:
-            told = {**about, **assets[key]}
-            code = told.get("proj:code") or told.get("proj:epsg")
+            raster = {**about, **assets[key]}
+            code = raster.get("proj:code") or raster.get("proj:epsg")
             yield Item(
                 id=str(name),
-                url=urljoin(url, str(told["href"])),
+                url=urljoin(url, str(raster["href"])),
                 date=str(about.get("datetime") or about.get("end_datetime") or ""),
                 crs=f"EPSG:{code}" if isinstance(code, int) else code,
-                checksum=told.get("file:checksum") or told.get("checksum:multihash"),
+                checksum=raster.get("file:checksum") or raster.get("checksum:multihash"),
                 footprint=shapely.make_valid(shape(item["geometry"])),
             )
 

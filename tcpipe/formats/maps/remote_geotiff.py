@@ -174,17 +174,17 @@ def open_window(client: HttpsClient, url: str, area: Geometry, *, crs: str | Non
             raise remote.error or MapError(f"{url}: not a GeoTIFF, or damaged: {describe_error(error)}") from None
 
 
-def _find_window(dataset: Any, url: str, area: Geometry, said: str | None) -> Window | None:
+def _find_window(dataset: Any, url: str, area: Geometry, stated_crs: str | None) -> Window | None:
     """Return the pixels around the part of an area that lies on a raster."""
     if dataset.crs is None or dataset.transform.is_degenerate or dataset.transform.is_identity:
         raise MapError(f"{url}: has no georeference; tcpipe cannot tell which part of it covers the track")
     crs = parse_crs(dataset.crs.to_wkt(), where=url)
     placed = _project(area, crs)
     xy = shapely.get_coordinates(placed)
-    stated = _project(area, parse_crs(said, where=f"{url} in the catalogue")) if said else placed
+    stated = _project(area, parse_crs(stated_crs, where=f"{url} in the catalogue")) if stated_crs else placed
     if not np.allclose(xy, shapely.get_coordinates(stated), rtol=0.0, atol=_SAME_PLACE):
         raise MapError(
-            f"{url}: its CRS is {crs.name!r}, the catalogue says {said}, which is elsewhere; give other rasters"
+            f"{url}: its CRS is {crs.name!r}, the catalogue says {stated_crs}, which is elsewhere; give other rasters"
         )
     if not np.isfinite(xy).all():
         return None  # far outside the area of its CRS
@@ -239,8 +239,8 @@ def _copy_pixels(dataset: Any, window: Window, path: Path) -> None:
             out.write_colormap(1, dataset.colormap(1))
         step = max(dataset.block_shapes[0][0], 256)
         for first in range(0, window.height, step):
-            here = Window(0, first, window.width, min(step, window.height - first))
-            there = Window(window.col_off, window.row_off + first, here.width, here.height)
-            out.write(dataset.read(window=there), window=here)
+            target = Window(0, first, window.width, min(step, window.height - first))
+            source = Window(window.col_off, window.row_off + first, target.width, target.height)
+            out.write(dataset.read(window=source), window=target)
             if dataset.mask_flag_enums[0] == [MaskFlags.per_dataset]:
-                out.write_mask(dataset.dataset_mask(window=there) > 0, window=here)
+                out.write_mask(dataset.dataset_mask(window=source) > 0, window=target)

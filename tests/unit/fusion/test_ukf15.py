@@ -62,7 +62,6 @@ def test_all_sensors_reach_centimetres_and_know_it(truth, orientation):
     assert (_rms(scaled) > 0.3).all()
     assert set(trajectory.facts.measurements) == {GNSS, IMU, WHEELS, VISUAL}
     assert 0.7 < trajectory.facts.nis_mean[GNSS] < 1.2
-    assert trajectory.facts.recovered == dict.fromkeys((GNSS, IMU, WHEELS, VISUAL), 0)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +137,6 @@ def test_a_lasting_offset_of_the_fixes_is_followed_after_five_seconds(truth):
     shifted = measurements.gnss.position_enu_m + late[:, None] * [5.0, 0.0, 0.0]
     trajectory = _run(truth, replace(measurements, gnss=replace(measurements.gnss, position_enu_m=shifted)))
     refused = trajectory.rejections.stamp_ns[trajectory.rejections.role == GNSS]
-    assert trajectory.facts.recovered[GNSS] >= 1
     assert refused.max() - truth.stamp_ns[2000] == pytest.approx(5e9, abs=0.2e9)
     assert trajectory.position_enu_m[-1, 0] - truth.position[-1, 0] == pytest.approx(5.0, abs=0.5)
 

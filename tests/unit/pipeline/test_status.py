@@ -199,7 +199,7 @@ def test_logs_with_findings_of_one_code_are_one_line_with_the_first_cause(first_
 
     (logs / "a.bag").write_bytes(bytes(30))
     assert told() == (1, "not a log: it begins with zeros")
-    assert "a .bag (2.0), or a ROS 2 bag directory or .db3" in str(where(tmp_path))
+    assert "a .bag (2.0), a .db3, a ROS 2 bag directory" in str(where(tmp_path))
     shutil.copy2(first_night / "logs" / "junk.bag", logs / "b.bag")
     (logs / "c.bag").write_bytes(b"junk" * 10)
     (logs / "a.bag").unlink()

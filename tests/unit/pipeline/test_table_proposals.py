@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.errors import UsageError
+from tcpipe.errors import LogError, UsageError
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
 from tcpipe.pipeline.proposals import propose_recipe
@@ -47,7 +47,11 @@ def test_stamps_since_1970_go_before_those_from_the_start_and_texts_cut_to_secon
     values, recipe, _ = proposed(tmp_path)
     assert values["tables"]["gnss"]["stamp"] == "timestamp (ns)"
     assert values["tables"]["gnss"]["columns"]["altitude"] == "alt_msl"
-    assert values["tables"]["power"] == {"file": "b/power.csv", "stamp": "stamp_ns", "columns": {"power": "Power (w)"}}
+    assert values["tables"]["power"] == {
+        "file": "b/power.csv",
+        "stamp": "stamp_ns",
+        "columns": {"power": "`Power (w)`"},
+    }
     topics = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables).topics
     assert {name: topic.message_count for name, topic in topics.items()} == {"/gnss": ROWS, "/power": ROWS}
 
@@ -145,3 +149,38 @@ def test_tables_of_two_drives_are_not_mixed(tmp_path):
     values, _, text = proposed(tmp_path)
     assert set(values["tables"]) == {"gnss"}
     assert "no time in common" in text
+
+
+def test_speeds_of_both_sides_in_other_units_words_and_a_counter_are_read_in_si(tmp_path):
+    write(
+        tmp_path / "wheels.csv", time=UTC_S + SECONDS, **{"velL__(km/h)": 3.6 + SECONDS, "velR__(km/h)": 7.2 + SECONDS}
+    )
+    write(tmp_path / "gps.csv", time=UTC_S + SECONDS, **FIXES, fix__type="RTK Fixed")
+    write(tmp_path / "power.csv", time=UTC_S + SECONDS, **{"energy__(Wh)": SECONDS / 3600})
+    values, recipe, _ = proposed(tmp_path)
+    assert values["tables"]["gnss"]["columns"]["quality"] == "words: fix type"
+    assert values["tables"]["power"]["columns"] == {"energy": "energy (Wh)"}
+    assert values["tables"]["wheel_odometry"]["units"] == {"linear_x": "km/h"}
+    log = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
+    odometry = log.tables(["/wheel_odometry"])["/wheel_odometry"]
+    assert odometry["twist.twist.linear.x"].to_numpy() == pytest.approx(1.5 + SECONDS / 3.6)
+    assert odometry["twist.twist.angular.z"].to_numpy() == pytest.approx(1.0 / 0.5)  # of the track width of the comment
+
+
+def test_an_expression_of_columns_in_another_unit_needs_its_own(tmp_path):
+    write(tmp_path / "wheels.csv", time=UTC_S + SECONDS, **{"velL__(km/h)": 3.6, "velR__(km/h)": 3.6})
+    table = {"file": "wheels.csv", "columns": {"linear_x": "(`velL (km/h)` + `velR (km/h)`) / 2"}}
+    for units, problem in (({}, "state the unit"), ({"linear_x": "km/h"}, None)):
+        recipe = parse_recipe({"tables": {"wheel_odometry": {**table, "units": units}}}, where="test")
+        if problem is None:
+            open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
+        else:
+            with pytest.raises(LogError, match=problem):
+                open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
+
+
+def test_of_several_columns_of_one_name_a_person_decides(tmp_path):
+    (tmp_path / "power.csv").write_text(
+        "time,voltage,current,current\n" + "".join(f"{UTC_S + k},24,{k},{k}\n" for k in range(30))
+    )
+    assert "# [tables.power]" in propose_recipe(tmp_path).toml()

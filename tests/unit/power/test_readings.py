@@ -166,6 +166,7 @@ def test_an_unclear_sign_follows_ros_and_says_so_and_the_recipe_settles_it() -> 
         (battery(1000 * VOLT, AMP), "voltage-in-millivolts", {}),
         (battery(VOLT, 1000 * AMP), "current-in-milliamperes", {}),
         (battery(np.full(N, 0.8), AMP), "voltage-too-small", {"median_volt": 0.8}),
+        (battery(VOLT, 1e-4 * AMP), "power-too-small", {}),
         (TIMES | {"voltage": VOLT}, "field-missing", {}),
     ],
 )

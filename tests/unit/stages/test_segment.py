@@ -9,7 +9,7 @@ from tcpipe.recipe import MaskConfig, SegmentConfig
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import judge, select_findings
+from tcpipe.tables.findings import select_findings
 
 T = np.arange(0, 60, 0.05)
 
@@ -166,14 +166,6 @@ def test_a_run_that_never_moves_says_so():
     assert segments.table.num_rows == 0
     (finding,) = select_findings(segments.info.report.findings, "robot-did-not-move")
     assert finding.numbers == {"driven_m": 0.0}
-
-
-def test_a_run_of_a_moment_did_move_and_is_of_no_use():
-    segments = cut(straight_track(np.full(20, 0.5)))
-    (why,) = select_findings(segments.info.report.findings, "no-segments")
-    verdict = judge(segments.info.report.findings)
-    assert why.numbers["driven_m"] < 1.0
-    assert {verdict.position, verdict.time, verdict.energy} == {"not usable"}
 
 
 def test_a_run_without_segments_says_why_and_what_it_lost():

@@ -284,7 +284,7 @@ def test_what_is_no_log_is_refused_in_one_line(tmp_path, name, content, said):
     path.write_bytes(content)
     with pytest.raises(LogError) as refused:
         open_log(path)
-    wanted = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg or ArduPilot's .bin"
+    wanted = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg, ArduPilot's .bin or tables that the recipe maps"
     assert [problem.split(";")[0] for problem in refused.value.problems] == [f"{path}: not a log: {said}"]
     assert wanted in str(refused.value)
 
