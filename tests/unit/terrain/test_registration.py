@@ -140,6 +140,23 @@ def test_heights_in_feet_are_told_from_heights_in_metres():
     assert not stretched.is_feet()
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.05])
+def test_feet_are_told_on_a_tilted_map_and_a_tilt_is_no_scale(slope):
+    """The tilt of the map stays in the misfit, so that other heights are still named."""
+
+    def ground(x, y):
+        return rolling(x, y) + slope * y
+
+    xy = drive()
+    height = 600.0 + ground(*xy.T) + drift(len(xy), 0.02, 100, 3)
+    feet = register_track(site(tilted(lambda x, y: ground(x, y) / 0.3048, 0.02, 2)), xy, height).scale
+    assert feet.is_feet()
+    found = register_track(site(tilted(ground, 0.02, 2)), xy, height)
+    assert not found.scale.is_off()
+    assert found.shape_misfit_m < 0.05
+    assert found.shifted_misfit_m > 0.3
+
+
 def test_trees_and_even_ground_say_nothing_of_the_unit():
     """A surface model with a metre of canopy on rolling ground explains little; even ground tells nothing at all."""
     xy = drive()
