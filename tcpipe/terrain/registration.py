@@ -5,8 +5,8 @@ the shape of the ground; the horizontal shift at which the two shapes agree best
 navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary no shift can be
 told, and none is. The track's heights are also regressed on the map's: a map in feet rises 3.28 where the track rises one.
 
-A shift that is to be applied is fitted together with a tilt of the map and a drift of the track's heights, which look like a shift on a
-smooth hill, and from the misfit itself: along slopes that are noisy a step is too short. It is determined on less ground, more honestly.
+The shift is fitted together with a tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, and from
+the misfit itself: along slopes that are noisy a step is too short.
 """
 
 from __future__ import annotations
@@ -25,15 +25,13 @@ from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_wi
 
 FloatArray = NDArray[np.float64]
 Rows = NDArray[np.int64]
+Points = NDArray[np.bool_]
 
-REACH_M = 3.0
-"""Shifts are searched this far each way [m]."""
+REACH_M = 4.0
+"""Shifts are searched this far each way [m]: one of 3.5 m is not at the edge."""
 
 KNOWN_M = 0.25
 """A direction along which the shift's standard deviation is larger is not determined by the ground [m]."""
-
-TILTED_REACH_M = 4.0
-"""With a tilt they are searched this far: a shift of 3.5 m is not at the edge [m]."""
 
 _STEP_M = 0.25
 _SPACING_M = 0.5
@@ -52,11 +50,15 @@ _RIVAL_SIGMAS = 3.0
 _APART_M = 0.75
 """Ground that fits nearly as well somewhere else, this far away, does not tell where the track is [m]."""
 _RIDGE = 1e-12
+_FLAT = 1e-4
+"""The misfits of shifts rise so little along one direction, compared with the other, that the ground does not vary along it."""
 _FEW_BLOCKS = 1.26
 """Factor of a variance from so few blocks, so that two standard deviations cover 95 % (square of the ratio of Student's t and normal)."""
 _ROUNDS, _REWEIGHTINGS, _LEAST_MISFIT_M = 6, 20, 0.01
 _DRIFT_M = 25.0
 """Stretches of path in which the track's heights may be off by a constant of their own [m]: those of GNSS drift over tens of seconds."""
+_EDGE_M = 0.75 * _STEP_M
+"""Where the best shift is so far from the best one inside the window's edge, the true one may be larger [m]."""
 _NEAR = 2
 """A paraboloid is fitted to the misfits of shifts that are so many steps each way from the best."""
 _CLIFF_M = 1.0
@@ -105,9 +107,10 @@ class Registration:
 
     ``shift_xy_m`` is what to add to the track's positions to find their ground on the map [m, the map's axes], along determined
     directions only; ``shift_std_m`` its largest standard deviation along them, NaN where none is determined. ``height_offset_m`` is track
-    minus map; ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left without and with the shift. ``significant``:
-    the shift is not chance. ``at_reach``: the best shift lies at the window's edge, the true one may be larger. ``scale`` is of heights.
-    ``axis_std_m`` are the shift's standard deviations along both axes, NaN where a direction is not determined.
+    minus map; ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left without and with the shift,
+    ``shape_misfit_m`` of what is left with the shift, a tilt and a drift. ``significant``: the shift is not chance. ``at_reach``: the best
+    shift lies at the window's edge, the true one may be larger. ``scale`` is of heights. ``axis_std_m`` are the shift's standard deviations
+    along both axes, NaN where a direction is not determined.
     """
 
     points: int
@@ -116,6 +119,7 @@ class Registration:
     height_offset_m: float
     misfit_m: float
     shifted_misfit_m: float
+    shape_misfit_m: float
     significant: bool
     at_reach: bool
     scale: HeightScale
@@ -137,9 +141,7 @@ class Registration:
         return self.shifted_misfit_m if self.significant else self.misfit_m
 
 
-def register_track(
-    source: MapReader, xy_m: FloatArray, height_m: FloatArray, *, with_tilt: bool = False
-) -> Registration | None:
+def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) -> Registration | None:
     """Find the horizontal shift at which the map's ground fits the track's heights best.
 
     Parameters
@@ -148,17 +150,16 @@ def register_track(
     xy_m : positions of the track in the map's CRS, in the order driven, shape (N, 2) [m]; what is not finite or not on the map is passed
         over.
     height_m : their heights above any surface, shape (N,) [m].
-    with_tilt : fit a tilt of the map and a drift of the heights, too; misfits are then without both.
 
     Returns
     -------
-    None where fewer than `_FEWEST_POINTS` points, half a metre apart, lie well inside the map.
+    None where fewer than `_FEWEST_POINTS` points, half a metre apart, lie well inside the map and on its ground.
     """
     level = choose_level(source, _STEP_M)
     finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
     at = np.flatnonzero(finite)[_thin_points(xy_m[finite])]
     at = at[level.grid.contains(xy_m[at])]
-    steps = round((TILTED_REACH_M if with_tilt else REACH_M) / _STEP_M)
+    steps = round(REACH_M / _STEP_M)
     shift_m = np.arange(-steps, steps + 1, dtype=np.float64) * _STEP_M
     ground_m = _sample_heights(level, xy_m[at], shift_m)
     whole = np.isfinite(ground_m).all(axis=(1, 2))
@@ -166,21 +167,18 @@ def register_track(
         return None
     at, ground_m = at[whole], ground_m[whole]
     excess_m = ground_m - height_m[at][:, None, None]
-    if with_tilt:
-        good, tilt_m = _find_ground(excess_m, xy_m[at])
-        if good.sum() < _FEWEST_POINTS:
-            return None
-        ground_m -= tilt_m[:, None, None]
-    else:
-        best = _find_least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
-        left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
-        good = left <= _OUTLIER * estimate_robust_std(left) + 1e-6  # what is not the ground: bridges, trees
-    scale = _fit_height_scale(ground_m[good], height_m[at][good])
-    return _refine_shift(excess_m[good], shift_m, scale, xy_m[at][good] if with_tilt else None)
+    near, good = _find_ground(excess_m, xy_m[at])
+    if near.sum() < _FEWEST_POINTS:
+        return None
+    scale = _fit_height_scale(ground_m[near], height_m[at][near], xy_m[at][near])
+    return _refine_shift(excess_m, xy_m[at], (near, good), shift_m, scale)
 
 
-def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Return which points are on the map's ground at the shift that fits these best, (N,), and the tilt there, (N,) [m]."""
+def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[Points, Points]:
+    """Return which points are on the map's ground at the shift that fits best, (N,), and which of them tell a shift.
+
+    These are not on cliffs, unless too few are left.
+    """
     middle = excess_m.shape[1] // 2
     flat_m = excess_m - _fit_tilt(xy_m, excess_m[:, middle, middle])[:, None, None]
     best = _find_least(np.median(np.abs(flat_m - np.median(flat_m, axis=0)), axis=0))
@@ -190,13 +188,14 @@ def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[NDArray[np.boo
         left = np.abs(left - np.median(left))
         relief_m = np.ptp(_take_near(excess_m, best), axis=(1, 2))
         # steep ground misfits where the shift is off by a step
-        good = (left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)) & (relief_m < _CLIFF_M)
+        near = left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)
+        good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
-            break
+            return near, near
         before, best = best, _find_least(_flatten(excess_m[good], xy_m[good])[0].var(axis=0))
         if best == before:
             break
-    return good, tilt_m
+    return near, good
 
 
 def _fit_tilt(xy_m: FloatArray, excess_m: FloatArray) -> FloatArray:
@@ -247,11 +246,17 @@ def _find_least(spread: FloatArray) -> tuple[int, int]:
     return int(i), int(j)
 
 
-def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
+def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArray) -> HeightScale:
+    """Return the scale of heights beside a tilt of the map, or without one if it says feet: no map is tilted so much."""
+    whole, tilt = _regress_heights(ground_m, height_m), xy_m - xy_m.mean(axis=0)
+    return whole if whole.is_feet() else _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
+
+
+def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
     """Regress the track's heights (N,) on the map's (N, K, K) where both are most alike; how sure, by leaving stretches out."""
     ground, height = ground_m - ground_m.mean(axis=0), height_m - height_m.mean()
     squares, products = np.einsum("nij,nij->ij", ground, ground), np.einsum("nij,n->ij", ground, height)
-    explained = products**2 / (squares * (height @ height) + _RIDGE)
+    explained = np.maximum(products, 0.0) ** 2 / (squares * (height @ height) + _RIDGE)
     i, j = np.unravel_index(int(explained.argmax()), explained.shape)
     along = ground[:, i, j]
     parts = [(along[block] @ along[block], along[block] @ height[block]) for block in _cut_stretches(len(height))]
@@ -261,32 +266,22 @@ def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray) -> HeightScale
 
 
 def _refine_shift(
-    excess_m: FloatArray, shift_m: FloatArray, scale: HeightScale, tilted_xy_m: FloatArray | None
+    raw_m: FloatArray, xy_m: FloatArray, chosen: tuple[Points, Points], shift_m: FloatArray, scale: HeightScale
 ) -> Registration:
-    """Refine the best shift of the lattice, and tell how sure it is by leaving stretches out; with the points a tilt and a drift, too."""
-    raw_m, blocks, edge = excess_m, _cut_stretches(len(excess_m)), 1
-    if tilted_xy_m is not None:
-        edge = _NEAR
-        excess_m, tilt, stretches = _flatten(excess_m, tilted_xy_m)
-    best = _find_least(excess_m.var(axis=0))
-    last, middle = shift_m.size - 1, shift_m.size // 2
-    i, j = (min(max(index, edge), last - edge) for index in best)
-    east, north = excess_m[:, i, j + 1] - excess_m[:, i, j - 1], excess_m[:, i + 1, j] - excess_m[:, i - 1, j]
-    slope = np.stack([east, north], axis=1) / (2.0 * _STEP_M)
-    slope -= slope.mean(axis=0)
-    unshifted, left = (excess_m[:, a, b] - excess_m[:, a, b].mean() for a, b in ((middle, middle), (i, j)))
-    if tilted_xy_m is None:
-        step_m, covariance = _step(slope, left)
-    else:
-        step_m, covariance, blocks = _descend(
-            _take_near(excess_m, (i, j)), tilt, _group_stretches(tilted_xy_m, stretches)
-        )
+    """Refine the best shift of the lattice by the good points, and tell how sure it is by leaving stretches out; misfits are near ones'."""
+    near, good = chosen
+    excess_m, tilt, stretches = _flatten(raw_m[good], xy_m[good])
+    variance, middle = excess_m.var(axis=0), (shift_m.size // 2, shift_m.size // 2)
+    best, inner = _find_least(variance), _find_least(variance[_NEAR:-_NEAR, _NEAR:-_NEAR])
+    i, j = inner[0] + _NEAR, inner[1] + _NEAR
+    step_m, covariance, blocks = _descend(_take_near(excess_m, (i, j)), tilt, _group_stretches(xy_m[good], stretches))
     variances, axes = np.linalg.eigh(covariance)
     known = axes[:, variances < KNOWN_M**2]
     if not _is_distinct(excess_m, (i, j), known, shift_m, blocks):
         known = axes[:, :0]
     step_m = known @ np.clip(known.T @ step_m, -_STEP_M, _STEP_M)
-    shifted = left + slope @ step_m
+    unshifted, shifted = _move(excess_m, middle, 0.0 * step_m), _move(excess_m, (i, j), step_m)
+    outside_m = known.T @ (shift_m[[best[1], best[0]]] - shift_m[[j, i]])
     fitted = known @ known.T @ np.array([shift_m[j], shift_m[i]]) + step_m
     weight = float(((known.T @ fitted) ** 2 / variances[: known.shape[1]]).sum())
     gain, sigmas = _compute_gain(unshifted, shifted, blocks)
@@ -295,14 +290,23 @@ def _refine_shift(
         points=len(excess_m),
         shift_xy_m=(float(fitted[0]), float(fitted[1])),
         shift_std_m=float(np.sqrt(variances[known.shape[1] - 1])) if known.size else float("nan"),
-        height_offset_m=-float(raw_m[:, i, j].mean()),
-        misfit_m=float(unshifted.std()),
-        shifted_misfit_m=float(shifted.std()),
+        height_offset_m=-float(raw_m[near, i, j].mean()),
+        misfit_m=float(raw_m[near, *middle].std()),
+        shifted_misfit_m=float(_move(raw_m[near], (i, j), step_m).std()),
+        shape_misfit_m=float(shifted.std()),
         significant=weight > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
-        at_reach=bool(known.size) and (i, j) != best,
+        at_reach=bool((np.abs(outside_m) > _EDGE_M).any()),
         scale=scale,
         axis_std_m=(float(axis_std_m[0]), float(axis_std_m[1])),
     )
+
+
+def _move(excess_m: FloatArray, at: tuple[int, int], step_m: FloatArray) -> FloatArray:
+    """Return the excess (N,) [m] at a step [m] beside a shift of the lattice, less its mean."""
+    i, j = at
+    east, north = excess_m[:, i, j + 1] - excess_m[:, i, j - 1], excess_m[:, i + 1, j] - excess_m[:, i - 1, j]
+    moved = excess_m[:, i, j] + np.stack([east, north], axis=1) @ step_m / (2.0 * _STEP_M)
+    return np.asarray(moved - moved.mean())
 
 
 def _take_near(values: FloatArray, best: tuple[int, int]) -> FloatArray:
@@ -326,10 +330,9 @@ def _flatten(excess_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
-    """Return values, shape (N, ...), less the least-squares multiples of the columns of a tilt, shape (N, 2)."""
+    """Return values, shape (N, ...), less the least-squares multiples of a tilt's columns, (N, 2), whose means are zero."""
     flat = values.reshape(len(values), -1)
-    fitted = np.linalg.lstsq(tilt, flat - flat.mean(axis=0), rcond=None)[0]
-    return np.asarray((flat - tilt @ fitted).reshape(values.shape))
+    return np.asarray((flat - tilt @ (np.linalg.pinv(tilt) @ flat)).reshape(values.shape))
 
 
 def _group_stretches(xy_m: FloatArray, stretches: Sequence[Rows]) -> list[list[Rows]]:
@@ -350,38 +353,27 @@ def _descend(
 
     Of the groupings of rows the one counts that gives the larger covariance; it is added to what independent errors would give.
     """
-    step_m, curvature, least = _find_bottom(excess_m, tilt)
+    step_m, independent = _find_bottom(excess_m, tilt)
     found = []
     for blocks in groupings:
         without = [_find_bottom(np.delete(excess_m, rows, axis=0), np.delete(tilt, rows, axis=0))[0] for rows in blocks]
         found.append(_estimate_covariance(np.stack(without)))
     most = int(np.argmax([np.trace(covariance) for covariance in found]))
-    covariance = _FEW_BLOCKS * found[most] + 2.0 * least / len(excess_m) * np.linalg.inv(curvature)
-    return step_m, covariance if np.linalg.eigvalsh(curvature)[0] > _RIDGE else np.eye(2) / _RIDGE, groupings[most]
+    return step_m, _FEW_BLOCKS * found[most] + independent, groupings[most]
 
 
-def _find_bottom(excess_m: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return the step [m] to the bottom of a paraboloid through the squared misfits, its second derivatives, and the least misfit."""
+def _find_bottom(excess_m: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the step [m] to the bottom of a paraboloid through the squared misfits, and its covariance if errors are independent.
+
+    Along a furrow there is no bottom: the step is 0, its standard deviation the window's size.
+    """
     misfit = (_remove_tilt(excess_m, tilt) ** 2).sum(axis=0)
     _, east, north, east2, both, north2 = _PARABOLOID @ misfit.ravel()
-    curvature = np.array([[2.0 * east2, both], [both, 2.0 * north2]]) + _RIDGE * np.eye(2)
-    return -np.linalg.solve(curvature, [east, north]), curvature, float(misfit.min())
-
-
-def _step(slope: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the least-squares step (2,) [m] that takes the misfits away, and its covariance (2, 2).
-
-    The covariance is the larger of what independent errors would give and what leaving stretches out gives, direction by direction their
-    sum; where the ground is even it is huge.
-    """
-    information, pull = slope[:, :, None] * slope[:, None, :], -slope * left[:, None]
-    total, force = information.sum(axis=0) + _RIDGE * len(left) * np.eye(2), pull.sum(axis=0)
-    step_m = np.linalg.solve(total, force)
-    without = [
-        np.linalg.solve(total - information[block].sum(axis=0), force - pull[block].sum(axis=0))
-        for block in _cut_stretches(len(left))
-    ]
-    return step_m, np.linalg.inv(total) * (left + slope @ step_m).var() + _estimate_covariance(np.stack(without))
+    curvature, axes = np.linalg.eigh(np.array([[2.0 * east2, both], [both, 2.0 * north2]]))
+    is_flat = curvature <= _FLAT * curvature[1] + _RIDGE
+    inverse = np.where(is_flat, 0.0, 1.0 / np.where(is_flat, 1.0, curvature))
+    variance = np.where(is_flat, REACH_M**2, 2.0 * misfit.min() / len(excess_m) * inverse)
+    return -axes @ (inverse * (axes.T @ [east, north])), (axes * variance) @ axes.T
 
 
 def _is_distinct(

@@ -29,7 +29,7 @@ from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection, compute_geoid_height
-from tcpipe.terrain.registration import TILTED_REACH_M, Registration, register_track
+from tcpipe.terrain.registration import REACH_M, Registration, register_track
 from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
@@ -97,7 +97,7 @@ def _register(
     xy_m = projection.forward(lonlat)
     here_m = std_m[certain][source.grid.contains(np.where(np.isfinite(xy_m), xy_m, np.inf))]
     track_std_m = float(np.median(here_m)) if here_m.size else float("nan")
-    return register_track(source, xy_m, height_m[certain], with_tilt=config.align), expected_m, track_std_m
+    return register_track(source, xy_m, height_m[certain]), expected_m, track_std_m
 
 
 def _find_obstacle(found: Registration | None, expected_m: float, max_std_m: float) -> str:
@@ -107,12 +107,12 @@ def _find_obstacle(found: Registration | None, expected_m: float, max_std_m: flo
     if found.scale.is_off():
         return "heights are scaled"
     if found.at_reach:
-        return f"the shift may be beyond {TILTED_REACH_M:g} m"
+        return f"the shift may be beyond {REACH_M:g} m"
     if not np.isfinite(found.position_std_m):
         return "the ground does not determine the shift"
     if found.position_std_m > max_std_m:
         return f"the shift is known only to {found.position_std_m:.2f} m"
-    return "heights differ" if _has_other_heights(found, expected_m) else ""
+    return "heights differ" if _is_other_ground(found.shape_misfit_m, expected_m) else ""
 
 
 def _describe_feet(found: Registration, run_id: str, name: str) -> str:
@@ -149,13 +149,13 @@ def _find_other_heights(found: Registration, expected_m: float, run_id: str, nam
     subject, names = Subject("run", run_id), {"map": name}
     if found.scale.is_off():
         return (make_finding("map-height-scale", subject, names=names, map_rise_m=1 / found.scale.value),)
-    if not _has_other_heights(found, expected_m):
+    if not _is_other_ground(found.left_m, expected_m):
         return ()
     return (make_finding("map-heights-differ", subject, names=names, misfit_m=found.left_m, expected_m=expected_m),)
 
 
-def _has_other_heights(found: Registration, expected_m: float) -> bool:
-    return found.left_m > read_threshold("map-heights-differ", "max_misfit_ratio") * expected_m
+def _is_other_ground(misfit_m: float, expected_m: float) -> bool:
+    return misfit_m > read_threshold("map-heights-differ", "max_misfit_ratio") * expected_m
 
 
 def _find_height_datum(registrations: Sequence[MapRegistration], name: str, geoid_m: float | None) -> list[Finding]:

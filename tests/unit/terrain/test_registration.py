@@ -140,6 +140,23 @@ def test_heights_in_feet_are_told_from_heights_in_metres():
     assert not stretched.is_feet()
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.05])
+def test_feet_are_told_on_a_tilted_map_and_a_tilt_is_no_scale(slope):
+    """The tilt of the map stays in the misfit, so that other heights are still named."""
+
+    def ground(x, y):
+        return rolling(x, y) + slope * y
+
+    xy = drive()
+    height = 600.0 + ground(*xy.T) + drift(len(xy), 0.02, 100, 3)
+    feet = register_track(site(tilted(lambda x, y: ground(x, y) / 0.3048, 0.02, 2)), xy, height).scale
+    assert feet.is_feet()
+    found = register_track(site(tilted(ground, 0.02, 2)), xy, height)
+    assert not found.scale.is_off()
+    assert found.shape_misfit_m < 0.05
+    assert found.shifted_misfit_m > 0.3
+
+
 def test_trees_and_even_ground_say_nothing_of_the_unit():
     """A surface model with a metre of canopy on rolling ground explains little; even ground tells nothing at all."""
     xy = drive()
@@ -172,7 +189,7 @@ def register_tilted(seed, *, shift_m, tilt=0.0, noise_m=0.03, **ground):
     source = ArrayMap(grid, {"height": height.astype(np.float32)}, tile_px=256, height_reference_m=600.0)
     xy, shift = drive(), shift_m * np.array([np.cos(7.0 * seed), np.sin(7.0 * seed)])
     height = 646.2 + truth(*(xy + shift).T) + drift(len(xy), 0.02, 400, seed)
-    return register_track(source, xy, height, with_tilt=True), shift
+    return register_track(source, xy, height), shift
 
 
 @pytest.mark.parametrize(("shift_m", "tilt"), [(0.0, 0.02), (0.3, 0.0), (1.0, 0.015), (3.0, 0.02)])
@@ -194,7 +211,7 @@ def test_a_tilt_alone_is_no_shift(seed):
     """On a hill without other relief a tilt is a shift, and on even ground everything is."""
     for ground in (lambda x, y: 0.002 * (x**2 + y**2), lambda x, y: 0.0 * x * y, lambda x, y: 0.1 * x - 0.03 * y):
         source, xy = site(tilted(ground, 0.015, seed), noise_m=0.02, seed=seed), drive()
-        found = register_track(source, xy, 600.0 + ground(*xy.T) + drift(len(xy), 0.02, 400, seed), with_tilt=True)
+        found = register_track(source, xy, 600.0 + ground(*xy.T) + drift(len(xy), 0.02, 400, seed))
         assert np.isnan(found.position_std_m) or found.shift_m < 2.0 * found.position_std_m
         assert not found.position_std_m < 0.1
 
@@ -205,7 +222,7 @@ def test_heights_of_other_ground_do_not_move_a_tilted_map():
     height = 600.0 + rolling(*np.add(xy, (1.2, 0.5)).T)
     height[1000:1600] += 4.0
     source.arrays["height"][200:280, 100:900] += 6.0
-    found = register_track(source, xy, height, with_tilt=True)
+    found = register_track(source, xy, height)
     assert found.shift_xy_m == pytest.approx((1.2, 0.5), abs=max(0.1, 2.0 * found.position_std_m))
     assert found.position_std_m < 0.1
 
@@ -217,5 +234,5 @@ def test_a_map_that_repeats_itself_determines_no_shift():
         return 0.2 * np.sin(2.0 * np.pi * x / 2.5) + 0.2 * np.sin(2.0 * np.pi * y / 2.5)
 
     source, xy = site(ridges), drive()
-    found = register_track(source, xy, 600.0 + ridges(*np.add(xy, (0.5, 0.0)).T), with_tilt=True)
+    found = register_track(source, xy, 600.0 + ridges(*np.add(xy, (0.5, 0.0)).T))
     assert np.isnan(found.position_std_m)
