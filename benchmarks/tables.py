@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from tcpipe.formats.logs.table_log import TableLog
+from tcpipe.formats.logs.table_log import open_tables
 from tcpipe.recipe import TableMapping
 
 RATE_HZ = 50.0
@@ -45,7 +45,7 @@ def by_polars(folder: Path, mappings: dict[str, TableMapping]) -> int:
 
 
 def by_tcpipe(folder: Path, mappings: dict[str, TableMapping]) -> int:
-    log = TableLog(folder, mappings)
+    log = open_tables(folder, mappings)
     return sum(table.num_rows for table in log.tables(list(log.topics)).values())
 
 
