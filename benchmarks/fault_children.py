@@ -207,7 +207,7 @@ def _be_the_child(
         os.dup2(output, 2)
         tempfile.tempdir = os.environ["TMPDIR"] = str(work / "tmp")
         if steps_in == "bucket":
-            _tell_of_requests()
+            fault_workers.call_around_requests(lambda: sys.audit(_REQUEST))  # the hook counts them
         if steps_in != "workers":
             sys.addaudithook(_hook(work, counted, fault, in_bucket=steps_in == "bucket"))
         run()
@@ -221,11 +221,6 @@ def _be_the_child(
         with suppress(OSError):
             sys.stdout.flush()
         os._exit(code)
-
-
-def _tell_of_requests() -> None:
-    """Have requests that change something in a bucket tell the audit hook when they begin, and when they are answered."""
-    fault_workers.call_around_requests(lambda: sys.audit(_REQUEST))
 
 
 def _hook(work: Path, counted: "memoryview[int]", fault: Fault | None, *, in_bucket: bool):

@@ -141,7 +141,7 @@ def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
     services.mend()
     now = all_of(case, work)
     bad = half_written(plain.before, plain.after, now)
-    bad += [f"half visible: {line}" for line in _select_damage(list(_find_problems(plain, work)))]
+    bad += [f"half visible: {line}" for line in _select_damage([*_find_problems(plain, work)])]
     bad += [
         f"the other task ends with {other.code}: {other.said}" for other in others if other.code != plain.ended.code
     ]
@@ -195,8 +195,8 @@ def _of_the_next_call(plain: Undisturbed, work: Path, wanted: Tree) -> Iterator[
 def _find_problems(plain: Undisturbed, work: Path) -> Iterator[str]:
     """Yield what `verify` finds at the outputs that a reader would find now: store and dataset, on disk and in the bucket."""
     objects = get_objects(plain.case.url).keys() if plain.case.url else ()
-    for name in ("store", "dataset"):
-        if any(of == f"{name}/store.json" or (of.startswith(f"{name}/log/") and name == "dataset") for of in objects):
+    for name, mark in (("store", "store.json"), ("dataset", "log/")):
+        if any(of.startswith(f"{name}/{mark}") for of in objects):
             yield from in_child(lambda name=name: _verify(f"{plain.case.url}/{name}"))
     for name, mark in (("tcpipe-store", "store.json"), ("dataset", "dataset.json")):
         if (work / name / mark).exists():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError
 from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.logs.field_mapping import STAMP_UNITS, parse_stamps_ns
+from tcpipe.recipe.checking import parse_utc_ns
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -171,11 +172,9 @@ def _parse_iso_stamp(path: Path, name: str, text: str | None) -> int | None:
     if text is None:
         return None
     try:
-        told = datetime.fromisoformat(text.strip())
+        return parse_utc_ns(text.strip())
     except ValueError:
         raise DatasetError(f"{path}: {name} is {text!r}; expected ISO 8601, as 2025-10-14T11:41:00Z") from None
-    since = (told if told.tzinfo else told.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
 def _convert_numeric_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:

@@ -41,7 +41,7 @@ _DAMAGE: Mapping[str, str] = {
 }  # fmt: skip
 """Numbers that follow a line in brackets, where they are more than zero and the template lacks them."""
 _EVIDENCE = ("field", "wanted", "joints", "platforms")
-"""Names that do so."""
+"""Names that follow likewise, where the template lacks them."""
 _MOST_SUBJECTS = 3
 _DIGITS = 3
 _LARGEST_PLAIN = 1e6
@@ -75,9 +75,11 @@ def describe_finding(finding: Finding) -> str:
     missing = dict.fromkeys(entry.fields, "?")  # a redacted finding keeps only what is public
     line = entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
     numbers = finding.numbers.keys() - entry.fields
-    damage = [f"{name} {finding.names[name]}" for name in _EVIDENCE if name in finding.names.keys() - entry.fields]
-    damage += [text.format(values[name]) for name, text in _DAMAGE.items() if name in numbers and finding.numbers[name]]
-    return f"{line} ({', '.join(damage)})" if damage else line
+    details = [f"{name} {finding.names[name]}" for name in _EVIDENCE if name in finding.names.keys() - entry.fields]
+    details += [
+        text.format(values[name]) for name, text in _DAMAGE.items() if name in numbers and finding.numbers[name]
+    ]
+    return f"{line} ({', '.join(details)})" if details else line
 
 
 def describe_title(finding: Finding) -> str:

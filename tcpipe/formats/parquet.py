@@ -329,13 +329,13 @@ def map_table(path: Path) -> pa.Table:
 
 def take_rows(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
     """Return rows of a table: `pa.Table.take` would copy all of each column that has several chunks."""
-    batches = table.to_batches()
-    firsts = np.cumsum([0, *(batch.num_rows for batch in batches)])
     order = np.argsort(rows, kind="stable")
-    number = np.searchsorted(firsts, rows[order], side="right") - 1
-    parts = np.split(order, np.flatnonzero(np.diff(number)) + 1)
-    numbers = [int(number[0]), *number[1:][np.diff(number) > 0].tolist()] if len(rows) else []
-    taken = [batches[at].take(pa.array(rows[part] - firsts[at])) for at, part in zip(numbers, parts, strict=False)]
+    ascending, first, taken = rows[order], 0, []
+    for batch in table.to_batches():
+        begin, end = np.searchsorted(ascending, (first, first + batch.num_rows))
+        if begin < end:
+            taken.append(batch.take(pa.array(ascending[begin:end] - first)))
+        first += batch.num_rows
     back = np.empty(len(rows), np.int64)
     back[order] = np.arange(len(rows))
     return pa.Table.from_batches(taken, table.schema).take(pa.array(back))

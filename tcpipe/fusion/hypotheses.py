@@ -279,17 +279,19 @@ def explain(
 
 
 def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> bool:
-    """Return whether what it changes is part of the state, and the same scale does not vary already."""
-    varying = {each.role for each in best.changes if each.kind == change.kind == "varies"}
-    return change.role not in varying and all(
-        e in active for place, count, _ in change.blocks for e in range(place, place + count)
-    )
+    """Return whether the state has the errors that a change is of, and a scale that it lets vary does not vary already."""
+    if change.kind == "varies" and any((each.kind, each.role) == ("varies", change.role) for each in best.changes):
+        return False
+    return all(e in active for place, count, _ in change.blocks for e in range(place, place + count))
 
 
 def _drop_changes(
     best: Hypothesis, tests: Tests, gates: Floats, run: Callable[[Hypothesis, int, int], Pass]
 ) -> tuple[Hypothesis, Tests]:
-    """Return the hypothesis without what a scale that varies explains as well, and its tests: it explains more than where it was found."""
+    """Return the hypothesis without the changes that a scale that varies explains as well, and its tests.
+
+    Such a scale varies throughout, so it also explains what earlier changes were found for.
+    """
     size, first = tests.verdict.shape[0], min(each.first for each in best.changes)
     for change in [each for each in best.changes if each.kind not in {"varies", "wander"}]:
         others = replace(best, changes=tuple(each for each in best.changes if each != change))

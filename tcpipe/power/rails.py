@@ -144,8 +144,8 @@ def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tu
     power = voltage * current
     known = np.isfinite(power).all(0)
     volt, amp, watt = voltage.mean(0), current.sum(0), power.sum(0)
-    told = known & (not any(is_power_only(each.voltage.value) for each in rails))
-    return np.where(told, volt, np.nan), np.where(told, amp, np.nan), np.where(known, watt, np.nan)
+    measured = known & (not any(is_power_only(each.voltage.value) for each in rails))
+    return np.where(measured, volt, np.nan), np.where(measured, amp, np.nan), np.where(known, watt, np.nan)
 
 
 def _interpolate_known(signal: Samples, at_ns: Stamps, *, averaged: bool, max_gap_ns: int) -> Floats:

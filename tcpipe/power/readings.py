@@ -126,9 +126,7 @@ def read_power(
         told_by,
         includes,
         gain_std_fraction=max(gains),
-        offset_std_amp=max(
-            0.0 if of.joints else of.offset_std_watt if of.lacks_voltage else of.offset_std_amp for of in sources
-        ),
+        offset_std_amp=max(of.zero_std for of in sources),
         rest_current_amp=(min(of[0] for of in rest), max(of[1] for of in rest))
         if rest and len(rest) == sum(bool(of.current or of.energy) for of in sources)
         else None,

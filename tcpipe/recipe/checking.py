@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from itertools import pairwise
 from math import isfinite
@@ -158,6 +158,13 @@ def as_toml(value: Any) -> str:
 
 def _make_key(name: str) -> str:
     return name if _BARE_KEY.fullmatch(name) else as_toml(name)
+
+
+def parse_utc_ns(text: str) -> int:
+    """Return a time in ISO 8601 as [ns since 1970], UTC where it names no zone; `ValueError` where it is none."""
+    moment = datetime.fromisoformat(text)
+    since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return 1000 * (since // timedelta(microseconds=1))
 
 
 def _check_value(kind: Any, value: Any, key: str, problems: list[str]) -> Any:

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 from typing import Annotated, Literal
 
-from tcpipe.recipe.checking import validate_fields
+from tcpipe.recipe.checking import parse_utc_ns, validate_fields
 from tcpipe.robots import NOMINAL_STD_FRACTION, TABLE_POWER, PlausibleSpeed, PowerSource, Robot, Share, Volt
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import LEFT_OUT
@@ -172,9 +171,7 @@ class TimeWindow:
 
 def _find_ns(at: float | str | None, first_ns: int, default_ns: int) -> int:
     if isinstance(at, str):
-        moment = datetime.fromisoformat(at)
-        since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
-        return 1000 * (since // timedelta(microseconds=1))
+        return parse_utc_ns(at)
     return default_ns if at is None else first_ns + round(at * 1e9)
 
 

@@ -185,6 +185,13 @@ class PowerSource:
         """Whether only power or energy is known."""
         return bool(self.power or self.energy or self.joints) and not self.voltage and self.nominal_voltage_volt is None
 
+    @property
+    def zero_std(self) -> float:
+        """σ of the zero of what is measured: of a current [A], of a power without voltage [W]; torques have none."""
+        if self.joints:
+            return 0.0
+        return self.offset_std_watt if self.lacks_voltage else self.offset_std_amp
+
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield each key whose value cannot be, and what was wanted."""
         if not _TYPE.fullmatch(self.type):

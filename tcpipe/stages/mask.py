@@ -37,8 +37,7 @@ def mask_track(
     Parameters
     ----------
     max_velocity_mps, max_plausible_mps : [m/s], of the robot's profile; the recipe's take precedence. Without a maximum, no row is
-        dropped as
-        below the limit.
+        dropped as below the limit.
     chord_m : [m], length of a segment, over which the relative position error counts.
 
     Raises
@@ -84,7 +83,10 @@ def mask_track(
 
 
 def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[Mask, tuple[Finding, ...]]:
-    """Return the rows that windows of this run drop, or do not keep where some keep, and the finding on windows without a row."""
+    """Return the rows that the windows of this run drop, and a finding if a window has no row.
+
+    Rows are dropped inside a window that drops and, if any window keeps, outside all windows that keep.
+    """
     stamp_ns, run_id = to_integers(track.table, "stamp_ns"), track.info.run_id
     dropped, kept, empty = np.zeros(len(stamp_ns), np.bool_), np.zeros(len(stamp_ns), np.bool_), 0
     names = (run_id, run_id.rpartition("-")[0])

@@ -208,7 +208,7 @@ def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, served):
     assert sum(name.endswith("segments.parquet") for name in served) == 1
     for copy in filter(Path.is_file, (tmp_path / "cache").rglob("*")):
         copy.write_bytes(b"x" * copy.stat().st_size)
-    assert counted(store) == [10], "what is damaged here is served anew"
+    assert counted(store) == [10], "what is damaged here is fetched anew"
     (path,) = (tmp_path / "served").rglob("segments.parquet")
     path.write_bytes(b"x" * path.stat().st_size)
     shutil.rmtree(tmp_path / "cache")
