@@ -134,10 +134,10 @@ def open_logs(
         run = find_table_run(path, tables or {})
         firsts.setdefault(run.files if run else (path,), path)
     with ExitStack() as stack:
-        logs = [
-            stack.enter_context(open_single_log(path, message_definitions=message_definitions, tables=tables))
-            for path in firsts.values()
-        ]
+        logs: list[Log | TableLog] = []
+        for path in firsts.values():
+            logs.append(open_single_log(path, message_definitions=message_definitions, tables=tables))
+            stack.push(logs[-1])
         alone = logs[0] if len(logs) == 1 else None
         earlier = _find_earlier_part(alone) if isinstance(alone, Log) and not _find_static_topics(alone) else None
         if earlier:
