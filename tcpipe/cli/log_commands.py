@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -153,7 +154,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         yield from (f"  damage:  {describe_finding(of)} [{of.code}]" for of in run.damage)
     if is_new and not several:
         yield f"  verdict: {format_verdict(result.verdict)}"
-        where = f"tcpipe inspect {store}/runs/{run.run_id}"
+        where = f"tcpipe inspect {shlex.quote(f'{store}/runs/{run.run_id}')}"
         yield from (f"  {line}" for line in format_findings(result.findings, more=where))
     elif is_new or result.is_new_problem:
         yield from (

@@ -73,7 +73,13 @@ def _add_windows(recipe: Recipe, path: Path) -> Recipe:
         text = file.read_text(encoding="utf-8")
     except OSError as error:
         raise RecipeError(f"{path}: mask.windows_csv: {file} cannot be read ({error.strerror})") from None
-    for number, row in enumerate(csv.DictReader(text.splitlines()), 2):
+    rows = csv.DictReader(text.splitlines())
+    for number, row in enumerate(rows, 2):
+        if None in row or any(";" in name for name in rows.fieldnames or ()):
+            raise RecipeError(
+                f"{file}, line {number}: expected cells separated by commas below the first line run,action,start,end, "
+                "and numbers with a decimal point"
+            )
         cells = {str(name).strip(): str(value).strip() for name, value in row.items() if value}
         given = {name: value if name == "run" else _read_cell(value) for name, value in cells.items() if value}
         windows.append(from_values(TimeWindow, given, where=f"{file}, line {number}"))

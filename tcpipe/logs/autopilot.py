@@ -69,7 +69,8 @@ def make_role_messages(log: Autopilot) -> tuple[list[RoleMessages], list[Finding
     """
     made: list[RoleMessages] = []
     findings: list[Finding] = []
-    for names, topic, role, frame, convert in _SOURCES[log.kind]:
+    for topic, (names, convert) in _SOURCES[log.kind].items():
+        role, frame = _TOPICS[topic]
         present = next((found for name in names.split() if (found := log.list_instances(name))), [])
         for name in present if role == "power" else present[:1]:
             try:
@@ -120,14 +121,14 @@ def find_utc_offset_us(log: Autopilot) -> int:
     else:  # week and milliseconds of GPS, which had other names before 2015
         week, ms = (fields.get(new, fields.get(old, np.zeros(1))).astype(np.int64) for new, old in _GPS_TIME)
         utc_us = utc_from_gps_ns((_GPS_BEGAN_MS + week * _WEEK_MS + ms) * 10**6) // 1000
-    known = (utc_us > _FIRST_US) & (utc_us < _LAST_US)
+    known = (utc_us > _FIRST_US) & (utc_us < LATEST_US)
     return int(np.median((utc_us - time_us)[known])) if known.any() else 0
 
 
 _GPS_TIME = (("GWk", "Week"), ("GMS", "TimeMS"))
 _GPS_BEGAN_MS, _WEEK_MS = 315_964_800_000, 7 * 86_400_000
-_FIRST_US, _LAST_US = 1_100_000_000 * 10**6, 4_000_000_000 * 10**6
-"""Receivers count from an epoch of their own until they know the time; no log is from before 2004."""
+_FIRST_US, LATEST_US = 1_100_000_000 * 10**6, 4_000_000_000 * 10**6
+"""Receivers count from an epoch of their own until they know the time; no log is from before 2004, or from after 2096."""
 
 
 _RECEIVERS = "vehicle_gps_position sensor_gps GPS"
@@ -283,26 +284,37 @@ def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Int64, f: Co
 _Convert = Callable[[Autopilot, str, Int64, Columns], tuple[Int64, Columns]]
 _PX4_COMMANDS = """rover_speed_setpoint rover_differential_setpoint rover_ackermann_setpoint rover_mecanum_setpoint
 differential_drive_setpoint"""
-_SOURCES: dict[str, tuple[tuple[str, str, str, str, _Convert], ...]] = {
-    "ulog": (
-        (_RECEIVERS, "fix", "gnss", "gps", _convert_px4_fix),
-        (_RECEIVERS, "velocity", "gnss_velocity", "", _convert_px4_velocity),
-        ("sensor_combined", "imu", "imu", "imu", _convert_px4_imu),
-        ("wheel_encoders", "odometry", "wheel_odometry", "base_link", _convert_px4_wheels),
-        ("battery_status", "battery", "power", "", _convert_px4_battery),
-        (_PX4_COMMANDS, "command", "command", "", _convert_px4_command),
-    ),
-    "dataflash": (
-        (_RECEIVERS, "fix", "gnss", "gps", _convert_ardupilot_fix),
-        (_RECEIVERS, "velocity", "gnss_velocity", "", _convert_ardupilot_velocity),
-        ("IMU", "imu", "imu", "imu", _convert_ardupilot_imu),
-        ("WENC", "odometry", "wheel_odometry", "base_link", _convert_ardupilot_wheels),
-        ("BAT CURR", "battery", "power", "", _convert_ardupilot_battery),
-        ("THR", "command", "command", "", _convert_ardupilot_command),
-    ),
+_TOPICS = {
+    "fix": ("gnss", "gps"),
+    "velocity": ("gnss_velocity", ""),
+    "imu": ("imu", "imu"),
+    "odometry": ("wheel_odometry", "base_link"),
+    "battery": ("power", ""),
+    "command": ("command", ""),
 }
-"""Names of messages, best first; topic, role and frame of what they become, and how."""
+"""Role and frame of what messages become, by the last part of its topic."""
+_SOURCES: dict[str, dict[str, tuple[str, _Convert]]] = {
+    "ulog": {
+        "fix": (_RECEIVERS, _convert_px4_fix),
+        "velocity": (_RECEIVERS, _convert_px4_velocity),
+        "imu": ("sensor_combined", _convert_px4_imu),
+        "odometry": ("wheel_encoders", _convert_px4_wheels),
+        "battery": ("battery_status", _convert_px4_battery),
+        "command": (_PX4_COMMANDS, _convert_px4_command),
+    },
+    "dataflash": {
+        "fix": (_RECEIVERS, _convert_ardupilot_fix),
+        "velocity": (_RECEIVERS, _convert_ardupilot_velocity),
+        "imu": ("IMU", _convert_ardupilot_imu),
+        "odometry": ("WENC", _convert_ardupilot_wheels),
+        "battery": ("BAT CURR", _convert_ardupilot_battery),
+        "command": ("THR", _convert_ardupilot_command),
+    },
+}
+"""Names of messages, best first, and how they are converted, by autopilot and topic."""
 
 _BESIDE = "GPA STER rover_rate_setpoint"
-CONVERTED = {name for of in _SOURCES.values() for names, *_ in of for name in names.split()} | {*_BESIDE.split()}
+CONVERTED = {name for of in _SOURCES.values() for names, _ in of.values() for name in names.split()} | {
+    *_BESIDE.split()
+}
 """Names of messages that are read here."""

@@ -65,15 +65,15 @@ class Expression:
             case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
                 return np.asarray(value, np.float64)
             case ast.Subscript(value=value, slice=ast.Constant(value=int(index))):
-                return read(self._name(value), index)
-        return read(self._name(node), None)
+                return read(self._join_name(value), index)
+        return read(self._join_name(node), None)
 
-    def _name(self, node: ast.expr) -> str:
+    def _join_name(self, node: ast.expr) -> str:
         match node:
             case ast.Name(id=name):
                 return self.quoted[int(name.removeprefix(_MARK))] if name.startswith(_MARK) else name
             case ast.Attribute(value=value, attr=attribute):
-                return f"{self._name(value)}.{attribute}"
+                return f"{self._join_name(value)}.{attribute}"
         raise ExpressionError
 
 

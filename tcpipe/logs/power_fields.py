@@ -79,10 +79,10 @@ def match_power_fields(names: Iterable[str]) -> PowerFields | None:
     if quantity == "power":
         rails: list[dict[str, str]] = [{"power": " + ".join(of.name for of in drawn)}]
     elif len(drawn) > 1 and all(of.side in by_side for of in drawn):
-        rails = [{"voltage": _of_one(by_side[of.side]), "current": of.name} for of in drawn]
+        rails = [{"voltage": _take_first_element(by_side[of.side]), "current": of.name} for of in drawn]
     else:
         rails = [{"current": " + ".join(of.name for of in drawn)}]
-        rails = [{"voltage": _of_one(volt[0].name)} | rails[0]] if volt else rails
+        rails = [{"voltage": _take_first_element(volt[0].name)} | rails[0]] if volt else rails
     used = [*drawn, *(volt if "voltage" in rails[0] else [])]
     scales = {of.quantity: of.scale for of in used if of.scale != 1.0}
     return PowerFields(tuple(rails), scales, _find_doubt(drawn, others))
@@ -134,7 +134,7 @@ def _rank(group: Sequence[_Named]) -> tuple[bool, bool]:
     return not supply, phase
 
 
-def _of_one(name: str) -> str:
+def _take_first_element(name: str) -> str:
     """Return the first element of a list: the sum of voltages is none."""
     return name.replace("[]", "[0]")
 

@@ -254,7 +254,7 @@ def _inspect_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
     from tcpipe.pipeline.table_proposals import propose_tables, read_columns  # noqa: PLC0415  polars only where a table is read
 
     columns, problems = read_columns(folder, files)
-    found = propose_tables(folder, files)
+    found = propose_tables(folder, columns, problems.values())
     return InspectedTables(
         path=str(folder), columns=columns, problems=problems, recipe=found.toml() if found.lines else ""
     )

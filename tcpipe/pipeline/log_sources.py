@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shlex
 import sqlite3
 import stat
 from collections import Counter
@@ -64,11 +65,13 @@ class LogSource:
     def stem(self) -> str:
         """What the run is called after: the first name without its suffix, as text that can be printed and be a file name."""
         path = self.paths[0]
-        name, suffixes = path.name.lower(), sorted(LOG_SUFFIXES, key=len, reverse=True)
-        suffix = next((end for end in suffixes if name.endswith(end) and not path.is_dir()), "")
-        stem = path.name[: len(path.name) - len(suffix)]
-        if is_table(path.name) and not path.is_dir():
+        if path.is_dir():
+            stem = path.name
+        elif is_table(path.name):
             stem = f"{path.parent.name}_{path.stem}"
+        else:
+            suffix = max((end for end in LOG_SUFFIXES if path.name.lower().endswith(end)), key=len, default="")
+            stem = path.name[: len(path.name) - len(suffix)]
         return clean_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")
 
     @property
@@ -186,7 +189,8 @@ def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
                 *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
             ) from None
         if path.is_dir() and (held := list_table_files(path)):
-            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): 'tcpipe init --from {path}' writes a recipe for them"
+            init = f"tcpipe init --from {shlex.quote(str(path))}"
+            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): '{init}' writes a recipe for them"
             raise LogError(*error.problems, hint) from None
         raise
 

@@ -152,7 +152,7 @@ class Preflight:
         said += [f"topic     {_rate(of)}" for of in self.topics]
         said += [f"fails     {line}" for line in self.problems]
         said += [f"verdict   {format_verdict(self.verdict)}"] if self.expected_yield else []
-        said += format_findings(self.findings, more=f"tcpipe preflight {self.log} --json")
+        said += format_findings(self.findings, more=f"tcpipe preflight {shlex.quote(self.log)} --json")
         said += [f"loss      {format_loss(loss)}" for loss in self.losses]
         said += [f"record    {self.record}"] if self.record else []
         rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -59,10 +59,11 @@ def propose_recipe(
     if isinstance(path, Path) and (is_table(path.name) or (path.is_dir() and not is_one_bag(path))):
         logs = list_logs_below(path) if path.is_dir() else []
         if not logs:
-            from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
+            from tcpipe.pipeline.table_proposals import propose_tables, read_columns  # noqa: PLC0415  polars only where a table is read
 
             folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
-            found = propose_tables(folder, files)
+            columns, problems = read_columns(folder, files)
+            found = propose_tables(folder, columns, problems.values())
             if not found.lines:
                 raise UsageError(f"{path}: it contains no log, and no table with columns of known names", *found.head)
             return found
@@ -97,7 +98,7 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
         pose, by = places.get(cast("Role", role.name), (None, ""))
         place = f"; at {np.round(pose.xyz_m, 3).tolist()} m ({by})" if pose and by == "tf_static" else ""
         samples = {
-            name: _sample(columns.get(name, {}), types[name], name, role.name, (assigned, known))
+            name: _describe_sample(columns.get(name, {}), types[name], name, role.name, (assigned, known))
             for name in role.topics
         }
         head += [f"{role.name}: {name}{sample}{place}" for name, sample in samples.items()]
@@ -106,13 +107,7 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
     head += [f"not found: {', '.join(lacking)}"] if lacking else []
     lines = [*_iterate_questions(assigned, log)]
     for finding in proposals:
-        low = {
-            name[4:]: format_number(name, value) for name, value in finding.numbers.items() if name.startswith("low_")
-        }
-        ends = (
-            f"{text} to {format_number(f'high_{name}', finding.numbers[f'high_{name}'])}" for name, text in low.items()
-        )
-        notes = {**finding.names, "power_sources": ", ".join(ends)}
+        notes = {**finding.names, "power_sources": _format_ranges(finding.numbers)}
         for remedy in finding.remedies:
             lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
         if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
@@ -126,6 +121,13 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
     )
 
 
+def _format_ranges(numbers: Mapping[str, float]) -> str:
+    """Return the lowest to the highest value of each unit, as ``24.1 V to 25.2 V``."""
+    units = [name.removeprefix("low_") for name in numbers if name.startswith("low_")]
+    ends = {unit: [(name, numbers[name]) for name in (f"low_{unit}", f"high_{unit}")] for unit in units}
+    return ", ".join(" to ".join(format_number(*end) for end in of) for of in ends.values())
+
+
 def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterator[ProposedLine]:
     """Yield the lines for roles that several topics could be used as, and for a command that no name shows."""
     for role, names in assigned.choices.items():
@@ -136,7 +138,7 @@ def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterato
         yield ProposedLine("read.topics", "command", twists[:1], "if it commands the velocity", is_certain=False)
 
 
-def _sample(columns: Columns, kind: str, topic: str, role: str, by: tuple[RoleAssignment, Profiles]) -> str:
+def _describe_sample(columns: Columns, kind: str, topic: str, role: str, by: tuple[RoleAssignment, Profiles]) -> str:
     """Return how many messages a topic has, and values by what its role needs."""
     assigned, known = by
     count = f", {len(columns[LOG_TIME])} messages" if columns else ""

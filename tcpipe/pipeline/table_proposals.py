@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from tcpipe.logs.field_mapping import (
 )
 from tcpipe.logs.fix_quality import find_quality
 from tcpipe.logs.power_fields import match_power_fields, match_sided_velocities
-from tcpipe.power.sources import RailReadings, find_rejection
+from tcpipe.power.sources import RailReadings, find_quantity, find_rejection, make_rail_name
 from tcpipe.recipe.suggestions import (
     ProposedLine,
     ProposedRecipe,
@@ -39,7 +39,6 @@ from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, judge_fields
 Floats = NDArray[np.float64]
 
 _COMMAND = re.compile(r"cmd|command|joy")
-_BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
 _STAMP = re.compile(r"t|stamp|.*time(stamp|string)?|gpst|utc|date")
 _PLAIN = re.compile(r"[A-Za-z_]\w*")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
@@ -82,11 +81,13 @@ def read_columns(folder: Path, files: Sequence[Path]) -> tuple[dict[str, tuple[s
     return columns, problems
 
 
-def propose_tables(folder: Path, files: Sequence[Path]) -> ProposedRecipe:
-    """Return the recipe for the tables that have known names: of several for a role, that which covers the drive of the others best."""
-    columns, problems = read_columns(folder, files)
+def propose_tables(folder: Path, columns: Mapping[str, Sequence[str]], problems: Iterable[str] = ()) -> ProposedRecipe:
+    """Return the recipe for the tables that have known names: of several for a role, that which covers the drive of the others best.
+
+    ``columns`` and ``problems`` are what `read_columns` returns of the folder's files.
+    """
     roles: dict[str, list[tuple[_Table, list[ProposedLine]]]] = {}
-    head = [*problems.values()]
+    head = [*problems]
     for name, path in _group_files(folder, [folder / file for file in columns]).items():
         names = columns[path.relative_to(folder).as_posix()]
         table = _read_table(name, path, names)
@@ -106,6 +107,8 @@ def propose_tables(folder: Path, files: Sequence[Path]) -> ProposedRecipe:
         lines += [replace(line, note=f"{line.note}: {apart}", is_certain=False) for line in mine] if apart else mine
         log = table.path if "*" in table.file else log
         head += [f"{other.file}, {other.rows} rows, could be {role} as well" for other, _ in candidates[1:]]
+    with_voltage = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
+    lines = [line for line in lines if line.note != NO_VOLTAGE or make_rail_name(line.table) not in with_voltage]
     lines += propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)
     return ProposedRecipe(head, lines, format_path(log))
 
@@ -181,10 +184,10 @@ def _quote(name: str) -> str:
 def _iterate_power(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     matched = match_power_fields([_quote(name) for name in table.names])
     rails, doubt = (matched.rails, matched.doubt) if matched else ((), "")
-    named = [name for name, word in _BARE.items() if word.search(table.path.stem.lower()) and len(table.names) == 2]
+    named = find_quantity(table.path.stem) if len(table.names) == 2 else None
     found = {f"power_{number}" if len(rails) > 1 else "power": rail for number, rail in enumerate(rails, 1)}
     if named and not found:
-        found = {re.sub(r"\W+", "_", table.path.stem): {named[0]: table.names[1]}}
+        found = {re.sub(r"\W+", "_", table.path.stem): {named: table.names[1]}}
     counters = [name for name in table.names if split_unit(name)[1] in UNITS["J"]]
     if counters and not found:
         found = {"power": {"energy": counters[0]}}
@@ -209,7 +212,9 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     keys |= {"stamp_unit": (table.stamp_unit, "by its steps")} if table.stamp_unit else {}
     samples = {of: "" if of == "quality" else format_first(values[of]) for of in mapped}
     keys |= {f"columns.{of}": (text, samples[of]) for of, text in mapped.items()}
-    keys |= {f"units.{of}": (unit, "") for of, unit in _find_units(table, role, mapped).items() if of != "angular_z"}
+    units = _find_units(table, role, mapped)
+    turn_unit = units.pop("angular_z", None)
+    keys |= {f"units.{of}": (unit, "") for of, unit in units.items()}
     head = f"tables.{name}"
     lines = [ProposedLine(head, key, value, note, is_certain=not doubt) for key, (value, note) in keys.items()]
     if mapped.get("angular_z", "").endswith(_OVER_TRACK):
@@ -217,8 +222,7 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
         lines = [
             replace(line, note=note, is_certain=False) if line.key == "columns.angular_z" else line for line in lines
         ]
-        turn_units = _find_units(table, role, mapped).get("angular_z")
-        lines += [ProposedLine(head, "units.angular_z", turn_units, is_certain=False)] if turn_units else []
+        lines += [ProposedLine(head, "units.angular_z", turn_unit, is_certain=False)] if turn_unit else []
     if role == "gnss" and "quality" not in mapped:
         lines += [_propose_quality(table, head, of) for of in find_quality(table.names)]
     if role == "power" and set(mapped) == {"current"}:

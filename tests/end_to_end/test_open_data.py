@@ -272,6 +272,10 @@ def test_what_is_asked_wrongly_is_one_line(site):
     for text, wanted in (
         ('licence = "x"\ncollections = {}\n', "stac is missing"),
         ("stac = ", "cannot be read as TOML"),
+        (
+            'stac = "https://x.example"\nlicence = "x"\n[collections.dem]\nlayer = "heigth"\n',
+            'collections.dem.layer is "heigth"; expected one of height, ortho',
+        ),
     ):
         site.entry.write_text(text)
         assert wanted in plain_lines(site.run(), 2, most=2)

@@ -260,6 +260,29 @@ def test_wheels_of_px4_need_a_radius(tmp_path):
     assert read_one(log, tmp_path / "a.ulg", "/wheel_encoders/odometry")["twist.twist.linear.x"] == 1.875
 
 
+@pytest.mark.parametrize(
+    ("name", "fields", "values", "expected"),
+    [
+        ("rover_speed_setpoint", ("speed_body_x",), (1.25,), (1.25, -0.5)),  # its turn is another message's
+        ("rover_differential_setpoint", ("forward_speed_setpoint", "yaw_rate_setpoint"), (1.5, 0.25), (1.5, -0.25)),
+        ("rover_ackermann_setpoint", ("forward_speed_setpoint",), (0.75,), (0.75, -0.5)),
+        ("rover_mecanum_setpoint", ("forward_speed_setpoint", "yaw_rate_setpoint"), (2.0, -0.25), (2.0, 0.25)),
+        ("differential_drive_setpoint", ("speed", "yaw_rate"), (1.75, 0.125), (1.75, -0.125)),
+    ],
+)
+def test_commands_of_px4_of_every_version_are_a_speed_and_a_turn_to_the_left(tmp_path, name, fields, values, expected):
+    log = Ulog()
+    if len(fields) == 1:
+        log.format("rover_rate_setpoint", "float yaw_rate_setpoint")
+        log.subscribe("rover_rate_setpoint", 1)
+        log.data("rover_rate_setpoint", 1, 1_000_000, 0.5)
+    log.format(name, *(f"float {field}" for field in fields))
+    log.subscribe(name, 2)
+    log.data(name, 2, 1_500_000, *values)
+    row = read_one(log, tmp_path / "a.ulg", f"/{name}/command")
+    assert (row["twist.linear.x"], row["twist.angular.z"]) == expected
+
+
 @pytest.mark.parametrize("letter", ["n", "a", "B", "f", "q"])
 def test_fields_of_another_kind_than_they_should_be_break_nothing(tmp_path, letter):
     fields = {

@@ -4,8 +4,8 @@ Both describe themselves: a format names the fields of a message; a message is a
 heads finds the messages of each format; numpy reads their columns. Where a head is impossible, the pass goes on at the next
 place that fits, and what it skips is damage. A size that a file states is believed only as far as the file reaches.
 
-tcpipe reads both itself. pyulog does not say that a file is cut, and lost messages unsaid or gave up the whole log after a flipped bit (8
-of 300 tries); pymavlink decodes row by row. Tests compare the columns with theirs, a benchmark the time.
+tcpipe reads both itself. pyulog does not report a truncated file; after a flipped bit it lost messages without a report or gave up the
+whole log (8 of 300 tries); pymavlink decodes row by row. Tests compare the columns with theirs, a benchmark the time.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ from numpy.typing import DTypeLike, NDArray
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import MAX_COLUMNS, MAX_TOPICS
 from tcpipe.formats.logs.log_part import gather_integers
+from tcpipe.logs.autopilot import LATEST_US
 from tcpipe.logs.topics import AutopilotKind, Damage
 
 _HEAD = b"\xa3\x95"
 _FORMAT, _FORMAT_BYTES = 0x80, 89
 _STRAY_US, _LATE_US = 1_000_000, 3_600 * 10**6
-_LAST_US = 4_000_000_000 * 10**6
-"""Simulators count time from 1970, none beyond 2096."""
-_FEW = 5
+_WINDOW = 5
+"""Messages in a row by whose median a stray stamp is found."""
+_MOST_DIGITS, _DEEPEST = 5, 5
+"""Of the length of a list in a format, and formats inside formats; what is more is damage."""
 
 Int64 = NDArray[np.int64]
 Layout = np.dtype[np.void]
@@ -116,8 +118,8 @@ class AutopilotRecords:
 
     def sort_by_time(self) -> None:
         """Bring messages in order of time; those with a stamp far from those around it, or from the log's end, are left out and counted."""
-        ends = [float(np.median(of.time_us[-_FEW:])) for of in self.messages.values() if len(of.time_us) >= _FEW]
-        latest_us = min(max(ends, default=_LAST_US) + _LATE_US, _LAST_US)
+        ends = [float(np.median(of.time_us[-_WINDOW:])) for of in self.messages.values() if len(of.time_us) >= _WINDOW]
+        latest_us = min(max(ends, default=LATEST_US) + _LATE_US, LATEST_US)
         for name, of in list(self.messages.items()):
             known = (of.time_us >= 0) & (of.time_us <= latest_us) & ~_find_stray(of.time_us)
             if lost := int(np.count_nonzero(~known)):
@@ -134,9 +136,9 @@ class AutopilotRecords:
 def _find_stray(time_us: Int64) -> NDArray[np.bool_]:
     """Return which times, in the order of the file, are far from the median of those around them."""
     steps = np.diff(time_us)
-    if len(time_us) < _FEW or not (steps < 0).any():
+    if len(time_us) < _WINDOW or not (steps < 0).any():
         return np.zeros(len(time_us), np.bool_)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(time_us, _FEW // 2, mode="edge"), _FEW)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(time_us, _WINDOW // 2, mode="edge"), _WINDOW)
     is_stray: NDArray[np.bool_] = np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(
         np.abs(steps)
     )
@@ -175,7 +177,7 @@ def _parse_field(text: str) -> tuple[str, int, str] | None:
     """Return the type of a field, how many of it there are (0: no list) and its name, from ``float[3] rate``; None where it is no field."""
     of, _, name = text.partition(" ")
     kind, opening, count = of.removesuffix("]").partition("[")
-    number = int(count) if count.isdecimal() and len(count) <= _FEW else 0
+    number = int(count) if count.isdecimal() and len(count) <= _MOST_DIGITS else 0
     is_field = kind.isidentifier() and name.isidentifier() and bool(number) == bool(opening)
     return (kind, number, name) if is_field else None
 
@@ -304,7 +306,7 @@ class _UlogReader:
 
     def _iterate_fields(self, name: str, prefix: str, depth: int) -> Iterator[tuple[str, DTypeLike]]:
         """Yield the fields of a format, those of formats in it as ``outer.inner`` or, of several, ``outer_0.inner``."""
-        if depth > _FEW:
+        if depth > _DEEPEST:
             raise ValueError("formats inside formats")
         for of, count, field_name in self._formats[name]:
             code = _ULOG_TYPES.get(of)

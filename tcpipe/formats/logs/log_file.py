@@ -122,6 +122,23 @@ def list_logs_below(directory: Path) -> list[Path]:
     return found
 
 
+def hash_files(files: Iterable[Path], size_bytes: int) -> str:
+    """Return the SHA-256 of files, one after the other, which have ``size_bytes`` together. `LogError`: the disk fails."""
+    digest, meter = hashlib.sha256(), Meter("hashing", size_bytes)
+    for file in files:
+        try:
+            with file.open("rb") as stream:
+                while block := stream.read(_HASH_BYTES):
+                    digest.update(block)
+                    meter.add(len(block))
+        except OSError as error:
+            raise LogError(
+                f"{file}: it cannot be read to its end ({error.strerror}); rescue what can be read into a copy "
+                "(ddrescue does), and give that"
+            ) from None
+    return digest.hexdigest()
+
+
 @dataclass(frozen=True, slots=True)
 class _OpenFiles:
     """The files of a log, open, and what metadata.yaml says of them."""
@@ -132,27 +149,11 @@ class _OpenFiles:
     fetched: Mapping[Path, FetchedFile]
 
 
-class Log:
-    """A log, open for reading. Use as a context manager, or close it."""
+class OpenLog:
+    """What is open for reading until its ``stack`` is closed. Use as a context manager, or close it."""
 
-    def __init__(self, path: Path, opened: _OpenFiles, types: TypeLibrary, stack: ExitStack) -> None:
-        self.path = path
-        self.container = opened.container
-        """``mcap``, ``bag`` or ``rosbag2``."""
-        self._files, self._parts, self._types, self._stack = opened.listed.paths, opened.parts, types, stack
-        self._fetched = tuple(opened.fetched.values())
-        self._damage = list(opened.listed.damage)
-        self.topics = self._merged_topics()
-        """Every topic by name, as the index tells."""
-        self._compare_counts(opened.listed)
-
-    def _compare_counts(self, listed: Rosbag2Files) -> None:
-        """Note where metadata.yaml counts more messages than the files hold, in all or of topics."""
-        held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
-        of_topics = sum(max(count - held.get(name, 0), 0) for name, count in listed.topic_counts.items())
-        lost = max((listed.message_count or 0) - sum(held.values()), of_topics)
-        if lost > 0:
-            self._damage.append(Damage("messages-miscounted", self.path.name, messages_lost=lost))
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
 
     def __enter__(self) -> Self:
         """Return the log, which is open already."""
@@ -167,6 +168,30 @@ class Log:
     def close(self) -> None:
         """Close its files and remove temporary copies."""
         self._stack.close()
+
+
+class Log(OpenLog):
+    """A log of ROS."""
+
+    def __init__(self, path: Path, opened: _OpenFiles, types: TypeLibrary, stack: ExitStack) -> None:
+        super().__init__(stack)
+        self.path = path
+        self.container = opened.container
+        """``mcap``, ``bag`` or ``rosbag2``."""
+        self._files, self._parts, self._types = opened.listed.paths, opened.parts, types
+        self._fetched = tuple(opened.fetched.values())
+        self._damage = list(opened.listed.damage)
+        self.topics = self._merged_topics()
+        """Every topic by name, as the index tells."""
+        self._compare_counts(opened.listed)
+
+    def _compare_counts(self, listed: Rosbag2Files) -> None:
+        """Note where metadata.yaml counts more messages than the files hold, in all or of topics."""
+        held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
+        of_topics = sum(max(count - held.get(name, 0), 0) for name, count in listed.topic_counts.items())
+        lost = max((listed.message_count or 0) - sum(held.values()), of_topics)
+        if lost > 0:
+            self._damage.append(Damage("messages-miscounted", self.path.name, messages_lost=lost))
 
     @property
     def findings(self) -> list[Finding]:
@@ -217,19 +242,7 @@ class Log:
             return self.outline
         for fetched in self._fetched:
             fetched.whole()
-        digest, meter = hashlib.sha256(), Meter("hashing", self.size_bytes)
-        for file in sorted(self._files, key=lambda file: file.name):
-            try:
-                with file.open("rb") as stream:
-                    while block := stream.read(_HASH_BYTES):
-                        digest.update(block)
-                        meter.add(len(block))
-            except OSError as error:
-                raise LogError(
-                    f"{file}: it cannot be read to its end ({error.strerror}); rescue what can be read into a copy "
-                    "(ddrescue does), and give that"
-                ) from None
-        return digest.hexdigest()
+        return hash_files(sorted(self._files, key=lambda file: file.name), self.size_bytes)
 
     def definition(self, topic: str) -> tuple[str, str]:
         """Return the text of a topic's message definition, and where it is from: ``log``, or ``given`` or ``bundled`` in its stead.

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 import pyarrow as pa
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_container import find_autopilot
-from tcpipe.formats.logs.log_file import AUTOPILOT_SUFFIXES, Log, is_log_file, open_log
+from tcpipe.formats.logs.log_file import AUTOPILOT_SUFFIXES, Log, OpenLog, is_log_file, open_log
 from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import Mappings, find_table_run
@@ -33,12 +32,14 @@ _GAP_NS = 5_000_000_000
 """Parts of one recording follow one another within so much."""
 
 
-class JoinedLog:
+class JoinedLog(OpenLog):
     """Logs behind one face: topics merged, tables in log-time order; with the static transforms of an ``earlier`` part."""
 
-    def __init__(self, logs: Sequence[Log | TableLog], earlier: Log | None) -> None:
-        self._logs, self._earlier = logs, earlier
-        self.topics = (_find_static_topics(earlier) if earlier else {}) | _merge_topics(logs)
+    def __init__(
+        self, logs: Sequence[Log | TableLog], earlier: Log | None, topics: Mapping[str, Topic], stack: ExitStack
+    ) -> None:
+        super().__init__(stack)
+        self._logs, self._earlier, self.topics = logs, earlier, topics
 
     @property
     def findings(self) -> list[Finding]:
@@ -98,19 +99,6 @@ class JoinedLog:
         if self._earlier and lent:
             yield from self._earlier.batches(lent)
 
-    def __enter__(self) -> Self:
-        """Return self; the files are open already."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close every file."""
-        with ExitStack() as stack:
-            for log in (*self._logs, *([self._earlier] if self._earlier else [])):
-                stack.push(log)
-            stack.pop_all().__exit__(kind, error, trace)
-
 
 def _join_tables(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
     if len(tables) == 1:  # in order already
@@ -141,20 +129,22 @@ def open_logs(
 
     A folder that is no bag is one of tables, where ``tables`` says what they hold.
     """
-    runs = {path: find_table_run(path, tables or {}) for path in sorted(paths, key=Path)}
-    firsts = {run.files if run else (path,): path for path, run in reversed(runs.items())}
+    firsts: dict[tuple[Path | str, ...], Path | str] = {}
+    for path in sorted(paths, key=Path):
+        run = find_table_run(path, tables or {})
+        firsts.setdefault(run.files if run else (path,), path)
     with ExitStack() as stack:
         logs: list[Log | TableLog] = []
-        for path in reversed(firsts.values()):
+        for path in firsts.values():
             logs.append(open_single_log(path, message_definitions=message_definitions, tables=tables))
-            stack.callback(logs[-1].close)
+            stack.push(logs[-1])
         alone = logs[0] if len(logs) == 1 else None
         earlier = _find_earlier_part(alone) if isinstance(alone, Log) and not _find_static_topics(alone) else None
         if earlier:
             stack.enter_context(earlier)
-        joined = JoinedLog(logs, earlier)
-        stack.pop_all()
-    return joined if earlier or len(logs) > 1 else logs[0]
+        topics = (_find_static_topics(earlier) if earlier else {}) | _merge_topics(logs)
+        opened = stack.pop_all()
+    return JoinedLog(logs, earlier, topics, opened) if earlier or len(logs) > 1 else logs[0]
 
 
 def open_single_log(

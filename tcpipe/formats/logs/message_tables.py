@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
+from tcpipe.formats.logs.log_file import OpenLog, hash_files
 from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
@@ -31,7 +29,7 @@ class TopicMessages:
     damage: Sequence[Damage] = ()
 
 
-class TableLog:
+class TableLog(OpenLog):
     """A log whose topics are tables of messages; each is made when it is asked for."""
 
     outline = ""
@@ -48,26 +46,13 @@ class TableLog:
         findings: Iterable[Finding] = (),
         stack: ExitStack | None = None,
     ) -> None:
+        super().__init__(stack or ExitStack())
         self.path, self.container = path, container
         self._made = {found.topic.name: found.make for found in topics}
         self.topics = {found.topic.name: found.topic for found in topics}
         """Every topic by name."""
         self.findings = [*find_damage(damage for found in topics for damage in found.damage), *findings]
-        self._files, self._stack = files, stack or ExitStack()
-
-    def __enter__(self) -> Self:
-        """Return the log."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Remove temporary copies."""
-        self._stack.__exit__(kind, error, trace)
-
-    def close(self) -> None:
-        """Remove temporary copies."""
-        self._stack.close()
+        self._files = files
 
     @property
     def size_bytes(self) -> int:
@@ -75,12 +60,8 @@ class TableLog:
         return sum(file.stat().st_size for file in self._files)
 
     def sha256(self) -> str:
-        """Return the SHA-256 of all files, one after the other, by name; also of tables that are not mapped."""
-        digest = hashlib.sha256()
-        for file in self._files:
-            with file.open("rb") as stream:
-                hashlib.file_digest(stream, lambda: digest)
-        return digest.hexdigest()
+        """Return the SHA-256 of all files, one after the other, by name; also of tables that are not mapped. `LogError`: the disk fails."""
+        return hash_files(self._files, self.size_bytes)
 
     def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
         """Return the messages of several topics; `LogError` where one is not in the log."""

@@ -53,7 +53,7 @@ class Catalogue:
     """Its URL, without /collections."""
     licence: str
     """What the licence demands, and where it can be read."""
-    collections: Mapping[str, Collection]
+    collections: dict[str, Collection]
     """By id."""
     hosts: list[str] = field(default_factory=list)
     """Other hosts that its rasters are on, name or name:port."""

@@ -167,6 +167,22 @@ def test_speeds_of_both_sides_in_other_units_words_and_a_counter_are_read_in_si(
     assert odometry["twist.twist.angular.z"].to_numpy() == pytest.approx(1.0 / 0.5)  # of the track width of the comment
 
 
+def test_tables_of_one_column_each_are_told_by_the_names_of_their_files(tmp_path):
+    write(tmp_path / "battery_voltage.csv", time=UTC_S + SECONDS, data=24.0 + SECONDS)
+    write(tmp_path / "battery_current.csv", time=UTC_S + SECONDS, data=3.0 + SECONDS)
+    write(tmp_path / "battery_temperature.csv", time=UTC_S + SECONDS, data=30.0)
+    values, recipe, text = proposed(tmp_path)
+    assert {name: of["columns"] for name, of in values["tables"].items()} == {
+        "battery_voltage": {"voltage": "data"},
+        "battery_current": {"current": "data"},
+    }
+    assert "nominal_voltage_volt" not in text, "there is a voltage"
+    topics = open_single_log(tmp_path, tables=recipe.tables).topics
+    assert set(topics) == {"/battery_voltage", "/battery_current"}
+    (tmp_path / "battery_voltage.csv").unlink()
+    assert "# nominal_voltage_volt = 24.0" in proposed(tmp_path)[2]
+
+
 def test_an_expression_of_columns_in_another_unit_needs_its_own(tmp_path):
     write(tmp_path / "wheels.csv", time=UTC_S + SECONDS, **{"velL__(km/h)": 3.6, "velR__(km/h)": 3.6})
     table = {"file": "wheels.csv", "columns": {"linear_x": "(`velL (km/h)` + `velR (km/h)`) / 2"}}
