@@ -219,9 +219,9 @@ class SampleTable:
             map=[self.map_names[index] for index in self.sampled.map_index[at]],
             **columns,
         )
-        for field in self.added.schema:
-            added = take_rows(self.added.select([field.name]), rows_of_segments)
-            table = table.append_column(field, added.column(0))
+        added = take_rows(self.added, rows_of_segments)
+        for field in added.schema:
+            table = table.append_column(field, added.column(field.name))
         return add_geo_metadata(table if self.redaction is None else self.redaction.table(table), "Point", centres)
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
