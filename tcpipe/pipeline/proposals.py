@@ -64,7 +64,9 @@ def propose_recipe(
             folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
             found = propose_tables(folder, files)
             if not found.lines:
-                raise UsageError(f"{path}: it contains no log, and no table with columns of known names", *found.head)
+                raise UsageError(
+                    f"{path}: it contains no log, and no table with stamps and columns of known names", *found.head
+                )
             return found
         others = [f"proposed for the first of {len(logs)} logs"] if len(logs) > 1 else []
         if tables := [file.name for file in list_table_files(path)]:
