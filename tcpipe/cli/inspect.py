@@ -234,7 +234,9 @@ def _print_tables(found: InspectedTables) -> None:
         print_line(line)
     print_line("")
     print_line(
-        "proposed recipe ('tcpipe init --from PATH' writes it):" if found.recipe else "no column has a known name"
+        "proposed recipe ('tcpipe init --from PATH' writes it):"
+        if found.recipe
+        else "no table has stamps and columns of known names"
     )
     for line in found.recipe.splitlines():
         print_line(line)

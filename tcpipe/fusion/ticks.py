@@ -149,7 +149,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         if m.imu is None and (m.visual is None or m.visual.turn_rate_radps is None):
             variances = variances + _compute_unseen_turn_variance(m.doppler.stamp_ns, m.gnss.lever_arm_m)
         put(state.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
-    _add_constraints(m, stationary_ns, stamp_ns, value, variance)
+    _add_constraints(m, stationary_ns, stamp_ns, value, variance, period_s=period_s)
     if m.wheels is not None:
         levers[state.SIDEWAYS] = m.wheels.lever_arm_m
 
@@ -238,8 +238,9 @@ def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, floa
     return np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * lasting
 
 
-def _add_constraints(m: Measurements, stationary_ns: Ints, stamp_ns: Ints, value: Floats, variance: Floats) -> None:
-    period_s = float(stamp_ns[1] - stamp_ns[0]) * 1e-9
+def _add_constraints(
+    m: Measurements, stationary_ns: Ints, stamp_ns: Ints, value: Floats, variance: Floats, *, period_s: float
+) -> None:
     if is_gliding(m):  # which way the body looks is not known
         return
     value[:, state.SIDEWAYS, :2] = 0.0

@@ -65,7 +65,9 @@ def propose_recipe(
             columns, problems = read_columns(folder, files)
             found = propose_tables(folder, columns, problems.values())
             if not found.lines:
-                raise UsageError(f"{path}: it contains no log, and no table with columns of known names", *found.head)
+                raise UsageError(
+                    f"{path}: it contains no log, and no table with stamps and columns of known names", *found.head
+                )
             return found
         others = [f"proposed for the first of {len(logs)} logs"] if len(logs) > 1 else []
         if tables := [file.name for file in list_table_files(path)]:

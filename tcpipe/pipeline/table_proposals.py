@@ -15,6 +15,7 @@ from tcpipe.formats.logs.table_log import describe_duplicate, read_cells, read_c
 from tcpipe.formats.object_storage import format_path
 from tcpipe.logs.expressions import UNITS, parse_expression, split_unit
 from tcpipe.logs.field_mapping import (
+    CALLED,
     MAPPED,
     STAMP_UNITS,
     find_other_unit,
@@ -135,7 +136,8 @@ def _group_files(folder: Path, files: Sequence[Path]) -> dict[str, Path]:
 def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     """Return a table with the stamps that suit best: those since 1970, of these the finest; None where there are none."""
     found: list[tuple[tuple[bool, int, bool], _Table]] = []
-    for stamp in [name for name in names if _STAMP.fullmatch(split_unit(name)[0].lower())] or names[:1]:
+    named = [name for name in names if _STAMP.fullmatch(split_unit(name)[0].lower())]
+    for stamp in named or ([] if _is_measured(names[0], names) else names[:1]):
         cells = read_cells(path, stamp=stamp, columns=[])
         known, unit = cells.stamp[cells.stamp_known], split_unit(stamp)[1] or ""
         if known.size < 2:
@@ -155,6 +157,13 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
         if stated != "none":
             found.append(((is_absolute, rows, not cells.stamp_is_time), made))  # texts are often cut to seconds
     return max(found, key=lambda of: of[0])[1] if found else None
+
+
+def _is_measured(name: str, names: Sequence[str]) -> bool:
+    """Return whether a role takes this column: a table that begins with latitudes has no stamps."""
+    power = match_power_fields([_quote(each) for each in names])
+    found = [match_field_names(role, names) for role in CALLED] + [*(power.rails if power else ())]
+    return any({name, _quote(name)} & set(fields.values()) for fields in found)
 
 
 def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:

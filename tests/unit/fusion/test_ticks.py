@@ -35,6 +35,11 @@ def fixes(stamp_ns):
     return Positions(stamp_ns, np.zeros((stamp_ns.size, 3)), np.ones((stamp_ns.size, 3)))
 
 
+def test_a_section_of_one_instant_has_one_tick():
+    at_ns = 2 * TICK_NS
+    assert ticks_of(Measurements(gnss=fixes(np.array([at_ns]))), at_ns, at_ns).stamp_ns.tolist() == [at_ns]
+
+
 @pytest.mark.parametrize(
     ("period_ns", "tick_ns"), [(10**7, 10**7), (5 * 10**7, 5 * 10**7), (12 * 10**7, 4 * 10**7), (10**9, 5 * 10**7)]
 )

@@ -127,7 +127,14 @@ def test_commands_and_velocities_of_one_table_are_told_apart(tmp_path):
 
 def test_a_folder_without_known_names_says_so(tmp_path):
     write(tmp_path / "notes.csv", week=SECONDS, done=1.0)
-    with pytest.raises(UsageError, match="no table with columns of known names"):
+    with pytest.raises(UsageError, match="no table with stamps and columns of known names"):
+        propose_recipe(tmp_path)
+
+
+@pytest.mark.parametrize("columns", [{**FIXES, "volt": 24.0, "amp": 2.0}, {"volt": 24 + 1e-3 * SECONDS, "amp": 2.0}])
+def test_what_a_role_measures_is_no_stamp(tmp_path, columns):
+    write(tmp_path / "drive.csv", **columns)
+    with pytest.raises(UsageError, match=r"drive\.csv is not used, no stamps in its columns"):
         propose_recipe(tmp_path)
 
 
