@@ -140,7 +140,7 @@ class NetworkModel(Predictor):
         config, is_held = samples.config, samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
         trainer, device = _make_trainer(fit)
-        model, best = cls(trainer.network, samples.inputs), trainer.network.arrays()
+        model, best = cls(trainer.network, samples.inputs), _copy_weights(trainer)
         logger.info("%s: %d samples to fit, %d to stop by, on %s", job.name, len(fit), len(held), device)
         progress = TrainingProgress(job.key)
         if job.checkpoint.exists():
@@ -157,7 +157,7 @@ class NetworkModel(Predictor):
             progress.epoch += 1
             progress.history.append((progress.epoch, loss, held_loss))
             if held_loss < progress.best_loss:
-                progress.best_loss, progress.best_epoch, best = held_loss, progress.epoch, trainer.network.arrays()
+                progress.best_loss, progress.best_epoch, best = held_loss, progress.epoch, _copy_weights(trainer)
             if progress.epoch % max(_STEPS_BETWEEN * config.batch_size // len(fit), 1) == 0:
                 write_checkpoint(job.checkpoint, progress, _state(trainer, best))
             _say(job.name, progress, config, times)
@@ -233,9 +233,13 @@ def _train_epoch(trainer: Trainer, fit: Samples, progress: TrainingProgress, tim
     return total / max(count, 1)
 
 
+def _copy_weights(trainer: Trainer) -> Arrays:
+    return trainer.network.arrays()
+
+
 def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
     """Return all arrays of a checkpoint."""
-    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.copy_optimizer_state()}
+    return {"now": _copy_weights(trainer), "best": best, "optimizer": trainer.copy_optimizer_state()}
 
 
 def _restore(trainer: Trainer, parts: dict[str, Arrays], checkpoint: Path) -> None:

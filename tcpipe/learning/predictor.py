@@ -204,10 +204,14 @@ def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
     return out
 
 
+def find_held_out(held_out: Labels) -> NDArray[np.bool_]:
+    """Return which samples have a held-out prediction, shape (N,)."""
+    return np.asarray(np.isfinite(held_out).all(axis=1))
+
+
 def compute_held_loss(held: Samples, predicted: Labels) -> float:
     """Return the loss of predictions of held-out samples, as the options say."""
-    config, scale = held.config, np.array(held.inputs.scale, np.float32)
+    scale = np.array(held.inputs.scale, np.float32)
     labels, predicted = (values.astype(np.float32) / scale for values in (held.labels, predicted))
-    return float(
-        mean_loss(predicted, labels, compute_loss_factors(config.loss, scale), held.weights.astype(np.float32))
-    )
+    factors = compute_loss_factors(held.config.loss, held.inputs.scale)
+    return float(mean_loss(predicted, labels, factors, held.weights.astype(np.float32)))

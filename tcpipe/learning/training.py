@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
@@ -28,7 +27,17 @@ from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, Tra
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.learning.network_model import read_checkpoint
 from tcpipe.learning.physics_model import find_idle_power
-from tcpipe.learning.predictor import Fitted, Inputs, Job, Predictor, Samples, compute_held_loss, find_kind
+from tcpipe.learning.predictor import (
+    Fitted,
+    Inputs,
+    Job,
+    Labels,
+    Predictor,
+    Samples,
+    compute_held_loss,
+    find_held_out,
+    find_kind,
+)
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
 from tcpipe.terrain.sampling import compute_relief_m
@@ -145,7 +154,7 @@ def train(
         _require_deviations(task, data)
     if no_resume or (disposable and checkpoint.exists() and not _can_continue(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
-    samples = _make_samples(task, rules, data, kind)
+    samples = make_samples(task, rules, data, kind)
     fitted = kind.fit_folds(samples, Job(str(place), key, checkpoint))
     card = _make_card(data, task, samples, fitted, key)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.history)
@@ -207,10 +216,10 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     return Task(train, fitted, held, outputs)
 
 
-def _make_samples(task: Task, rules: FitConfig, data: Dataset, kind: type[Predictor]) -> Samples:
+def make_samples(task: Task, rules: FitConfig, data: Dataset, kind: type[Predictor]) -> Samples:
     """Return what a model of a kind is fitted to; a network of energy alone takes no extra features."""
     used = task.fit if kind.stops_by_fold else task.train
-    extra_features = ()
+    extra_features: tuple[ExtraFeature, ...] = ()
     if kind.features or (kind.features is None and rules.extra_features and len(task.outputs) > 1):
         extra_features = _find_extra_features(used, kind.features, data)
     inputs = Inputs(
@@ -331,7 +340,7 @@ def _make_result(place: Path | str, status: str, training: Training, times: Trai
 
 def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key: str) -> ModelCard:
     card, config, inputs = data.card, samples.config, samples.inputs
-    kind, is_held = type(fitted.predictor), np.isfinite(fitted.held_out).all(axis=1)
+    kind, is_held = type(fitted.predictor), find_held_out(fitted.held_out)
     used, held = task.fit if kind.stops_by_fold else task.train, samples.take(is_held)
     return ModelCard(
         architecture=Architecture(
@@ -374,9 +383,9 @@ def read_class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _make_residuals_table(samples: Samples, held_out: NDArray[np.floating]) -> pa.Table:
+def _make_residuals_table(samples: Samples, held_out: Labels) -> pa.Table:
     """Return labels and predictions of what was held out, one row a sample."""
-    is_held, outputs = np.isfinite(held_out).all(axis=1), samples.inputs.outputs
+    is_held, outputs = find_held_out(held_out), samples.inputs.outputs
     held, said, labels = samples.split.take(is_held), held_out[is_held], samples.labels[is_held]
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class")}
     for number, name in enumerate(("power_watt", "velocity_mps") if len(outputs) > 1 else outputs):
