@@ -32,11 +32,17 @@ def run_train(options: TrainOptions) -> TrainResult:
     from tcpipe.learning.training import train as run
     from tcpipe.recipe.checking import from_values
 
-    given = {of.name: value for of in fields(FitConfig) if (value := getattr(options, of.name)) is not None}
+    names = [of.name for of in fields(FitConfig) if of.name != "predictor"]
+    given = {name: value for name in names if (value := getattr(options, name)) is not None}
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
-    given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
+    if options.predictor is None:
+        given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
     return run(
-        options.dataset, options.out, config=from_values(FitConfig, given, where="train"), no_resume=options.no_resume
+        options.dataset,
+        options.out,
+        config=from_values(FitConfig, given, where="train"),
+        no_resume=options.no_resume,
+        predictor=options.predictor,
     )
 
 
@@ -57,6 +63,7 @@ class Evaluate(Protocol):
         baselines: bool = True,
         retrain_ablation: bool = False,
         seed: int = 0,
+        predictor: str | None = None,
     ) -> EvaluationResult: ...
     @overload
     def __call__(
@@ -68,6 +75,7 @@ class Evaluate(Protocol):
         drives: Sequence[str | Path],
         map_name: str | None = None,
         store: str | Path = "tcpipe-store",
+        predictor: str | None = None,
     ) -> DrivesResult: ...
 
 
@@ -86,7 +94,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
         from tcpipe.planning.drives import evaluate_drives
         from tcpipe.planning.path_files import choose_map
 
-        loaded, data = load_model(model), open_dataset(dataset)
+        loaded, data = load_model(model, options.predictor), open_dataset(dataset)
         check_origin(loaded.card, data, str(model))
         source = choose_map(options.store, options.map_name)
         return evaluate_drives(loaded, data, source, [*map(str, options.drives)], store=options.store, out=out)
@@ -95,7 +103,9 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     from tcpipe.recipe.checking import from_values
 
     asked = {name: getattr(options, name) for name in ("noise_draws", "baselines", "retrain_ablation", "seed")}
-    return run_evaluation(model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"))
+    return run_evaluation(
+        model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"), predictor=options.predictor
+    )
 
 
 evaluate = cast("Evaluate", as_function(EvaluateOptions, run_evaluate))
@@ -112,7 +122,9 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     from tcpipe.planning.path_files import predict_path as run
 
     source = choose_map(options.store, options.map_name)
-    asked = choose_model(options.model, physics=options.physics_from, speed_mps=options.speed_mps)
+    asked = choose_model(
+        options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
+    )
     return run(asked, source, Path(options.path), None if options.out is None else Path(options.out))
 
 
@@ -137,7 +149,9 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
         request = replace(request, cost_map=fetch_directory(options.cost_map))
     source = choose_map(options.store, options.map_name)
     return plan(
-        choose_model(options.model, physics=options.physics_from, speed_mps=options.speed_mps),
+        choose_model(
+            options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
+        ),
         source,
         request,
         out=Path(options.out),

@@ -97,6 +97,7 @@ def evaluate(
     *,
     key: str,
     plant: PlantCosts | None = None,
+    predictor: str | None = None,
 ) -> tuple[Evaluation, pa.Table]:
     """Measure a model on a dataset and return everything that was found, which ``key`` tells from any other evaluation.
 
@@ -109,7 +110,7 @@ def evaluate(
     ------
     ModelError, DatasetError : the model is none or does not fit the dataset, or there is nothing to evaluate on.
     """
-    ours = load_model(model)
+    ours = load_model(model, predictor)
     data = open_dataset(dataset, label=ours.label_energy)
     check_fit(ours.card, data, str(model))
     fitting, fitted = ours.card.training.config, ours.card.training.samples["fitted"]

@@ -26,6 +26,7 @@ from tcpipe.learning.evaluation_figures import EvaluatedSamples, select_evaluate
 from tcpipe.learning.evaluation_page import COLUMNS, format_leakage, list_evaluation_rows, render_evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
+from tcpipe.learning.own_models import load_own_kind
 from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.tables.findings import PREDICTED
@@ -69,6 +70,7 @@ def run_evaluation(
     *,
     config: EvaluateConfig | None = None,
     plant: PlantCosts | None = None,
+    predictor: str | None = None,
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
 
@@ -82,12 +84,13 @@ def run_evaluation(
     ModelError, DatasetError : as `evaluate`.
     """
     rules = config or EvaluateConfig()
-    key = _make_key(model, dataset, rules, simulated=plant is not None)
+    own = [] if predictor is None else [load_own_kind(predictor).digest]
+    key = _make_key(model, dataset, rules, own, simulated=plant is not None)
     if is_url(out):
         if (known := _read_at_url(str(out))) is not None and known.values.key == key:
             return known
         with write_generation(str(out), JSON) as made:
-            result = run_evaluation(model, dataset, made, config=config, plant=plant)
+            result = run_evaluation(model, dataset, made, config=config, plant=plant, predictor=predictor)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)
     clear(place)
@@ -97,8 +100,8 @@ def run_evaluation(
     ):
         raise UsageError(f"{place}: exists and is no evaluation; it is not changed; give another OUT")
     if not ((place / JSON).is_file() and (place / SAMPLES).is_file()) or read_json(place / JSON).get("key") != key:
-        found, table = evaluate(model, dataset, place, rules, key=key, plant=plant)
-        if _make_key(model, dataset, rules, simulated=plant is not None) != key:
+        found, table = evaluate(model, dataset, place, rules, key=key, plant=plant, predictor=predictor)
+        if _make_key(model, dataset, rules, own, simulated=plant is not None) != key:
             raise StoreError(
                 f"{dataset} or {model}: another call has replaced it in the meantime; run the command again"
             )
@@ -136,7 +139,9 @@ def _read_at_url(url: str) -> EvaluationResult | None:
     return EvaluationResult(found.place.where(), parse_typed(parse_json(found.data, where), Evaluation, where))
 
 
-def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
+def _make_key(
+    model: str | Path, dataset: str | Path, config: EvaluateConfig, own: list[str], *, simulated: bool
+) -> str:
     """Return what tells one evaluation from another."""
     told = [
         seal_document(read_model_card(fetch_directory(model))),
@@ -144,5 +149,6 @@ def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *,
         asdict(config),
         simulated,
         __version__,
+        *own,
     ]
     return digest(told)

@@ -16,8 +16,8 @@ from tcpipe.tables.bounds import Bounds
 
 Floats = NDArray[np.float32]
 
-ModelKind = Literal["resnet18", "boosting", "physics"]
-"""The paper's network on patches, boosted trees on features of them, or coefficients of physics."""
+ModelKind = Literal["resnet18", "boosting", "physics", "own"]
+"""The paper's network on patches, boosted trees on features of them, coefficients of physics, or the user's own code."""
 
 Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 """What every generator of random numbers takes."""
@@ -52,6 +52,8 @@ class FitConfig:
     """Energy to train on: total, or net of idle power (less the idle power)."""
     extra_features: bool = False
     """Whether turn and commanded speed of each segment are inputs, too."""
+    predictor: str = ""
+    """Digest of the user's own code."""
 
 
 @dataclass(frozen=True, slots=True)

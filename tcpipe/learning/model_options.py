@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.options import MAP, MODEL, SEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import MAP, MODEL, PREDICTOR, SEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.dataset.energies import EnergyName
@@ -32,6 +32,7 @@ class TrainOptions:
             kind=("resnet18", "boosting", "physics"),
         ),
     )  # fmt: skip
+    predictor: str | None = option(None, PREDICTOR)
     loss: Loss = option(
         "nrmse",
         Option(
@@ -106,6 +107,7 @@ class EvaluateOptions:
         ),
     )  # fmt: skip
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
+    predictor: str | None = option(None, PREDICTOR)
     drives: Sequence[str | Path] = option(
         (),
         Option(

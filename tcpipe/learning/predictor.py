@@ -136,7 +136,7 @@ class Fitted:
 class Predictor(Protocol):
     """A kind of model. Everything but ``predict`` has a default."""
 
-    about: ClassVar[str] = ""
+    about: ClassVar[str] = "code that is given with --predictor"
     """One sentence, for MODEL.md."""
     optimizer: ClassVar[str] = ""
     channels: ClassVar[tuple[str, ...]] = ()
@@ -151,8 +151,9 @@ class Predictor(Protocol):
 
     @classmethod
     def fit(cls, samples: Samples) -> Predictor:
-        """Return the model fitted to samples."""
-        raise NotImplementedError
+        """Return the model fitted to samples; by default it is as it is, and learns nothing."""
+        del samples
+        return cls()
 
     @classmethod
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
@@ -175,6 +176,7 @@ KINDS: Mapping[ModelKind, str] = {
     "physics": "tcpipe.learning.physics_model:PhysicsModel",
     "boosting": "tcpipe.learning.table_model:BoostingModel",
     "resnet18": "tcpipe.learning.network_model:NetworkModel",
+    "own": "tcpipe.learning.predictor:Predictor",
 }
 """Class of each kind, simplest first; a class is imported when it is needed."""
 

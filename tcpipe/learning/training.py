@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from tcpipe.learning.fitting import FitConfig, ModelKind, Task, TrainingTimes, c
 from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, format_readme, is_current
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.learning.network_model import read_checkpoint
+from tcpipe.learning.own_models import load_own_kind, report_errors
 from tcpipe.learning.physics_model import find_idle_power
 from tcpipe.learning.predictor import (
     Fitted,
@@ -113,6 +115,7 @@ def train(
     variant: Variant | None = None,
     no_resume: bool = False,
     disposable: bool = False,
+    predictor: str | None = None,
 ) -> TrainResult:
     """Train a model on a dataset and write the model folder ``out``, whole or not at all.
 
@@ -124,6 +127,7 @@ def train(
     config : the options.
     variant : what another network than the paper's is trained on.
     no_resume : ignore an earlier state.
+    predictor : code of the user, ``FILE.py[:NAME]`` or an entry point, that is fitted instead of a shipped kind.
     disposable : replace a state that is damaged or of another training, with a warning; otherwise such a state is an error.
 
     Raises
@@ -131,12 +135,15 @@ def train(
     DatasetError, ModelError, UsageError : the dataset has no samples or no weights, or ``out`` or the state is of something else.
     """
     rules, other = config or FitConfig(), variant or Variant()
+    own = None if predictor is None else load_own_kind(predictor)
+    rules = rules if own is None else replace(rules, model="own", predictor=own.digest)
     data = open_dataset(dataset, label=rules.label)
-    kind = find_kind(rules.model)
+    kind = find_kind(rules.model) if own is None else own.kind
     other = replace(other, channels=kind.channels or other.channels)
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
-        return _train_into_bucket(dataset, str(out).rstrip("/"), key, rules, other)
+        again = partial(train, dataset, config=rules, variant=other, predictor=predictor)
+        return _train_into_bucket(str(out).rstrip("/"), key, again)
     place = Path(out)
     clear_beside(place)
     checkpoint = _find_checkpoint_path(place)
@@ -144,7 +151,7 @@ def train(
         (known := _read_known_card(place)) is not None
         and known.training.key == key
         and not no_resume
-        and _is_whole(place)
+        and _is_whole(place, predictor)
     ):
         _remove_finished_state(checkpoint, key)
         return _make_result(place, "unchanged", known.training, TrainingTimes())
@@ -155,24 +162,28 @@ def train(
     if no_resume or (disposable and checkpoint.exists() and not _can_continue(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
     samples = make_samples(task, rules, data, kind)
-    fitted = kind.fit_folds(samples, Job(str(place), key, checkpoint))
-    card = _make_card(data, task, samples, fitted, key)
+    with report_errors(own):
+        fitted = kind.fit_folds(samples, Job(str(place), key, checkpoint))
+        weights = {name: np.asarray(array) for name, array in kind.to_arrays(fitted.predictor).items()}
+    if own is not None and (missing := int((~find_held_out(fitted.held_out)).sum())):
+        raise ModelError(f"--predictor {predictor}: no finite prediction of {missing} of {len(samples)} samples")
+    card = _make_card(data, samples, fitted, key)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.history)
     write_model(
-        place, card=card, weights=fitted.predictor.to_arrays(), residuals=_make_residuals_table(samples, fitted.held_out),
+        place, card=card, weights=weights, residuals=_make_residuals_table(samples, fitted.held_out),
         history="epoch,loss,held_out_loss\n" + history, readme=format_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
     return _make_result(place, "done", card.training, fitted.training_times_s)
 
 
-def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig, other: Variant) -> TrainResult:
+def _train_into_bucket(url: str, key: str, run: Callable[[Path], TrainResult]) -> TrainResult:
     """Train on this machine, and put the model to a URL."""
     known = read_model_card(fetch_directory(url)) if has_card(url) else None
     if known is not None and known.training.key == key:
         return _make_result(url, "unchanged", known.training, TrainingTimes())
     with write_generation(url, CARD) as place:
-        result = train(dataset, place, config=rules, variant=other)
+        result = run(place)
     return replace(result, path=url)
 
 
@@ -313,9 +324,9 @@ def _remove_finished_state(checkpoint: Path, key: str) -> None:
         checkpoint.unlink()
 
 
-def _is_whole(place: Path) -> bool:
+def _is_whole(place: Path, predictor: str | None) -> bool:
     try:
-        load_model(place)
+        load_model(place, predictor)
     except ModelError:
         return False
     return True
@@ -338,16 +349,16 @@ def _make_result(place: Path | str, status: str, training: Training, times: Trai
     )  # fmt: skip
 
 
-def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key: str) -> ModelCard:
+def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str) -> ModelCard:
     card, config, inputs = data.card, samples.config, samples.inputs
-    kind, is_held = type(fitted.predictor), find_held_out(fitted.held_out)
-    used, held = task.fit if kind.stops_by_fold else task.train, samples.take(is_held)
+    is_held = find_held_out(fitted.held_out)
+    used, held = samples.split if is_held.all() else samples.split.take(~is_held), samples.take(is_held)
     return ModelCard(
         architecture=Architecture(
             inputs.patch_px,
             inputs.depth,
             len(inputs.outputs),
-            config.width if kind.stops_by_fold else 0,
+            0 if is_held.all() else config.width,
             len(inputs.extra_features),
         ),
         channels=inputs.channels,
@@ -368,7 +379,7 @@ def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key:
         training=Training(
             key=key,
             config=config,
-            optimizer=kind.optimizer,
+            optimizer=getattr(fitted.predictor, "optimizer", ""),
             samples={"fitted": len(used), "held out": len(held)},
             epochs=fitted.epochs,
             best_epoch=fitted.best_epoch,

@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.options import CLUSTER, MAP, MODEL, PHYSICS, SPEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import CLUSTER, MAP, MODEL, PHYSICS, PREDICTOR, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.planning.plan import Objective
@@ -26,6 +26,7 @@ class PredictPathOptions:
     )
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     store: str | Path = option("tcpipe-store", STORE)
 
 
@@ -70,6 +71,7 @@ class PlanPathOptions:
     )  # fmt: skip
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     store: str | Path = option("tcpipe-store", STORE)
     on_step: Callable[[int, int], None] | None = None
     """Called with how many blocks of how many are done, in each round of the search."""
@@ -95,6 +97,7 @@ class CostMapOptions:
         ),
     )
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     store: str = option("tcpipe-store", STORE)
     cluster: str | None = option(
         None, replace(CLUSTER, about="Dask scheduler whose workers compute it, tcp://host:port (or TCPIPE_CLUSTER).")
