@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
+from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import compute_loss_factors, mean_loss
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, collect_labels
 
@@ -202,7 +203,15 @@ def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
     out = np.empty((len(samples), len(samples.inputs.outputs)))
     for first in range(0, len(samples), _TOGETHER):
         rows = np.arange(first, min(first + _TOGETHER, len(samples)))
-        out[rows] = predictor.predict(samples.split.batch(rows)[0], samples.features.take(rows))
+        out[rows] = ask(predictor, samples.split.batch(rows)[0], samples.features.take(rows), samples.inputs.outputs)
+    return out
+
+
+def ask(predictor: Predictor, patches: Patches, features: ExtraFeatures, outputs: Sequence[str]) -> Labels:
+    """Return predictions of patches, shape (N, outputs); `ModelError` where a model gives something else."""
+    out = np.asarray(predictor.predict(patches, features))
+    if out.shape != (len(patches), len(outputs)):
+        raise ModelError(f"predict returned shape {out.shape}, expected {len(patches)} rows of {', '.join(outputs)}")
     return out
 
 
