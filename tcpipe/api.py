@@ -28,7 +28,6 @@ def run_train(options: TrainOptions) -> TrainResult:
     else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the interrupted training is another one.
     """
     from tcpipe.learning.fitting import FitConfig
-    from tcpipe.learning.training import choose_model_kind
     from tcpipe.learning.training import train as run
     from tcpipe.recipe.checking import from_values
 
@@ -36,7 +35,7 @@ def run_train(options: TrainOptions) -> TrainResult:
     given = {name: value for name in names if (value := getattr(options, name)) is not None}
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
     if options.predictor is None:
-        given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
+        given["model"] = options.model or ("resnet18" if is_network else "auto")
     return run(
         options.dataset,
         options.out,

@@ -65,7 +65,7 @@ def compare_baselines(
     The baselines are fitted on the training samples of ``data`` and evaluated on ``sets``, the same samples as the predictions ``said`` of
     the model. ``seed`` is that of the bootstrap.
     """
-    own = BASELINE_OF_KIND.get(ours.card.training.config.model)
+    own = BASELINE_OF_KIND.get(ours.card.training.kind)
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
@@ -86,7 +86,7 @@ def compare_baselines(
 def _select_fitted_samples(train: Split, ours: Model) -> Split:
     """Return the samples that a model of this kind is fitted on: for a network without the fold that stops it."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
-    if not find_kind(ours.card.training.config.model).stops_by_fold:
+    if not find_kind(ours.card.training.kind).stops_by_fold:
         return labelled
     fitted, _ = labelled.fold(ours.card.training.config.fold)
     return fitted if len(fitted) else labelled

@@ -113,7 +113,8 @@ def evaluate(
     ours = load_model(model, predictor)
     data = open_dataset(dataset, label=ours.label_energy)
     check_fit(ours.card, data, str(model))
-    fitting, fitted = ours.card.training.config, ours.card.training.samples["fitted"]
+    training = ours.card.training
+    fitting, fitted = replace(training.config, model=training.kind), training.samples["fitted"]
     names = {entry.id: entry.name for entry in ours.classes.classes}
     sets = {name: found for name in SPLITS if len((found := collect_measured(data[name], names)).split)}
     if not sets:
@@ -131,12 +132,17 @@ def evaluate(
         longer = np.ceil(fitted / fitting.batch_size) / np.ceil(
             few / fitting.batch_size
         )  # as many steps, not as many epochs
-        rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
+        rules = replace(
+            fitting,
+            model=ours.card.training.kind,
+            epochs=round(longer * fitting.epochs),
+            patience=round(longer * fitting.patience),
+        )
         train(dataset, place, config=rules, variant=variant, disposable=True)
         return load_model(place)
 
     ablation = list(_iterate_ablation(ours, sets, config, trained))
-    with_networks = config.baselines and find_kind(fitting.model).stops_by_fold
+    with_networks = config.baselines and find_kind(ours.card.training.kind).stops_by_fold
     energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(
@@ -356,7 +362,7 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
         if quantity == "E" and not of.beats_all:
             best, ratio = of.best.baseline, of.best.rmse_ratio.value or 0.0
             kind = {TREES: "boosting", PHYSICS: "physics", **dict.fromkeys(CURVES.values(), "boosting")}[best]
-            is_other = of.is_worse and kind != found.model.training.config.model
+            is_other = of.is_worse and kind != found.model.training.kind
             remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
             names = {"baseline": best}
             yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)

@@ -199,7 +199,7 @@ def _describe_error_samples(found: Evaluation) -> str:
     """Return which samples the stated errors of the model rest on, in words."""
     training = found.model.training
     count = training.samples["held out"]
-    if find_kind(training.config.model).stops_by_fold:
+    if find_kind(training.kind).stops_by_fold:
         return (
             f"Intervals, NLL and CRPS rest on its errors on the fold of train used for early stopping ({count} samples), and are slightly "
             "too small: no second network was trained for them. "

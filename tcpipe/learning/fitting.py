@@ -16,8 +16,8 @@ from tcpipe.tables.bounds import Bounds
 
 Floats = NDArray[np.float32]
 
-ModelKind = Literal["resnet18", "boosting", "physics", "own"]
-"""The paper's network on patches, boosted trees on features of them, coefficients of physics, or the user's own code."""
+ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "resnet18", "own"]
+"""Curves of class and slope, physics, boosted trees on features of patches, the paper's network, or the user's own code."""
 
 Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 """What every generator of random numbers takes."""
@@ -30,7 +30,8 @@ class FitConfig:
     A table and physics use only loss, weights, label and beside.
     """
 
-    model: ModelKind = "resnet18"
+    model: ModelKind | Literal["auto"] = "resnet18"
+    """``auto``: chosen by cross-validation over runs ."""
     loss: Loss = "nrmse"
     epochs: Annotated[int, Bounds(ge=1, le=100_000)] = 100
     """At most."""

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tcpipe.tables.options import MAP, MODEL, PREDICTOR, SEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.dataset.energies import EnergyName
     from tcpipe.learning.architecture import Loss
-    from tcpipe.learning.fitting import ModelKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +22,12 @@ class TrainOptions:
     out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
     """The same dataset and options are not trained again."""
     _: KW_ONLY
-    model: ModelKind | None = option(
+    model: Literal["auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"] | None = option(
         None,
         Option(
-            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and use only --loss, "
-            "--inverse-variance-weights, --label and --extra-features (default: boosting below 20000 samples, "
-            "otherwise, or with an option of the network, resnet18).",
-            kind=("resnet18", "boosting", "physics"),
+            "Curves of class and slope, physics, boosted trees on features of patches, or the paper's network. auto: the simplest that "
+            "predicts other runs as well as the best (default; with an option of the network, resnet18).",
+            kind=("auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"),
         ),
     )  # fmt: skip
     predictor: str | None = option(None, PREDICTOR)

@@ -74,7 +74,7 @@ class Model:
     def predictor(self) -> Predictor:
         """Return what predicts: a model of the card's kind, from its arrays; torch is imported for a network."""
         path = self.place / WEIGHTS
-        kind = find_kind(self.card.training.config.model) if self.own is None else self.own.kind
+        kind = find_kind(self.card.training.kind) if self.own is None else self.own.kind
         try:
             with report_errors(self.own):
                 return kind.from_arrays(read_arrays(path), self.card.inputs)
@@ -214,7 +214,7 @@ def _add_code(model: Model, predictor: str | None) -> Model:
     """Return the model with the user's code, without which it cannot predict."""
     config = model.card.training.config
     if not config.predictor:
-        raise UsageError(f"{model.name}: a model of kind {config.model} needs no code; remove --predictor")
+        raise UsageError(f"{model.name}: a model of kind {model.card.training.kind} needs no code; remove --predictor")
     if predictor is None:
         raise UsageError(
             f"{model.name}: was trained with code of your own, which no folder has: give it with --predictor FILE.py"
@@ -299,6 +299,7 @@ def _bring_card(found: Mapping[str, Json]) -> dict[str, Json]:
     card = rename_keys(found, EARLIER_MODEL_KEYS)
     config = card["training"]["config"]
     config |= {name: EARLIER_CHOICES.get(config[name], config[name]) for name in ("model", "label")}
+    card["training"]["kind"] = config["model"]
     energy = EARLIER_CHOICES.get(card["label_energy"], card["label_energy"])
     return {**card, "schema_version": SCHEMA_VERSION, "label_energy": energy}
 

@@ -174,12 +174,19 @@ class Predictor(Protocol):
 
 
 KINDS: Mapping[ModelKind, str] = {
+    "mean": "tcpipe.learning.physics_model:MeanModel",
+    "linear": "tcpipe.learning.physics_model:CurveModel",
+    "spline": "tcpipe.learning.physics_model:SplineModel",
     "physics": "tcpipe.learning.physics_model:PhysicsModel",
     "boosting": "tcpipe.learning.table_model:BoostingModel",
     "resnet18": "tcpipe.learning.network_model:NetworkModel",
     "own": "tcpipe.learning.predictor:Predictor",
 }
 """Class of each kind, simplest first; a class is imported when it is needed."""
+
+
+AUTOMATIC: tuple[ModelKind, ...] = ("mean", "linear", "spline", "physics", "boosting")
+"""Kinds of which one is chosen where none is asked for, simplest first."""
 
 
 def find_kind(name: ModelKind) -> type[Predictor]:
@@ -190,12 +197,18 @@ def find_kind(name: ModelKind) -> type[Predictor]:
 
 def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
     """Fit a model to all samples and, for predictions of each, to the other folds."""
-    began, held_out = time.perf_counter(), np.empty_like(samples.labels)
-    for fold in np.unique(samples.folds):
-        held = samples.folds == fold
-        held_out[held] = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+    began, held_out = time.perf_counter(), cross_predict(kind, samples, samples.folds)
     whole = kind.fit(samples)
     return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, 0.0, len(samples)))
+
+
+def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Floats:
+    """Return predictions of each part of the samples by a model of the others, shape (N, outputs)."""
+    out = np.empty_like(samples.labels)
+    for part in np.unique(parts):
+        held = parts == part
+        out[held] = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+    return out
 
 
 def predict_samples(predictor: Predictor, samples: Samples) -> Floats:

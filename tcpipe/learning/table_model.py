@@ -352,7 +352,12 @@ class BoostingModel(Predictor):
         return cls(TableModel(curves, read_forest(rest), inputs.channels, inputs.class_count), inputs)
 
     @classmethod
-    def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
+    def fit(cls, samples: Samples) -> Predictor:
+        """Fit curves and trees."""
+        return cls.fit_folds(samples).predictor
+
+    @classmethod
+    def fit_folds(cls, samples: Samples, job: Job | None = None) -> Fitted:
         """Fit curves and trees, as many trees as are best where each fold is predicted by the others."""
         del job
         began, inputs = time.perf_counter(), samples.inputs
