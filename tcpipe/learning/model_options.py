@@ -22,12 +22,12 @@ class TrainOptions:
     out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
     """The same dataset and options are not trained again."""
     _: KW_ONLY
-    model: Literal["auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"] | None = option(
+    model: Literal["auto", "mean", "linear", "spline", "physics", "boosting", "residual", "resnet18"] | None = option(
         None,
         Option(
-            "Curves of class and slope, physics, boosted trees on features of patches, or the paper's network. auto: the simplest that "
-            "predicts other runs as well as the best (default; with an option of the network, resnet18).",
-            kind=("auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"),
+            "Curves of class and slope, physics, a curve and boosted trees or a small network on what it leaves, or the paper's network. "
+            "auto: the simplest that predicts other runs as well as the best (default; with an option of the network, resnet18).",
+            kind=("auto", "mean", "linear", "spline", "physics", "boosting", "residual", "resnet18"),
         ),
     )  # fmt: skip
     predictor: str | None = option(None, PREDICTOR)

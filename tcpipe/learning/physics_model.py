@@ -280,6 +280,18 @@ def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], label
     return Curves(form, knots, pooled, classes, own)
 
 
+def cross_fit_curves(
+    slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats, folds: NDArray[np.generic]
+) -> Floats:
+    """Return the predictions of linear curves of the other folds, shape (N, outputs)."""
+    out = np.empty_like(labels)
+    for fold in np.unique(folds):
+        held = folds == fold
+        others = fit_curves("linear", slope_rad[~held], class_id[~held], labels[~held])
+        out[held] = others.predict(slope_rad[held], class_id[held])
+    return out
+
+
 def _evaluate_functions(form: Form, knots_rad: Floats, slope_rad: Floats) -> Floats:
     """Return the functions of a form at these slopes, shape (N, J); all of order one, so that none is lost beside another."""
     one = np.ones_like(slope_rad)

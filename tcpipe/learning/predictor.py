@@ -179,6 +179,7 @@ KINDS: Mapping[ModelKind, str] = {
     "spline": "tcpipe.learning.physics_model:SplineModel",
     "physics": "tcpipe.learning.physics_model:PhysicsModel",
     "boosting": "tcpipe.learning.table_model:BoostingModel",
+    "residual": "tcpipe.learning.residual_model:ResidualModel",
     "resnet18": "tcpipe.learning.network_model:NetworkModel",
     "own": "tcpipe.learning.predictor:Predictor",
 }

@@ -31,7 +31,7 @@ from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
 from tcpipe.learning.fitting import TrainingTimes
-from tcpipe.learning.physics_model import Curves, fit_curves, list_curve_arrays, read_curves
+from tcpipe.learning.physics_model import Curves, cross_fit_curves, fit_curves, list_curve_arrays, read_curves
 from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Predictor, Samples
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
 
@@ -308,11 +308,7 @@ def fit_table(
     ModelError : LightGBM is not installed, or cannot be loaded.
     """
     slope_rad, class_id = find_slope_and_class(features, channels, class_count)
-    told = np.empty_like(labels)
-    for fold in np.unique(folds):
-        held = folds == fold
-        others = fit_curves("linear", slope_rad[~held], class_id[~held], labels[~held])
-        told[held] = others.predict(slope_rad[held], class_id[held])
+    told = cross_fit_curves(slope_rad, class_id, labels, folds)
     forest, held_out = grow(features, labels - told, weights, folds)
     curves = fit_curves("linear", slope_rad, class_id, labels)
     return TableModel(curves, forest, tuple(channels), class_count), told + held_out
