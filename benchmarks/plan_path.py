@@ -11,12 +11,15 @@ alone (steps with turns), and that of the plans of least time and distance, whic
 
 from __future__ import annotations
 
-import multiprocessing as mp
+import multiprocessing
 import resource
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,7 +140,8 @@ def measure(kind: str, cells: int, pairs: int) -> tuple[list[float], float, floa
     """Return the least costs, and CPU seconds and peak memory [MB] of the last, without the site."""
     survey, class_id = make_site(cells)
     run = {"explicit": search_explicitly, "implicit": search}[kind]
-    run(*make_site(20), [21, 350])  # compiles
+    small = make_site(60)
+    run(*small, choose_ends(small[1], 0))  # compiles
     before, costs, begun = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, [], 0.0
     for pair in range(pairs):
         begun = time.process_time()
@@ -160,15 +164,17 @@ def plan(cells: int, pairs: int) -> tuple[list[dict[str, float]], float, float]:
     return judged, spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
+def run_alone(function: Callable[..., Any], *arguments: object) -> Any:
+    """Return what a function returns, in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
 def main() -> None:
     cells = int(sys.argv[1]) if len(sys.argv) > 1 else 300
     pairs = int(sys.argv[2]) if len(sys.argv) > 2 else 3
-    found = {}
-    for kind in ("explicit", "implicit"):
-        with mp.get_context("spawn").Pool(1) as pool:
-            found[kind] = pool.apply(measure, (kind, cells, pairs))
-    with mp.get_context("spawn").Pool(1) as pool:
-        judged, plan_s, plan_mb = pool.apply(plan, (cells, pairs))
+    found = {kind: run_alone(measure, kind, cells, pairs) for kind in ("explicit", "implicit")}
+    judged, plan_s, plan_mb = run_alone(plan, cells, pairs)
     (costs, spent, peak), (theirs, their_s, their_mb) = found["implicit"], found["explicit"]
     off = max(0.0 if a == b else abs(a / b - 1.0) for a, b in zip(costs, theirs, strict=True))
     print(f"{cells} x {cells} cells, {pairs} pairs")
