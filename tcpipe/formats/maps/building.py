@@ -150,7 +150,7 @@ def build_map(
             facts = _make_facts(grid, every, sides_m, origin, inputs or MapInputs())
             facts = replace(facts, origins=tuple(origins))
             ranges = {role: _set_range(source) for role, source in layers.items()}
-            writer.finish(facts, ranges, {role: of.describe() for role, of in banded.items()})
+            writer.finish(facts, ranges | {role: of.describe() for role, of in banded.items()})
             write_checksums(half)
     return facts
 

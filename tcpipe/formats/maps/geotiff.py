@@ -231,6 +231,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
             unit = (dataset.units[bands[0] - 1] or "").strip() if use == "numbers" else ""
             palette = use == "classes" and dataset.colorinterp[bands[0] - 1] == ColorInterp.palette
             colours = ", ".join(dataset.colorinterp[band - 1].name for band in bands)
+            many = f"{len(bands)} x " if len(bands) > 1 else ""
             return Tile(
                 path=path,
                 role=role,
@@ -239,7 +240,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
                 affine=tuple(dataset.transform)[:6],
                 rows=dataset.height,
                 cols=dataset.width,
-                kind=f"{len(bands)} x {dataset.dtypes[bands[0] - 1]} ({_shorten(colours)}{', ' if unit else ''}{unit})",
+                kind=f"{many}{dataset.dtypes[bands[0] - 1]} ({_shorten(colours)}{', ' if unit else ''}{unit})",
                 findings=(*unusual, *ignored),
                 names=read_value_names(_describe_as_vrt(dataset), bands[0]) if use == "classes" else {},
                 source=source,

@@ -364,8 +364,8 @@ class MapWriter:
         array, (rows, cols) = self._banded[layer][0], values.shape
         array[band, row0 : row0 + rows, col0 : col0 + cols] = values.astype(array.dtype)
 
-    def finish(self, facts: MapFacts, layers: Mapping[str, Layer], banded: Mapping[str, Layer]) -> None:
-        """Write coordinates and attributes; ``layers`` and ``banded`` are those of before, with the ranges that were found."""
+    def finish(self, facts: MapFacts, layers: Mapping[str, Layer]) -> None:
+        """Write coordinates and attributes; ``layers`` are all those of before, with the range that was found."""
         reference_m = self.height_reference_m or 0.0
         for factor, arrays in self._levels.items():
             arrays["height"].attrs.update({"add_offset": reference_m})
@@ -376,13 +376,13 @@ class MapWriter:
                 f"{self._name}, {factor} x coarser" if factor > 1 else self._name,
             )
         kept = _Attributes(
-            version=MAP_VERSION if banded else PAPER_VERSION if set(layers) <= set(LAYERS) else OWN_VERSION,
+            version=MAP_VERSION if self._banded else PAPER_VERSION if set(layers) <= set(LAYERS) else OWN_VERSION,
             name=self._name,
             grid=self._grid,
             class_table=self._scheme.table.classes,
             id_by_value=self._scheme.id_by_value,
-            layers=tuple(layers),
-            described=_describe_layers({**layers, **banded}),
+            layers=tuple(name for name in layers if name not in self._banded),
+            described=_describe_layers(layers),
             band_grids={name: grid for name, (_, grid) in self._banded.items()},
             factors=self._factors,
             tile_px=TILE_PX,
