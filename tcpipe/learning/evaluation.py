@@ -61,6 +61,7 @@ from tcpipe.learning.predictions import (
     predict_costs,
     predict_spreads,
 )
+from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import Variant, compute_dataset_checksum, make_training_task, train
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
@@ -134,7 +135,7 @@ def evaluate(
         return load_model(place)
 
     ablation = list(_iterate_ablation(ours, sets, config, trained))
-    with_networks = config.baselines and fitting.model == "resnet18"
+    with_networks = config.baselines and find_kind(fitting.model).stops_by_fold
     energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(

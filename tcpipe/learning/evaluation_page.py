@@ -14,6 +14,7 @@ from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, draw_paper_figures, make_page_data, sample_sections
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
+from tcpipe.learning.predictor import find_kind
 from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.tables.findings import PREDICTED, judge_again
 
@@ -198,7 +199,7 @@ def _describe_error_samples(found: Evaluation) -> str:
     """Return which samples the stated errors of the model rest on, in words."""
     training = found.model.training
     count = training.samples["held out"]
-    if training.config.model == "resnet18":
+    if find_kind(training.config.model).stops_by_fold:
         return (
             f"Intervals, NLL and CRPS rest on its errors on the fold of train used for early stopping ({count} samples), and are slightly "
             "too small: no second network was trained for them. "
