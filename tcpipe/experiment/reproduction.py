@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from tcpipe.experiment.simulation_floor import (
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
-from tcpipe.learning.evaluation_files import read_evaluated_samples, run_evaluation
+from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -52,17 +53,31 @@ class Experiment:
     scenario: str
     fitting: FitConfig
     evaluating: EvaluateConfig
+    warning: str = ""
 
 
 FULL = Experiment("paper", FitConfig(epochs=40, patience=8), EvaluateConfig(noise_draws=5))
-"""The paper's size: fits 90 minutes on two cores."""
+"""The paper's size: fits two hours on two cores, a training."""
+
+SMALL = Experiment(
+    "paper_quick",
+    FitConfig(epochs=40, patience=8, batch_size=32, learning_rate=1e-3, width=16),
+    EvaluateConfig(noise_draws=2),
+    "This is the small site, with a narrow network: three short drives, some 300 training samples. Its figures are not the paper's size.",
+)
+"""Some minutes a training: enough of them for the claims, on few samples."""
 
 QUICK = Experiment(
     "paper_quick",
-    FitConfig(epochs=4, patience=4, batch_size=32, learning_rate=1e-3, width=16),
-    EvaluateConfig(noise_draws=2),
+    replace(SMALL.fitting, epochs=4, patience=4),
+    SMALL.evaluating,
+    "This is a quick run: the small site, a narrow network, few epochs. It only shows that all steps run: do not use its numbers.",
 )
 """Two minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
+
+Size = Literal["full", "small", "quick"]
+
+SIZES: Mapping[Size, Experiment] = {"full": FULL, "small": SMALL, "quick": QUICK}
 
 RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="sample"))
 """The defaults with the paper's random test samples."""
@@ -130,7 +145,7 @@ class Reproduction:
 def reproduce(
     directory: str | Path,
     *,
-    quick: bool = False,
+    size: Size = "full",
     seeds: int = 1,
     jobs: int = 1,
     hidden_variance: float = 1.0,
@@ -141,8 +156,8 @@ def reproduce(
     Parameters
     ----------
     directory : where everything goes: new, empty, or an earlier reproduction of the same size, which is gone on from.
-    quick : a small one, to see it run.
-    seeds : trainings; figures are compared by their means.
+    size : the paper's; the small site, for claims over many trainings; or the same with few epochs, to see it run.
+    seeds : trainings; claims are decided by five or more.
     jobs : logs read side by side.
     hidden_variance : variance of the resistance that nothing shows, over that of the frozen site.
     baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
@@ -151,7 +166,7 @@ def reproduce(
     ------
     UsageError : ``directory`` holds something else.
     """
-    place, plan = Path(directory), QUICK if quick else FULL
+    place, plan = Path(directory), SIZES[size]
     plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))
     clear(place)
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
@@ -224,12 +239,9 @@ def _write(result: Reproduction, plan: Experiment, hidden_variance: float) -> No
         result.directory / PAGE,
         render_reproduction_page(
             result.runs,
-            read_evaluated_samples(result.directory / "seed-0" / "evaluation", result.directory / "dataset"),
             result.claims,
-            splits=result.counts.splits,
-            terrain=result.counts.terrain,
             shares=result.variance_shares,
             hidden_variance=hidden_variance,
-            quick=plan.scenario == QUICK.scenario,
+            warnings=[plan.warning] if plan.warning else [],
         ),
     )

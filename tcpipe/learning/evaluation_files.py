@@ -1,9 +1,7 @@
-"""The files of an evaluation: ``evaluation.json``, ``.csv`` and ``.html``, ``predictions.parquet``, and the networks that it trained."""
+"""The files of an evaluation: ``evaluation.json`` and ``.html``, ``predictions.parquet``, and the networks that it trained."""
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, select_evaluated_samples
-from tcpipe.learning.evaluation_page import COLUMNS, format_leakage, list_evaluation_rows, render_evaluation_page
+from tcpipe.learning.evaluation_page import format_leakage, render_evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.training import compute_dataset_checksum
@@ -32,7 +30,7 @@ from tcpipe.tables.findings import PREDICTED
 
 SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
 
-JSON, CSV, PAGE, SAMPLES = "evaluation.json", "evaluation.csv", "evaluation.html", "predictions.parquet"
+JSON, PAGE, SAMPLES = "evaluation.json", "evaluation.html", "predictions.parquet"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +49,9 @@ class EvaluationResult:
                 for quantity, of in ((quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES)
             )
             lines.append(f"{split}: {part.samples} samples, MAPE (of so many labels) {', '.join(figures)}")
-            energy = part.errors["E"][ALL]
-            if energy.coverage_percent is not None:
-                lines.append(
-                    f"{split}: 90 % intervals cover {energy.coverage_percent:.1f} % of E, CRPS {energy.crps:.2f} J"
-                )
+            lines += [
+                f"{split}: 90 % intervals of {name} cover {of}" for name, of in part.coverage.items() if name in "TE"
+            ]
             lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
@@ -72,8 +68,8 @@ def run_evaluation(
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
 
-    It may be a URL in a bucket, where it becomes the newest generation. Where the same evaluation is already, only its table and page
-    are written again; at a URL nothing is.
+    It may be a URL in a bucket, where it becomes the newest generation. Where the same evaluation is already, only its page
+    is written again; at a URL nothing is.
 
     Raises
     ------
@@ -91,7 +87,7 @@ def run_evaluation(
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)
     clear(place)
-    ours = {JSON, CSV, PAGE, SAMPLES, NETWORKS, "drives.json", "drives.html"}
+    ours = {JSON, PAGE, SAMPLES, NETWORKS, "drives.json", "drives.html"}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
@@ -108,10 +104,6 @@ def run_evaluation(
     name = values.dataset.name
     of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
     lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, compared with the paper."
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerows([COLUMNS, *list_evaluation_rows(values)])
-    write_text(place / CSV, table.getvalue())
     samples = read_evaluated_samples(place, dataset)
     write_text(
         place / PAGE,

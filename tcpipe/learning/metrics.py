@@ -13,14 +13,16 @@ taken as normal with its standard deviation s, z = (label - m) / s, by ::
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, stdtrit
+from scipy.special import betaincinv, ndtr, stdtrit
 
+from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.tables.facts import ABSENT
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Array = NDArray[np.float64]
 
@@ -190,18 +192,69 @@ def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dic
     return {"w": w, "v": v, "T": chord_m / v, "E": w * chord_m / v}
 
 
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Share of labels inside their 90 % intervals, with its own 95 % interval; None of a single run."""
+
+    fraction: float
+    low: float | None
+    high: float | None
+    runs: int
+    samples: int
+
+    def __str__(self) -> str:
+        """Return the share in percent with its interval."""
+        if self.low is None or self.high is None:
+            return f"{100.0 * self.fraction:.1f} % (one run: no interval)"
+        return f"{100.0 * self.fraction:.1f} % (95 % CI {100.0 * self.low:.1f} to {100.0 * self.high:.1f}, {self.runs} runs)"
+
+
+def measure_coverage(is_inside: NDArray[np.bool_], runs: NDArray[np.generic]) -> Coverage:
+    """Return the share of samples that are inside, and its binomial interval, clustered by run.
+
+    Samples of one run err alike, so that they count as fewer: as many as have the variance that the runs show, less for the few degrees of
+    freedom of that variance (Korn and Graubard, Survey Methodology 24, 1998); then Clopper and Pearson's interval.
+    """
+    _, at = np.unique(runs, return_inverse=True)
+    share, samples, groups = float(is_inside.mean()), len(is_inside), int(at.max()) + 1
+    if groups < 2:
+        return Coverage(share, None, None, groups, samples)
+    counted = float(groups)  # where all or none are inside, the variance is not observable
+    if 0.0 < share < 1.0:
+        variance = groups / (groups - 1.0) * float((np.bincount(at, weights=is_inside - share) ** 2).sum()) / samples**2
+        counted = share * (1.0 - share) * samples / (samples - 1.0) / variance
+        counted *= (float(stdtrit(samples - 1, _TAILS[1])) / float(stdtrit(groups - 1, _TAILS[1]))) ** 2
+    counted = min(counted, float(samples))
+    inside = share * counted
+    low = float(betaincinv(inside, counted - inside + 1.0, _TAILS[0])) if inside > 0.0 else 0.0
+    high = float(betaincinv(inside + 1.0, counted - inside, _TAILS[1])) if inside < counted else 1.0
+    return Coverage(share, low, high, groups, samples)
+
+
+def find_miscalibration(found: Coverage, quantity: str, subject: Subject) -> Iterator[Finding]:
+    """Yield that intervals of ``time`` or ``energy`` are too narrow or too wide, where the runs suffice to say so."""
+    if found.low is None or found.high is None:
+        return
+    if found.high < COVERAGE and found.fraction < read_threshold(f"{quantity}-overconfident", "min_coverage_fraction"):
+        yield make_finding(f"{quantity}-overconfident", subject, coverage_fraction=found.fraction)
+    if found.low > COVERAGE and found.fraction > read_threshold("underconfident", "max_coverage_fraction"):
+        names = {"quantity": quantity}
+        yield make_finding("underconfident", subject, names=names, coverage_fraction=found.fraction)
+
+
 Floats = NDArray[np.float64]
 
 _DRAWS = 2000
 _TAILS = (0.025, 0.975)
 _NORMAL = 1.959964
-_FEWEST = 5
-"""Groups without which a ratio has no interval."""
+
+FEWEST_GROUPS = 10
+"""Groups without which a ratio has no interval: a bootstrap of fewer misses the truth too often."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """A ratio of errors with its 95 % interval; None where there is nothing to divide by, or there are fewer than five groups."""
+    """A ratio of errors with its 95 % interval; None where there is nothing to divide by, or there are too few groups."""
 
     value: float | None
     low: float | None
@@ -214,8 +267,8 @@ class Ratio:
         return f"{self.value:.2f}" + ("" if self.low is None else f" ({self.low:.2f} to {self.high:.2f})")
 
 
-def compare_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *, power: float, seed: int) -> Ratio:
-    """Return the ratio of two mean losses over the same samples, raised to ``power``, with its interval.
+def compare_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *, seed: int) -> Ratio:
+    """Return the ratio of two RMSE over the same samples with its interval.
 
     Groups are drawn anew with all of their samples, the same ones for both sides. Quantiles of the logarithm are widened by as much as
     Student's t is wider than the normal, and for the share of the scatter that the mean takes up: of few groups plain quantiles are too
@@ -224,21 +277,20 @@ def compare_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *,
 
     Parameters
     ----------
-    ours, theirs : losses, not negative, shape (N,): squared errors with ``power`` 0.5 give the ratio of RMSE, absolute ones with 1 that of
-        MAPE.
+    ours, theirs : squared errors, shape (N,).
     groups : of each sample, shape (N,): its run, or its block of ground.
-    power, seed : of the ratio; of the draws.
+    seed : of the draws.
     """
     _, at = np.unique(groups, return_inverse=True)
     sums = np.stack([np.bincount(at, losses) for losses in (ours, theirs)], axis=1)
     if not len(sums) or not (total := sums.sum(axis=0)).all() or not np.isfinite(total).all():
         return Ratio(None, None, None)
-    value, count = float((total[0] / total[1]) ** power), len(sums)
-    if count < _FEWEST:
+    value, count = float(np.sqrt(total[0] / total[1])), len(sums)
+    if count < FEWEST_GROUPS:
         return Ratio(value, None, None)
     drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), _DRAWS) @ sums
     drawn = drawn[(drawn > 0.0).all(axis=1)]
-    logs = power * np.log(drawn[:, 0] / drawn[:, 1]) - np.log(value)
+    logs = 0.5 * np.log(drawn[:, 0] / drawn[:, 1]) - np.log(value)
     wider = float(stdtrit(count - 1, _TAILS[1])) / _NORMAL * np.sqrt(count / (count - 1))
     low, high = (value * np.exp(wider * np.quantile(logs, _TAILS))).tolist()
     return Ratio(value, low, high)

@@ -21,6 +21,7 @@ from tcpipe.formats.finding_lines import format_findings, format_verdict
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.learning.metrics import find_miscalibration, measure_coverage
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import (
     CostModel,
@@ -369,9 +370,8 @@ def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Findin
             error = abs(of.off_percent) / 100.0
             if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
                 yield make_finding(f"{name}-far-off", Subject("run", run_id), error_fraction=error)
-        held = [of.held for of in sums.values() if of.held is not None]
-        if held and sum(held) < read_threshold(f"{name}-overconfident", "min_drive_coverage_fraction") * len(held):
-            yield make_finding(f"{name}-overconfident", model, coverage_fraction=sum(held) / len(held))
+        if held := [of.held for of in sums.values() if of.held is not None]:
+            yield from find_miscalibration(measure_coverage(np.array(held), np.arange(len(held))), name, model)
     if 0 < len(compared) < read_threshold("few-drives", "min_drive_count"):
         yield make_finding("few-drives", model, drive_count=len(compared))
 
