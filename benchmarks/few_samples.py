@@ -22,10 +22,9 @@ from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.baselines import compare_with_baseline
 from tcpipe.learning.fitting import FitConfig, Task, fit, predict_split
-from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.models import load_model
 from tcpipe.learning.network import make_resnet18
-from tcpipe.learning.predictions import collect_measured
+from tcpipe.learning.predictions import Predicted, collect_measured
 from tcpipe.learning.table_model import compute_features, fit_table
 from tcpipe.learning.training import Variant, make_training_task, read_class_table
 
@@ -65,14 +64,14 @@ def compare(data: Dataset, network: Predict, table: Predict, called: str) -> Non
     for name in (name for name in ("test", "unseen") if len(data[name])):
         part = collect_measured(data[name], {})
         ours, theirs = (
-            compute_costs(*np.maximum(predict(part.split).T.astype(np.float64), [[-np.inf], [LEAST_VELOCITY_MPS]]), 1.0)
+            Predicted.centre({}, predict(part.split).astype(np.float64), part.class_ids, 1.0)
             for predict in (network, table)
         )
         rules = {"block_m": data.card.recipe.split.block_m, "seed": 0}
         row = next(
             of for of in compare_with_baseline("boosting", name, part, ours, theirs, **rules) if of.quantity == "E"
         )
-        rmse = float(np.sqrt(np.mean(np.square(ours["E"] - part.costs["E"]))))
+        rmse = float(np.sqrt(np.mean(np.square(ours.costs["E"] - part.costs["E"]))))
         print(
             f"{called:>12} {name:6}: network {rmse:6.2f} J, table {row.errors.rmse:6.2f} J, ratio {row.rmse_ratio}",
             flush=True,

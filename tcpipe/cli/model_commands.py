@@ -98,8 +98,9 @@ def reproduce(
 ) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 
-    Takes some two hours a training on two cores, minutes with --size small; an interrupted call resumes. The data are simulated: compare the pattern with the
-    paper, not the numbers. Writes reproduction.html, reproduction.json and all intermediate results to DIR.
+    Takes some two hours a training on two cores, minutes with --size small; an interrupted call resumes. The data are
+    simulated: compare the pattern with the paper, not the numbers. Writes reproduction.html, reproduction.json and all
+    intermediate results to DIR.
     """
     from tcpipe.experiment.reproduction import reproduce as run
 

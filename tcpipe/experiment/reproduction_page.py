@@ -29,6 +29,7 @@ def render_reproduction_page(
         title="The paper's experiment on a simulated site",
         lead=f"Of {len(claims)} claims: {counts}; {len(runs)} training{'s' if len(runs) > 1 else ''}. {' '.join(audits)} "
         "All tables of a training are in seed-N/evaluation/evaluation.html.",
+        numbers=[],
         warnings=[SIMULATED, *warnings],
         sections=[
             _make_claims_section(claims),
@@ -49,7 +50,7 @@ def _make_claims_section(claims: Sequence[Claim]) -> Section:
     ]  # fmt: skip
     text = (
         "RMSE of E of the network over a baseline's, of the same samples, both centred by class: the mean of all trainings, with its 95 % "
-        "interval over trainings and test samples. Held if all of it is below 1, NOT held if above, open if it contains 1, or of fewer than "
+        "interval over trainings and test samples. Held if all of it is below 1, NOT held if above, open otherwise, and of fewer than "
         f"{FEWEST_SEEDS} trainings. Height, class and slow ground matter by construction of the site, so they are no claims."
     )
     header = ("claim", "split", "", "here", "between trainings (1σ)", "the paper")

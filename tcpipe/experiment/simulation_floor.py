@@ -167,7 +167,7 @@ class Claim:
     """Standard deviation of the ratio's logarithm between trainings; None of one."""
     in_the_paper: float | None
     verdict: Verdict
-    """``held``: the whole 95 % interval lies below 1; ``NOT held``: above; ``open``: it holds 1, or there are too few trainings or groups."""
+    """``held``: the whole 95 % interval lies below 1; ``NOT held``: above; ``open``: it holds 1, or trainings or groups are too few."""
 
     def __str__(self) -> str:
         """Return the claim, its figure and its verdict as one line."""

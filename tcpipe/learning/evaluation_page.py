@@ -22,7 +22,7 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
 
 COUNTED = (
-    "The number in brackets after a MAPE counts its labels: those of at least "
+    "A number in brackets after a MAPE counts its labels, if some are left out: all below "
     + ", ".join(f"{least:g} {UNITS[quantity]} ({quantity})" for quantity, least in LEAST.items())
     + ". "
 )
@@ -67,7 +67,9 @@ def _format_figure(error: Errors | None, measure: str, quantity: str) -> str:
     value = None if error is None else getattr(error, measure)
     if error is None or value is None:
         return "–"
-    return f"{value:.2f} ({error.mape_count})" if measure == "mape_percent" else f"{value:.{_DIGITS[quantity]}f}"
+    if measure == "mape_percent":
+        return f"{value:.2f}" + ("" if error.mape_count == error.count else f" ({error.mape_count})")
+    return f"{value:.{_DIGITS[quantity]}f}"
 
 
 def _format_figures(error: Errors | None, quantity: str) -> list[str]:
@@ -116,7 +118,9 @@ def _make_coverage_section(found: Evaluation) -> Section:
         (split, quantity, str(coverage), f"{error.nll:.2f}", f"{error.crps:.{_DIGITS[quantity]}f} {UNITS[quantity]}")
         for split in found.ordered_splits
         for quantity, coverage in found.splits[split].coverage.items()
-        if (error := found.splits[split].errors[quantity][ALL]).nll is not None and error.crps is not None
+        if quantity in "ET"
+        and (error := found.splits[split].errors[quantity][ALL]).nll is not None
+        and error.crps is not None
     ]
     training = found.model.training
     count, is_network = training.samples["held out"], training.config.model == "resnet18"
@@ -156,12 +160,13 @@ def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterato
         yield make_row(f"{quantity}, {_format_measure(measure, quantity)}", "here", part.errors[quantity], measure)
         of_paper = dict(zip(CLASSES, BY_CLASS[split, quantity, measure], strict=True))
         yield ("", "the paper", *(_format_paper_figure(of_paper.get(name)) for name in classes))
+        if measure != "rmse":
+            continue
         if split == "test" and found.blocks is not None:
             yield make_row("", "held-out blocks of train", found.blocks[quantity], measure)
         for floor, errors in part.floors.items():
             yield make_row("", FLOORS[floor], errors[quantity], measure)
-        repeats = found.repeatability[quantity]
-        if measure == "rmse" and repeats is not None:
+        if (repeats := found.repeatability[quantity]) is not None:
             blank = [""] * len(part.classes)
             yield ("", "repeatability (driven twice)", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
 
@@ -194,7 +199,7 @@ def _make_ablation_section(found: Evaluation) -> Section:
             cells = (_format_figure(errors[quantity], measure, quantity) for quantity, measure in ABLATION_COLUMNS)
             rows.append((layers, split, how, *cells))
             if row.how == "noise" and row.layers in ABLATION:
-                of_paper = map(_format_paper_figure, ABLATION[row.layers][SPLITS.index(split)])
+                of_paper = map(_format_paper_figure, ABLATION[row.layers][SPLITS.index(split)][4:])
                 rows.append(("", "", "the paper", *of_paper))
     columns = (f"{quantity} {_format_measure(measure, quantity)}" for quantity, measure in ABLATION_COLUMNS)
     text = f"Layers not named are replaced by noise, mean of {found.config.noise_draws} draws; retrained: a network without these layers."
@@ -280,7 +285,7 @@ ABLATION = {
 }  # fmt: skip
 """Table III: layers that are left, to RMSE and MAPE of w, v, E, T on test and on unseen."""
 
-ABLATION_COLUMNS = tuple((quantity, measure) for quantity in "wvET" for measure in ("rmse", "mape_percent"))
+ABLATION_COLUMNS = tuple((quantity, measure) for quantity in "ET" for measure in ("rmse", "mape_percent"))
 
 ENERGY = {
     "ours": ((21.51, 10.77), (26.63, 12.80)),

@@ -194,7 +194,7 @@ def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dic
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Share of labels inside their 90 % intervals, with its own 95 % interval; None of a single run."""
+    """Share of labels inside their 90 % intervals, with its own 95 % interval; None of too few runs."""
 
     fraction: float
     low: float | None
@@ -205,8 +205,12 @@ class Coverage:
     def __str__(self) -> str:
         """Return the share in percent with its interval."""
         if self.low is None or self.high is None:
-            return f"{100.0 * self.fraction:.1f} % (one run: no interval)"
+            return f"{100.0 * self.fraction:.1f} % ({self.runs} runs are too few for an interval)"
         return f"{100.0 * self.fraction:.1f} % (95 % CI {100.0 * self.low:.1f} to {100.0 * self.high:.1f}, {self.runs} runs)"
+
+
+_FEWEST_RUNS = 5
+"""Runs without which a coverage has no interval: two or three do not show how runs differ."""
 
 
 def measure_coverage(is_inside: NDArray[np.bool_], runs: NDArray[np.generic]) -> Coverage:
@@ -217,14 +221,13 @@ def measure_coverage(is_inside: NDArray[np.bool_], runs: NDArray[np.generic]) ->
     """
     _, at = np.unique(runs, return_inverse=True)
     share, samples, groups = float(is_inside.mean()), len(is_inside), int(at.max()) + 1
-    if groups < 2:
+    if groups < _FEWEST_RUNS:
         return Coverage(share, None, None, groups, samples)
     counted = float(groups)  # where all or none are inside, the variance is not observable
     if 0.0 < share < 1.0:
         variance = groups / (groups - 1.0) * float((np.bincount(at, weights=is_inside - share) ** 2).sum()) / samples**2
-        counted = share * (1.0 - share) * samples / (samples - 1.0) / variance
+        counted = min(share * (1.0 - share) * samples / (samples - 1.0) / max(variance, 1e-300), samples)
         counted *= (float(stdtrit(samples - 1, _TAILS[1])) / float(stdtrit(groups - 1, _TAILS[1]))) ** 2
-    counted = min(counted, float(samples))
     inside = share * counted
     low = float(betaincinv(inside, counted - inside + 1.0, _TAILS[0])) if inside > 0.0 else 0.0
     high = float(betaincinv(inside + 1.0, counted - inside, _TAILS[1])) if inside < counted else 1.0
