@@ -135,7 +135,7 @@ class Evaluation:
     """All of evaluation.json."""
 
     kind: str = KIND
-    schema_version: int = 2
+    schema_version: int = 3
     tcpipe_version: str
     key: str
     """Hash of model, dataset and options: the same key, the same evaluation."""

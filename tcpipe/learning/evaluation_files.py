@@ -80,7 +80,7 @@ def run_evaluation(
     rules = config or EvaluateConfig()
     key = _make_key(model, dataset, rules, simulated=plant is not None)
     if is_url(out):
-        if (known := _read_at_url(str(out))) is not None and known.values.key == key:
+        if (known := _read_at_url(str(out), key)) is not None:
             return known
         with write_generation(str(out), JSON) as made:
             result = run_evaluation(model, dataset, made, config=config, plant=plant)
@@ -119,13 +119,14 @@ def read_evaluated_samples(place: Path, dataset: str | Path) -> EvaluatedSamples
     return select_evaluated_samples(read_table(place / SAMPLES), open_dataset(dataset))
 
 
-def _read_at_url(url: str) -> EvaluationResult | None:
-    """Return the newest evaluation at a URL; None where there is none."""
+def _read_at_url(url: str, key: str) -> EvaluationResult | None:
+    """Return the newest evaluation at a URL if it has this key; None otherwise."""
     found = find_newest(url, [JSON])
     if found is None:
         return None
     where = found.place.where(JSON)
-    return EvaluationResult(found.place.where(), parse_typed(parse_json(found.data, where), Evaluation, where))
+    values = parse_json(found.data, where)
+    return EvaluationResult(found.place.where(), parse_typed(values, Evaluation, where)) if values.get("key") == key else None
 
 
 def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:

@@ -190,20 +190,23 @@ _TEXT = {
 
 
 def _make_ablation_section(found: Evaluation) -> Section:
-    """Return table III."""
+    """Return table III, of E."""
     rows = []
     for row in found.ablation:
         layers, how = f"{{{', '.join(row.layers)}}}", "retrained" if row.how == "retrained" else "here"
-        for split in found.ordered_splits:
-            errors = row.on(split)
-            cells = (_format_figure(errors[quantity], measure, quantity) for quantity, measure in ABLATION_COLUMNS)
-            rows.append((layers, split, how, *cells))
-            if row.how == "noise" and row.layers in ABLATION:
-                of_paper = map(_format_paper_figure, ABLATION[row.layers][SPLITS.index(split)][4:])
-                rows.append(("", "", "the paper", *of_paper))
-    columns = (f"{quantity} {_format_measure(measure, quantity)}" for quantity, measure in ABLATION_COLUMNS)
+        cells = (cell for split in found.ordered_splits for cell in _format_figures(row.on(split)["E"], "E"))
+        rows.append((layers, how, *cells))
+        if row.how == "noise" and row.layers in ABLATION:
+            of_paper = (value for split in found.ordered_splits for value in ABLATION[row.layers][SPLITS.index(split)])
+            rows.append(("", "the paper", *map(_format_paper_figure, of_paper)))
     text = f"Layers not named are replaced by noise, mean of {found.config.noise_draws} draws; retrained: a network without these layers."
-    return Section("Table III: ablation", text, header=("layers", "", "", *columns), rows=rows, figures_from=3)
+    header = ("layers", "", *_name_measures(found, "E"))
+    return Section("Table III: ablation, E", text, header=header, rows=rows, figures_from=2)
+
+
+def _name_measures(found: Evaluation, quantity: str) -> Iterator[str]:
+    """Yield the headers of both measures on every split."""
+    return (f"{split}, {_format_measure(measure, quantity)}" for split in found.ordered_splits for measure in MEASURES)
 
 
 def _make_comparison_section(
@@ -225,8 +228,7 @@ def _make_comparison_section(
         if what in of_paper:
             cells = [map(_format_paper_figure, of_paper[what][SPLITS.index(split)]) for split in splits]
             rows.append(("", "the paper", *(cell for part in cells for cell in part)))
-    measures = (f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in MEASURES)
-    return Section(title, text, header=("", "", *measures), rows=rows, figures_from=2)
+    return Section(title, text, header=("", "", *_name_measures(found, quantity)), rows=rows, figures_from=2)
 
 
 def _make_energy_section(found: Evaluation) -> Section:
@@ -275,17 +277,15 @@ BY_CLASS = {
 """Tables I and II: split (the paper's validation is ``unseen``), quantity, measure, to a value a class."""
 
 ABLATION = {
-    ("O", "C", "H"): ((14.04, 9.39, 0.04, 3.41, 21.51, 10.77, 0.06, 3.37), (17.73, 10.74, 0.06, 5.14, 26.63, 12.80, 0.08, 5.04)),
-    ("C", "H"): ((19.33, 10.94, 0.05, 3.84, 30.35, 12.29, 0.08, 3.71), (19.00, 12.49, 0.06, 5.05, 27.59, 14.53, 0.08, 5.18)),
-    ("O", "H"): ((14.78, 9.86, 0.04, 3.62, 22.17, 10.92, 0.06, 3.63), (22.39, 13.82, 0.07, 6.25, 34.95, 17.38, 0.10, 6.54)),
-    ("O", "C"): ((50.63, 41.02, 0.07, 5.69, 67.59, 47.84, 0.09, 5.64), (55.63, 45.07, 0.08, 7.22, 73.75, 52.20, 0.11, 7.57)),
-    ("O",): ((54.52, 44.63, 0.09, 6.49, 57.34, 57.17, 0.11, 6.41), (61.77, 50.24, 0.09, 8.10, 87.39, 60.39, 0.13, 8.68)),
-    ("C",): ((66.37, 44.10, 0.07, 5.73, 91.93, 47.16, 0.11, 5.32), (61.49, 37.11, 0.07, 5.92, 79.83, 40.07, 0.10, 5.98)),
-    ("H",): ((19.33, 11.69, 0.05, 3.71, 28.67, 13.31, 0.07, 3.60), (22.52, 15.17, 0.07, 5.53, 32.09, 17.36, 0.09, 5.64)),
-}  # fmt: skip
-"""Table III: layers that are left, to RMSE and MAPE of w, v, E, T on test and on unseen."""
-
-ABLATION_COLUMNS = tuple((quantity, measure) for quantity in "ET" for measure in ("rmse", "mape_percent"))
+    ("O", "C", "H"): ((21.51, 10.77), (26.63, 12.80)),
+    ("C", "H"): ((30.35, 12.29), (27.59, 14.53)),
+    ("O", "H"): ((22.17, 10.92), (34.95, 17.38)),
+    ("O", "C"): ((67.59, 47.84), (73.75, 52.20)),
+    ("O",): ((57.34, 57.17), (87.39, 60.39)),
+    ("C",): ((91.93, 47.16), (79.83, 40.07)),
+    ("H",): ((28.67, 13.31), (32.09, 17.36)),
+}
+"""Table III: layers that are left, to RMSE [J] and MAPE [%] of E on test and on unseen."""
 
 ENERGY = {
     "ours": ((21.51, 10.77), (26.63, 12.80)),
