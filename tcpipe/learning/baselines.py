@@ -32,6 +32,7 @@ from tcpipe.learning.metrics import (
 from tcpipe.learning.models import Model
 from tcpipe.learning.physics_model import Form, find_idle_power, fit_curves, fit_physics_model
 from tcpipe.learning.predictions import Measured, Predicted, make_residuals, predict_costs, predict_spreads
+from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import Variant
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -44,6 +45,8 @@ CURVES: Mapping[Form, str] = {
 }
 PHYSICS, TREES = "physics", "gradient boosting"
 SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
+BASELINE_OF_KIND = {"boosting": TREES, "physics": PHYSICS}
+"""What a baseline is called that would be the model itself."""
 
 _ALIKE = 1.005
 """Ratio up to which errors are the same: by digits of rounding nobody is better."""
@@ -64,8 +67,7 @@ def compare_baselines(
     The baselines are fitted on the training samples of ``data``, centred as the model is, and evaluated on ``sets``, the same samples as
     the predictions ``said`` of the model. ``seed`` is that of the bootstrap.
     """
-    kind = ours.card.training.config.model
-    own = {"boosting": TREES, "physics": PHYSICS}.get(kind)
+    own = BASELINE_OF_KIND.get(ours.card.training.config.model)
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
@@ -84,7 +86,7 @@ def compare_baselines(
 def _select_fitted_samples(train: Split, ours: Model) -> Split:
     """Return the samples that a model of this kind is fitted on: for a network without the fold that stops it."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
-    if ours.card.training.config.model != "resnet18":
+    if not find_kind(ours.card.training.config.model).stops_by_fold:
         return labelled
     fitted, _ = labelled.fold(ours.card.training.config.fold)
     return fitted if len(fitted) else labelled
@@ -132,7 +134,7 @@ def _fit_physics(train: Split) -> tuple[Predict, None]:
     fitted = fit_physics_model(
         read_extra_features(train), train.labels.astype(np.float64), idle_watt=find_idle_power(train)
     )
-    return lambda split: fitted.predict(read_extra_features(split)), None
+    return lambda split: fitted.predict(np.empty(0, np.float32), read_extra_features(split)), None
 
 
 def _fit_trees(ours: Model, train: Split) -> tuple[Predict, Array]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.balance.correlation import Floor
+from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
@@ -48,9 +49,7 @@ from tcpipe.learning.metrics import (
     average_draws,
     compute_costs,
     compute_errors_by_class,
-    find_miscalibration,
     label_floor,
-    measure_coverage,
 )
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import (
@@ -62,6 +61,7 @@ from tcpipe.learning.predictions import (
     predict_costs,
     predict_spreads,
 )
+from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import Variant, compute_dataset_checksum, make_training_task, train
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
@@ -135,7 +135,7 @@ def evaluate(
         return load_model(place)
 
     ablation = list(_iterate_ablation(ours, sets, config, trained))
-    with_networks = config.baselines and fitting.model == "resnet18"
+    with_networks = config.baselines and find_kind(fitting.model).stops_by_fold
     energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(

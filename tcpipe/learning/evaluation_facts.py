@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias
 
 from tcpipe.balance.correlation import Floor
+from tcpipe.cost.coverage import Coverage
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
-from tcpipe.learning.metrics import Coverage, Errors, Ratio
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import Training
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import ABSENT

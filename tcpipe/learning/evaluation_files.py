@@ -126,7 +126,11 @@ def _read_at_url(url: str, key: str) -> EvaluationResult | None:
         return None
     where = found.place.where(JSON)
     values = parse_json(found.data, where)
-    return EvaluationResult(found.place.where(), parse_typed(values, Evaluation, where)) if values.get("key") == key else None
+    return (
+        EvaluationResult(found.place.where(), parse_typed(values, Evaluation, where))
+        if values.get("key") == key
+        else None
+    )
 
 
 def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:

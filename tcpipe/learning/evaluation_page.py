@@ -13,6 +13,7 @@ from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, make_page_data, sample_sections
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
+from tcpipe.learning.predictor import find_kind
 from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.tables.findings import PREDICTED, judge_again
 
@@ -123,7 +124,7 @@ def _make_coverage_section(found: Evaluation) -> Section:
         and error.crps is not None
     ]
     training = found.model.training
-    count, is_network = training.samples["held out"], training.config.model == "resnet18"
+    count, is_network = training.samples["held out"], find_kind(training.config.model).stops_by_fold
     text = (
         f"Intervals rest on the model's errors on {count} samples of train "
         f"{'that stopped it early, which makes them slightly too small' if is_network else ', each predicted by the other folds'}. The "

@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
+from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
@@ -21,7 +22,6 @@ from tcpipe.formats.finding_lines import format_findings, format_verdict
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.learning.metrics import find_miscalibration, measure_coverage
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import (
     CostModel,

@@ -86,7 +86,7 @@ def test_again_is_nothing_to_do(reproduced):
 def test_without_baselines_their_claims_are_not_measured(reproduced, tmp_path):
     here, _ = reproduced
     shutil.copytree(here / "here", tmp_path / "here")
-    done = tcpipe("reproduce", "here", "--quick", "--no-baselines", "--json", "--quiet", cwd=tmp_path, env=ENV)
+    done = tcpipe("reproduce", "here", "--size", "quick", "--no-baselines", "--json", "--quiet", cwd=tmp_path, env=ENV)
     assert done.returncode == 0, done.stderr
     with_them, without = (
         json.loads((at / "here" / "reproduction.json").read_text())["claims"] for at in (here, tmp_path)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 from made_models import CARD, made_comparison, made_evaluation
 
+from tcpipe.cost.coverage import Coverage
 from tcpipe.learning.evaluation import find_weaknesses
 from tcpipe.learning.evaluation_facts import EvaluatedModel, Leakage, SplitErrors
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Coverage, Errors, Ratio
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.tables.findings import judge
 
 GOOD = Errors(500, 12.0, 6.0, 500, 90.0, 3.0, 6.0)
