@@ -45,7 +45,10 @@ CURVES: Mapping[Form, str] = {
 }
 PHYSICS, TREES = "physics", "gradient boosting"
 SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
-BASELINE_OF_KIND: Mapping[str, str] = {**CURVES, PHYSICS: PHYSICS, "boosting": TREES}
+BASELINE_OF_KIND: Mapping[str, str] = {str(form): name for form, name in CURVES.items()} | {
+    PHYSICS: PHYSICS,
+    "boosting": TREES,
+}
 """What a baseline is called that would be the model itself."""
 
 _ALIKE = 1.005

@@ -69,8 +69,7 @@ class ResidualModel(Predictor):
         )
         steps = int(np.clip(_PASSES * len(samples) / _BATCH, _FEWEST_STEPS, _MOST_STEPS))
         network = SmallNetwork(inputs.depth + len(inputs.extra_features), len(inputs.outputs), seed=config.seed)
-        stream = (_with_planes(inputs, *batch) for batch in batches.forever())
-        network.fit(stream, steps)
+        network.fit((_add_planes(inputs, *batch) for batch in batches.forever()), steps)
         return cls(fit_curves("linear", *ground, samples.labels), network, scale, inputs)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -93,7 +92,7 @@ class ResidualModel(Predictor):
         return cls(curves, network, scale, inputs)
 
 
-def _with_planes(inputs: Inputs, patches: Any, labels: Patches, weights: Patches) -> tuple[Patches, Patches, Patches]:
+def _add_planes(inputs: Inputs, patches: Any, labels: Any, weights: Any) -> tuple[Patches, Patches, Patches]:
     """Return a batch whose patches have a plane for each extra feature."""
     if inputs.extra_features:
         patches = append_planes(patches[0], standardize_columns(inputs.extra_features, patches[1]))
