@@ -6,7 +6,7 @@ A function imports what it needs when it is called: a model of physics needs no 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, overload
 
@@ -27,19 +27,20 @@ def run_train(options: TrainOptions) -> TrainResult:
     ``str`` of the result is what the command prints. Raises `UsageError` where an option is out of its range, or ``out`` holds something
     else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the interrupted training is another one.
     """
+    from tcpipe.formats.recipe_toml import resolve_recipe
     from tcpipe.learning.fitting import FitConfig
     from tcpipe.learning.training import train as run
     from tcpipe.recipe.checking import from_values
 
     names = [of.name for of in fields(FitConfig) if of.name != "predictor"]
-    given = {name: value for name in names if (value := getattr(options, name)) is not None}
+    given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
     if options.predictor is None:
         given["model"] = options.model or ("resnet18" if is_network else "auto")
     return run(
         options.dataset,
         options.out,
-        config=from_values(FitConfig, given, where="train"),
+        config=from_values(FitConfig, {**asdict(resolve_recipe(options.recipe).train), **given}, where="train"),
         no_resume=options.no_resume,
         predictor=options.predictor,
     )

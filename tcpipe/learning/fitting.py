@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tcpipe.dataset import Split
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.architecture import Loss
+from tcpipe.recipe import TrainConfig
 from tcpipe.tables.bounds import Bounds
 
 Floats = NDArray[np.float32]
@@ -24,31 +25,18 @@ Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 
 
 @dataclass(frozen=True, slots=True)
-class FitConfig:
-    """How a model is trained; ResNet-18, equation 4 and the learning rate are the paper's.
-
-    A table and physics use only loss, weights, label and beside.
-    """
+class FitConfig(TrainConfig):
+    """How a model is trained: the settings of the recipe, and the choices of a call."""
 
     model: ModelKind | Literal["auto"] = "resnet18"
-    """``auto``: chosen by cross-validation over runs ."""
+    """``auto``: chosen by cross-validation over runs."""
     loss: Loss = "nrmse"
-    epochs: Annotated[int, Bounds(ge=1, le=100_000)] = 100
-    """At most."""
-    patience: Annotated[int, Bounds(ge=1, le=100_000)] = 12
-    """Epochs without a better loss of the held-out fold before training stops."""
-    batch_size: Annotated[int, Bounds(ge=1, le=65_536)] = 64
-    learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 1e-4
     seed: Seed = 0
     """Of weights, shuffles and mirrors."""
     fold: Annotated[int, Bounds(ge=0, le=99)] = 0
     """Of train, for early stopping; the rest is fitted."""
-    mirror: bool = True
-    """Mirror every other patch across its direction of travel."""
     inverse_variance_weights: bool = False
     """Weigh each label by its inverse variance."""
-    width: Annotated[int, Bounds(ge=16, le=512)] = 64
-    """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
     """Energy to train on: total, or net of idle power (less the idle power)."""
     extra_features: bool = False

@@ -7,11 +7,12 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tcpipe.tables.options import MAP, MODEL, PREDICTOR, SEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import MAP, MODEL, PREDICTOR, RECIPE, SEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.dataset.energies import EnergyName
     from tcpipe.learning.architecture import Loss
+    from tcpipe.recipe import Recipe
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,7 @@ class TrainOptions:
         ),
     )  # fmt: skip
     predictor: str | None = option(None, PREDICTOR)
+    recipe: Recipe | str | Path | None = option(None, RECIPE)
     loss: Loss = option(
         "nrmse",
         Option(

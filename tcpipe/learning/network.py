@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import Architecture, mean_loss
+from tcpipe.recipe import TrainConfig
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -174,7 +175,7 @@ def _reorder_axes(value: Any) -> Any:
     return value.permute(2, 3, 1, 0) if value.ndim == 4 else value.T if value.ndim == 2 else value
 
 
-_FILTERS, _RATE, _DECAY = (16, 32, 32), 3e-3, 1e-2
+_FILTERS = 16, 32, 32
 
 
 class SmallNetwork(nn.Module):
@@ -202,10 +203,10 @@ class SmallNetwork(nn.Module):
         """Return outputs of patches of shape (N, px, px, depth), shape (N, outputs)."""
         return _predict(self, patches)
 
-    def fit(self, batches: Iterator[tuple[Floats, Floats, Floats]], steps: int) -> None:
+    def fit(self, batches: Iterator[tuple[Floats, Floats, Floats]], steps: int, config: TrainConfig) -> None:
         """Fit outputs to labels by weighted least squares, in so many steps of a batch of patches, labels and weights."""
-        optimizer = torch.optim.AdamW(self.parameters(), _RATE, weight_decay=_DECAY)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, steps)
+        optimizer = torch.optim.AdamW(self.parameters(), weight_decay=config.residual_weight_decay)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.residual_learning_rate, steps)
         self.train()
         for _ in range(steps):
             patches, *others = next(batches)

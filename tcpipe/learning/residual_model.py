@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_BATCH, _PASSES, _FEWEST_STEPS, _MOST_STEPS = 64, 30, 300, 2400
-"""Samples of a step; the steps are so many passes over the samples, within these limits."""
+_BATCH, _FEWEST_STEPS, _MOST_STEPS = 64, 300, 2400
+"""Samples of a step, and limits of the steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,9 @@ class ResidualModel(Predictor):
         batches = replace(
             batches, labels=(residuals / scale).astype(np.float32), weights=samples.weights.astype(np.float32)
         )
-        steps = int(np.clip(_PASSES * len(samples) / _BATCH, _FEWEST_STEPS, _MOST_STEPS))
+        steps = int(np.clip(config.residual_passes * len(samples) / _BATCH, _FEWEST_STEPS, _MOST_STEPS))
         network = SmallNetwork(inputs.depth + len(inputs.extra_features), len(inputs.outputs), seed=config.seed)
-        network.fit((_add_planes(inputs, *batch) for batch in batches.forever()), steps)
+        network.fit((_add_planes(inputs, *batch) for batch in batches.forever()), steps, config)
         return cls(fit_curves("linear", *ground, samples.labels), network, scale, inputs)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:

@@ -7,6 +7,7 @@ from tcpipe.errors import ModelError
 from tcpipe.learning import table_model as forest
 from tcpipe.learning.predictor import Inputs
 from tcpipe.learning.table_model import BoostingModel, compute_patch_features, fit_table
+from tcpipe.recipe import TrainConfig
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
@@ -50,7 +51,7 @@ def test_a_mirror_changes_nothing():
     assert compute_patch_features(patches[:0], **rules).shape == (0, 16)
 
 
-RULES = {**forest._RULES}
+RULES = forest.make_rules(TrainConfig())
 
 
 def _drawn(count, seed=0):
