@@ -37,13 +37,17 @@ def run_train(options: TrainOptions) -> TrainResult:
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
     if options.predictor is None:
         given["model"] = options.model or ("resnet18" if is_network else "auto")
-    return run(
-        options.dataset,
-        options.out,
-        config=from_values(FitConfig, {**asdict(resolve_recipe(options.recipe).train), **given}, where="train"),
-        no_resume=options.no_resume,
-        predictor=options.predictor,
-    )
+    config = from_values(FitConfig, {**asdict(resolve_recipe(options.recipe).train), **given}, where="train")
+    result = run(options.dataset, options.out, config=config, no_resume=options.no_resume, predictor=options.predictor)
+    if options.onnx is not None:
+        from tcpipe.formats.atomic import write_atomic_file
+        from tcpipe.learning.models import load_model
+        from tcpipe.learning.onnx_model import export_network
+
+        graph = export_network(load_model(options.out, options.predictor).predictor, str(options.out))
+        with write_atomic_file(Path(options.onnx)) as temporary:
+            temporary.write_bytes(graph)
+    return result
 
 
 train = as_function(TrainOptions, run_train)

@@ -351,7 +351,8 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
         if quantity == "E" and not of.beats_all:
             best, ratio = of.best.baseline, of.best.rmse_ratio.value or 0.0
             kind = next(kind for kind, baseline in BASELINE_OF_KIND.items() if baseline == best)
-            remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if of.is_worse else []
+            is_other = of.is_worse and kind != found.model.training.kind
+            remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
             names = {"baseline": best}
             yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)
 

@@ -17,8 +17,8 @@ from tcpipe.tables.bounds import Bounds
 
 Floats = NDArray[np.float32]
 
-ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "residual", "resnet18", "own"]
-"""Curves of class and slope, physics, a curve and boosted trees or a small network, the paper's network, or the user's own code."""
+ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "residual", "resnet18", "onnx", "own"]
+"""Curves of class and slope, physics, a curve and boosted trees or a small network, the paper's network, a graph, or own code."""
 
 Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 """What every generator of random numbers takes."""

@@ -32,6 +32,9 @@ class TrainOptions:
         ),
     )  # fmt: skip
     predictor: str | None = option(None, PREDICTOR)
+    onnx: str | Path | None = option(
+        None, Option("Also write the network as an ONNX graph.", (), "output_file", "FILE")
+    )
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     loss: Loss = option(
         "nrmse",

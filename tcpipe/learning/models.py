@@ -207,20 +207,21 @@ def load_model(path: str | Path, predictor: str | None = None) -> Model:
     if "terrain_class" in residuals:  # of a map without classes: null
         residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(np.float64)).astype(np.uint8)
     model = Model(str(path), card, place, compute_card_checksum(card), residuals)
-    return model if not card.training.config.predictor and predictor is None else _add_code(model, predictor)
+    needs_code = find_kind(card.training.kind) is Predictor
+    return _add_code(model, predictor) if needs_code or predictor is not None else model
 
 
 def _add_code(model: Model, predictor: str | None) -> Model:
     """Return the model with the user's code, without which it cannot predict."""
-    config = model.card.training.config
-    if not config.predictor:
-        raise UsageError(f"{model.name}: a model of kind {model.card.training.kind} needs no code; remove --predictor")
+    training = model.card.training
+    if find_kind(training.kind) is not Predictor:
+        raise UsageError(f"{model.name}: a model of kind {training.kind} needs no code; remove --predictor")
     if predictor is None:
         raise UsageError(
             f"{model.name}: was trained with code of your own, which no folder has: give it with --predictor FILE.py"
         )
     own = load_own_kind(predictor)
-    if own.digest != config.predictor:
+    if own.digest != training.config.predictor:
         logger.warning("%s: has changed since %s was trained with it", predictor, model.name)
     return replace(model, own=own, checksum=digest([model.checksum, own.digest]))
 

@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import ModelError, TcpipeError, UsageError
+from tcpipe.learning.fitting import ModelKind
+from tcpipe.learning.onnx_model import OnnxModel
 from tcpipe.learning.predictor import Predictor
 
 logger = logging.getLogger("tcpipe")
@@ -36,16 +38,23 @@ class OwnKind:
     digest: str
     """Of the file's bytes; of a package its name and version."""
     kind: type[Predictor]
+    model: ModelKind = "own"
 
 
 def load_own_kind(source: str) -> OwnKind:
     """Return the kind of model that ``FILE.py``, ``FILE.py:NAME`` or the name of an entry point stands for; this runs its code.
+
+    ``FILE.onnx`` is a graph, which is no code.
 
     Raises
     ------
     UsageError : there is no such file, entry point or name.
     ModelError : the code fails.
     """
+    if source.endswith(".onnx"):
+        data = _read(source, Path(source))
+        kind = type("Graph", (OnnxModel,), {"graph": data})
+        return OwnKind(source, hashlib.sha256(data).hexdigest(), kind, "onnx")
     path, name = source, ""
     if not source.endswith(".py") and ".py:" in source:
         path, _, name = source.rpartition(":")
@@ -64,10 +73,14 @@ def load_own_kind(source: str) -> OwnKind:
     return OwnKind(source, digest, _make_kind(found, source))
 
 
-def _load_file(source: str, path: Path, name: str) -> OwnKind:
+def _read(source: str, path: Path) -> bytes:
     if not path.is_file():
         raise UsageError(f"--predictor {source}: there is no file {path}")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return path.read_bytes()
+
+
+def _load_file(source: str, path: Path, name: str) -> OwnKind:
+    digest = hashlib.sha256(_read(source, path)).hexdigest()
     spec = spec_from_file_location(f"tcpipe_own_{digest[:16]}", path.resolve())
     if spec is None or spec.loader is None:
         raise UsageError(f"--predictor {source}: not a Python file")

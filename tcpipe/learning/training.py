@@ -175,7 +175,7 @@ def train(
     """
     rules, other = config or FitConfig(), variant or Variant()
     own = None if predictor is None else load_own_kind(predictor)
-    rules = rules if own is None else replace(rules, model="own", predictor=own.digest)
+    rules = rules if own is None else replace(rules, model=own.model, predictor=own.digest)
     data = open_dataset(dataset, label=rules.label)
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
