@@ -91,13 +91,14 @@ class ProposedRecipe:
 
     def toml(self) -> str:
         """Return the file. The head of a table of decisions alone is a comment too; those of ``read`` and ``mask`` may be empty."""
-        what = "Comments below it need a decision: remove the # and correct the value."
-        text = ["# Proposed by tcpipe init --from. " + what, *(f"# {clean_line(line)}".rstrip() for line in self.head)]
+        is_open = any(not line.is_certain for line in self.lines)
+        what = " Comments below it need a decision: remove the # and correct the value." if is_open else ""
+        text = [f"# Proposed by tcpipe init --from.{what}", *(f"# {clean_line(line)}".rstrip() for line in self.head)]
         tables = dict.fromkeys(line.table for line in sorted(self.lines, key=lambda line: bool(line.table)))
         for table in tables:
             mine = [line for line in self.lines if line.table == table]
-            is_open = any(line.is_certain for line in mine) or table.startswith(("read.", "mask"))
-            text += ["", *([f"{'' if is_open else '# '}[{table}]"] if table else [])]
+            is_head = any(line.is_certain for line in mine) or table.startswith(("read.", "mask"))
+            text += ["", *([f"{'' if is_head else '# '}[{table}]"] if table else [])]
             for line in mine:
                 note = f"  # {' '.join(line.note.split())}" if line.note else ""
                 text.append(f"{'' if line.is_certain else '# '}{line.key} = {as_toml(line.value)}{note}")
