@@ -54,9 +54,7 @@ SMALLEST = {
     ),
     "error_budget": Smallest("", rf"averaged, 20 Hz \| {NUMBER} %"),
     "faults": Smallest("kills --only 'a file over another' --times 1", r"together +[1-9]"),
-    "few_samples": Smallest(
-        "{dataset} --counts 60 --steps 2 --width 16", rf"60 test +: .*ratio {NUMBER}", package="torch"
-    ),
+    "few_samples": Smallest("{dataset} --counts 60 --kinds physics", rf"60 physics +test +: E +{NUMBER} ± {NUMBER} J"),
     "first_minute": Smallest("{out} tiny", rf"\| {NUMBER} ± {NUMBER} segments an hour \|"),
     "fuse": Smallest(
         "--hours 0.01 --paired-seconds 5", rf"15-state filterpy +{NUMBER} us/event[\s\S]*peak memory {NUMBER} MB"
@@ -74,6 +72,7 @@ SMALLEST = {
         "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"
     ),
     "physics": Smallest("--metres 100", rf"C_rr grass +{NUMBER} ± +{NUMBER}"),
+    "plan_path": Smallest("40 1", rf"peak memory: {NUMBER} x that of the full search"),
     "read_logs": Smallest("--minutes 0.05", rf"{NUMBER} of {NUMBER} figures met"),
     "real_data": Smallest("drive={log}", rf"drive, .*blocks .* {NUMBER} J"),
     "sample_patches": Smallest("50", rf"nearest gather +{NUMBER} us a patch +{NUMBER} x"),

@@ -70,9 +70,10 @@ def made_comparison(
     baseline: str, ratio: Ratio, *, quantity="E", split="unseen", rmse=5.0, groups=34
 ) -> BaselineResult:
     """A model beside a baseline, whose errors are ``ratio`` of the baseline's."""
+    errors = Errors(50, rmse, 5.0, 50)
     return BaselineResult(
-        baseline=baseline, split=split, quantity=quantity, errors=Errors(50, rmse, 5.0, 50), rmse_ratio=ratio, mape_ratio=ratio,
-        groups=groups, drawn_by="runs",
+        baseline=baseline, split=split, quantity=quantity, errors=errors, rmse_ratio=ratio, uncentred=errors,
+        uncentred_rmse_ratio=ratio, groups=groups, drawn_by="runs",
     )  # fmt: skip
 
 
@@ -80,6 +81,6 @@ def made_evaluation(**changes) -> Evaluation:
     """An evaluation without any figure; ``changes`` replace its fields."""
     empty = Evaluation(
         tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
-        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, repeatability={}, plots={},
+        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, repeatability={},
     )  # fmt: skip
     return replace(empty, **changes)

@@ -14,6 +14,7 @@ from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions
 
 if TYPE_CHECKING:
+    from tcpipe.experiment.reproduction import Size
     from tcpipe.formats.maps.map_files import MapFile
     from tcpipe.planning.cost_model import CostModel
 
@@ -62,9 +63,15 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 
 @click.command()
 @click.argument("directory", default="tcpipe-reproduction", type=OUTPUT_DIRECTORY, metavar="[DIR]")
-@click.option("--quick", is_flag=True, help="Run for minutes only: a small site and a narrow network.")
 @click.option(
-    "--seeds", default=1, type=click.IntRange(1, 100), help="Number of trainings; the claims compare their means."
+    "--size",
+    type=click.Choice(["full", "small", "quick"]),
+    default="full",
+    help="The paper's site; a small site and a narrow network; or these for a few epochs, to see it run.",
+)
+@click.option("--quick", is_flag=True, help="The same as --size quick.")
+@click.option(
+    "--seeds", default=1, type=click.IntRange(1, 100), help="Number of trainings; five or more decide the claims."
 )
 @jobs_option("Logs read")
 @click.option(
@@ -73,13 +80,14 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 )  # fmt: skip
 @click.option(
     "--baselines/--no-baselines", default=True,
-    help="Train the height-only networks of Wei and Isler, which take most of the time.",
+    help="Train networks of each class alone, with all layers and as Wei and Isler, which take most of the time.",
 )  # fmt: skip
 @json_option
 @quiet_option
 def reproduce(
     directory: str,
     *,
+    size: Size,
     quick: bool,
     seeds: int,
     jobs: int,
@@ -90,14 +98,20 @@ def reproduce(
 ) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 
-    Takes up to 90 minutes on two cores; an interrupted call resumes. The data are simulated: compare the pattern with the
-    paper, not the numbers. Writes reproduction.html, reproduction.json and all intermediate results to DIR.
+    Takes some two hours a training on two cores, minutes with --size small; an interrupted call resumes. The data are
+    simulated: compare the pattern with the paper, not the numbers. Writes reproduction.html, reproduction.json and all
+    intermediate results to DIR.
     """
     from tcpipe.experiment.reproduction import reproduce as run
 
     with show_progress("reproduce", quiet=quiet):
         result = run(
-            directory, quick=quick, seeds=seeds, jobs=jobs, hidden_variance=hidden_variance, baselines=baselines
+            directory,
+            size="quick" if quick else size,
+            seeds=seeds,
+            jobs=jobs,
+            hidden_variance=hidden_variance,
+            baselines=baselines,
         )
     print_result(result, as_json=as_json)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -75,6 +75,14 @@ def available_features(features: ExtraFeatures) -> tuple[ExtraFeature, ...]:
                 ExtraFeature(name, mean, max(float(known.std()), 1e-3), mean, (float(known.min()), float(known.max())))
             )
     return tuple(found)
+
+
+def fill_unknown(inputs: Sequence[ExtraFeature], features: ExtraFeatures) -> ExtraFeatures:
+    """Return the features with a model's usual values where one that it takes is unknown."""
+    values = {of.name: getattr(features, of.name) for of in inputs}
+    return replace(
+        features, **{of.name: np.where(np.isfinite(values[of.name]), values[of.name], of.usual) for of in inputs}
+    )
 
 
 def standardize_features(inputs: Sequence[ExtraFeature], features: ExtraFeatures) -> Floats:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, UsageError, clean_lines
-from tcpipe.experiment.reproduction_page import render_reproduction_page
 from tcpipe.experiment.simulation_floor import (
+    CLASS_AND_SLOPE,
+    FEWEST_SEEDS,
     Claim,
     check_claims,
     compute_true_costs,
@@ -26,13 +28,16 @@ from tcpipe.experiment.simulation_floor import (
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
-from tcpipe.learning.evaluation_files import read_evaluated_samples, run_evaluation
+from tcpipe.learning.evaluation_files import SIMULATED, run_evaluation
+from tcpipe.learning.evaluation_page import format_leakage
 from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.metrics import ALL, UNITS
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
+from tcpipe.report.page import Section, render_page
 from tcpipe.simulation import Scenario, SimulatedSite, find_scenario, simulate
 from tcpipe.simulation.paper_site import scale_hidden_variance
 
@@ -52,17 +57,31 @@ class Experiment:
     scenario: str
     fitting: FitConfig
     evaluating: EvaluateConfig
+    warning: str = ""
 
 
 FULL = Experiment("paper", FitConfig(epochs=40, patience=8), EvaluateConfig(noise_draws=5))
-"""The paper's size: fits 90 minutes on two cores."""
+"""The paper's size: fits two hours on two cores, a training."""
+
+SMALL = Experiment(
+    "paper_quick",
+    FitConfig(epochs=40, patience=8, batch_size=32, learning_rate=1e-3, width=16),
+    EvaluateConfig(noise_draws=2),
+    "This is the small site, with a narrow network: three short drives, some 300 training samples. Its figures are not the paper's size.",
+)
+"""Some minutes a training: enough of them for the claims, on few samples."""
 
 QUICK = Experiment(
     "paper_quick",
-    FitConfig(epochs=4, patience=4, batch_size=32, learning_rate=1e-3, width=16),
-    EvaluateConfig(noise_draws=2),
+    replace(SMALL.fitting, epochs=4, patience=4),
+    SMALL.evaluating,
+    "This is a quick run: the small site, a narrow network, few epochs. It only shows that all steps run: do not use its numbers.",
 )
 """Two minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
+
+Size = Literal["full", "small", "quick"]
+
+SIZES: Mapping[Size, Experiment] = {"full": FULL, "small": SMALL, "quick": QUICK}
 
 RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="sample"))
 """The defaults with the paper's random test samples."""
@@ -130,7 +149,7 @@ class Reproduction:
 def reproduce(
     directory: str | Path,
     *,
-    quick: bool = False,
+    size: Size = "full",
     seeds: int = 1,
     jobs: int = 1,
     hidden_variance: float = 1.0,
@@ -141,8 +160,8 @@ def reproduce(
     Parameters
     ----------
     directory : where everything goes: new, empty, or an earlier reproduction of the same size, which is gone on from.
-    quick : a small one, to see it run.
-    seeds : trainings; figures are compared by their means.
+    size : the paper's; the small site, for claims over many trainings; or the same with few epochs, to see it run.
+    seeds : trainings; claims are decided by five or more.
     jobs : logs read side by side.
     hidden_variance : variance of the resistance that nothing shows, over that of the frozen site.
     baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
@@ -151,7 +170,7 @@ def reproduce(
     ------
     UsageError : ``directory`` holds something else.
     """
-    place, plan = Path(directory), QUICK if quick else FULL
+    place, plan = Path(directory), SIZES[size]
     plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))
     clear(place)
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
@@ -222,14 +241,88 @@ def _write(result: Reproduction, plan: Experiment, hidden_variance: float) -> No
     write_json(result.directory / JSON, summary)
     write_text(
         result.directory / PAGE,
-        render_reproduction_page(
+        _render_page(
             result.runs,
-            read_evaluated_samples(result.directory / "seed-0" / "evaluation", result.directory / "dataset"),
             result.claims,
-            splits=result.counts.splits,
-            terrain=result.counts.terrain,
             shares=result.variance_shares,
             hidden_variance=hidden_variance,
-            quick=plan.scenario == QUICK.scenario,
+            warnings=[plan.warning] if plan.warning else [],
         ),
     )
+
+
+def _render_page(
+    runs: Sequence[Evaluation],
+    claims: Sequence[Claim],
+    *,
+    shares: Mapping[str, float],
+    hidden_variance: float,
+    warnings: Sequence[str],
+) -> str:
+    """Return the HTML page of the evaluations of all trainings; ``shares`` are of the variance of E, by what makes it."""
+    verdicts = Counter(claim.verdict for claim in claims)
+    counts = ", ".join(f"{count} {name}" for name, count in verdicts.items())
+    audits = (f"{split}: {format_leakage(part.leakage)}" for split, part in runs[0].splits.items())
+    return render_page(
+        title="The paper's experiment on a simulated site",
+        lead=f"Of {len(claims)} claims: {counts}; {len(runs)} training{'s' if len(runs) > 1 else ''}. {' '.join(audits)} "
+        "All tables of a training are in seed-N/evaluation/evaluation.html.",
+        numbers=[],
+        warnings=[SIMULATED, *warnings],
+        sections=[
+            _make_claims_section(claims),
+            _make_errors_section(runs),
+            _make_variance_section(shares, hidden_variance),
+        ],
+    )
+
+
+def _make_claims_section(claims: Sequence[Claim]) -> Section:
+    rows = [
+        (
+            claim.says, claim.split, claim.verdict, str(claim.ratio),
+            "–" if claim.between_seeds is None else f"{100.0 * claim.between_seeds:.0f} %",
+            "–" if claim.in_the_paper is None else f"{claim.in_the_paper:.2f}",
+        )
+        for claim in claims
+    ]  # fmt: skip
+    text = (
+        "RMSE of E of the network over a baseline's, of the same samples, both centred by class: the mean of all trainings, with its 95 % "
+        "interval over trainings and test samples. Held if all of it is below 1, NOT held if above, open otherwise, and of fewer than "
+        f"{FEWEST_SEEDS} trainings. Height, class and slow ground matter by construction of the site, so they are no claims."
+    )
+    header = ("claim", "split", "", "here", "between trainings (1σ)", "the paper")
+    return Section("Claims of the paper", text, header=header, rows=rows, figures_from=3)
+
+
+def _make_errors_section(runs: Sequence[Evaluation]) -> Section:
+    """Return the errors of each training above those of a predictor that knows the simulator."""
+    rows = []
+    for split, part in runs[0].splits.items():
+        for quantity in ("E", "T"):
+            found = [run.splits[split].errors[quantity][ALL] for run in runs]
+            floor = [] if part.simulation_floor is None else [part.simulation_floor[quantity][ALL]]
+            figures = (
+                f"{error.rmse:.3f} {UNITS[quantity]}, {error.mape_percent or float('nan'):.2f} %"
+                for error in (*floor, *found)
+            )
+            rows.append((split, quantity, *figures))
+    text = "The floor knows the simulator, map, path and turn without error; hidden variation and the noise of the labels remain."
+    header = ("", "", "floor", *(f"seed {number}" for number in range(len(runs))))
+    return Section("RMSE and MAPE of every training", text, header=header, rows=rows, figures_from=2)
+
+
+def _make_variance_section(shares: Mapping[str, float], hidden_variance: float) -> Section:
+    """Return the parts of E's variance, and their shares of what class and slope leave."""
+    rest = sum(share for name, share in shares.items() if name != CLASS_AND_SLOPE)
+    rows = []
+    for name, share in shares.items():
+        of_rest = "–" if name == CLASS_AND_SLOPE else f"{100.0 * share / rest if rest else float('nan'):.0f} %"
+        rows.append((name, f"{100.0 * share:.2f} %", of_rest))
+    text = (
+        "Of measured E on the unseen area: what a spline over the slope of each class explains; then what such splines leave of what "
+        "changes where a part of the simulated world is taken out. They add up to one only as far as they are independent. "
+        f"The hidden resistance has {hidden_variance:g} times the variance of the frozen site."
+    )
+    header = ("source", "of the variance of E", "share of the rest")
+    return Section("Variance of E by source", text, header=header, rows=rows, figures_from=1)

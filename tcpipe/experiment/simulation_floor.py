@@ -16,10 +16,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.special import stdtrit
 
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import read_extra_features
-from tcpipe.learning.baselines import CURVES, OURS, PER_CLASS, TREES
+from tcpipe.learning.baselines import ALL_LAYERS_PER_CLASS, CURVES, OURS, PER_CLASS, TREES
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult, Evaluation
 from tcpipe.learning.evaluation_page import ENERGY
 from tcpipe.learning.metrics import Array, Ratio, compute_costs
@@ -142,11 +143,15 @@ def _mean_over(values: Array, count: int) -> Array:
 Verdict = Literal["held", "open", "NOT held", "not measured"]
 
 CLAIMS = {
-    PER_CLASS: "one net beats a net per class",
+    ALL_LAYERS_PER_CLASS: "one net beats a net per class, all layers",
+    PER_CLASS: "one net beats a net per class, heights alone",
     CURVES["spline"]: "the net beats class and slope",
     TREES: "the net beats gradient boosting",
 }
 """By the baseline; each is of E, on every split."""
+
+FEWEST_SEEDS = 5
+"""Trainings without which no claim is decided: one of them says nothing of how far another would be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,44 +161,70 @@ class Claim:
     says: str
     split: str
     ratio: Ratio
+    """Its mean over trainings, with the 95 % interval over trainings and samples."""
+    seeds: int
+    between_seeds: float | None
+    """Standard deviation of the ratio's logarithm between trainings; None of one."""
     in_the_paper: float | None
     verdict: Verdict
-    """``held``: the whole 95 % interval lies below 1; ``NOT held``: above; ``open``: it holds 1, or there are too few groups for one."""
+    """``held``: the whole 95 % interval lies below 1; ``NOT held``: above; ``open``: it holds 1, or trainings or groups are too few."""
 
     def __str__(self) -> str:
         """Return the claim, its figure and its verdict as one line."""
         told = "" if self.in_the_paper is None else f" ({self.in_the_paper:.2f} in the paper)"
-        return f"{self.verdict}: {self.says}, {self.split}: RMSE of E {self.ratio} of its{told}"
+        trainings = (
+            "one training"
+            if self.between_seeds is None
+            else f"{self.seeds} trainings, {100.0 * self.between_seeds:.0f} % apart (1σ)"
+        )
+        return f"{self.verdict}: {self.says}, {self.split}: RMSE of E {self.ratio} of its{told}; {trainings}"
 
 
 def check_claims(runs: Sequence[Evaluation]) -> list[Claim]:
-    """Return every claim with its verdict over all trainings (one evaluation a seed): mean ratios with the widest interval."""
+    """Return every claim with its verdict over all trainings (one evaluation a seed)."""
     found = []
     for split in runs[0].splits:
         for baseline, says in CLAIMS.items():
-            ratio = _combine_ratios([_compute_ratio(run, baseline, split) for run in runs])
-            found.append(Claim(says, split, ratio, _read_paper_value(baseline, split), _find_verdict(ratio)))
+            rows = [_find_result(run, baseline, split) for run in runs]
+            ratio, between = _combine_ratios([row for row in rows if row is not None], len(runs))
+            verdict = _find_verdict(ratio, len(runs))
+            found.append(Claim(says, split, ratio, len(runs), between, _read_paper_value(baseline, split), verdict))
     return found
 
 
-def _compute_ratio(run: Evaluation, baseline: str, split: str) -> Ratio:
+def _find_result(run: Evaluation, baseline: str, split: str) -> BaselineResult | None:
     rows: tuple[BaselineResult, ...] = (*run.networks, *run.baselines)
-    mine = (row.rmse_ratio for row in rows if (row.baseline, row.split, row.quantity) == (baseline, split, "E"))
-    return next(mine, Ratio(None, None, None))
+    return next((row for row in rows if (row.baseline, row.split, row.quantity) == (baseline, split, "E")), None)
 
 
-def _combine_ratios(ratios: Sequence[Ratio]) -> Ratio:
-    values, lows, highs = ([getattr(ratio, end) for ratio in ratios] for end in ("value", "low", "high"))
-    if None in values:
-        return Ratio(None, None, None)
-    mean = float(np.exp(np.mean(np.log(values))))
-    return Ratio(mean, None, None) if None in lows else Ratio(mean, min(lows), max(highs))
+def _combine_ratios(rows: Sequence[BaselineResult], seeds: int) -> tuple[Ratio, float | None]:
+    """Return the mean ratio with its interval, and the standard deviation between trainings.
+
+    The variance of the mean logarithm is that of the trainings, over their number, and that of the samples, which are the same for all of
+    them: that of the bootstrap. Degrees of freedom are Welch and Satterthwaite's.
+    """
+    values = [row.rmse_ratio.value for row in rows if row.rmse_ratio.value is not None]
+    if len(values) < seeds:
+        return Ratio(None, None, None), None
+    logs = np.log(values)
+    mean = float(np.exp(logs.mean()))
+    if seeds < 2:
+        return Ratio(mean, None, None), None
+    between = float(logs.std(ddof=1))
+    groups = min(row.groups for row in rows)
+    widths = [np.log(high / low) for row in rows if (low := row.rmse_ratio.low) and (high := row.rmse_ratio.high)]
+    if len(widths) < seeds:
+        return Ratio(mean, None, None), between
+    parts = between**2 / seeds, float(np.mean(np.square(widths))) / (2.0 * float(stdtrit(groups - 1, 0.975))) ** 2
+    freedom = sum(parts) ** 2 / max(parts[0] ** 2 / (seeds - 1) + parts[1] ** 2 / (groups - 1), 1e-300)
+    half = float(stdtrit(max(freedom, 1.0), 0.975)) * float(np.sqrt(sum(parts)))
+    return Ratio(mean, mean * float(np.exp(-half)), mean * float(np.exp(half))), between
 
 
-def _find_verdict(ratio: Ratio) -> Verdict:
+def _find_verdict(ratio: Ratio, seeds: int) -> Verdict:
     if ratio.value is None:
         return "not measured"
-    if ratio.low is None or ratio.high is None or ratio.low <= 1.0 <= ratio.high:
+    if ratio.low is None or ratio.high is None or seeds < FEWEST_SEEDS or ratio.low <= 1.0 <= ratio.high:
         return "open"
     return "held" if ratio.high < 1.0 else "NOT held"
 

@@ -25,28 +25,18 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
         np.savez(stream, allow_pickle=False, **dict(arrays))
 
 
-def read_arrays(
-    path: Path, forms: Mapping[str, ArrayForm] | None = None, *, optional: Collection[str] = ()
-) -> dict[str, NDArray[np.generic]]:
-    """Return what `write_arrays` wrote. No array is read before every header agrees with the file's size, and with what is wanted.
-
-    Parameters
-    ----------
-    path : the file.
-    forms : by name, what must be there and nothing else; None: any arrays.
-    optional : names of forms that may be missing.
+def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
+    """Return what `write_arrays` wrote; no array is read before every header agrees with the file's size.
 
     Raises
     ------
-    ModelError : the file is cut short, damaged, none of its kind, or holds arrays of other names, types or shapes.
+    ModelError : the file is cut short, damaged, or none of its kind.
     """
     if path.is_file() and not zipfile.is_zipfile(path):
         raise ModelError(f"{path}: cut short or damaged (no end of an archive in it)")
     try:
         with path.open("rb") as stream:
-            found = _read_headers(stream, path.stat().st_size)
-            if forms is not None and (wrong := _find_wrong_form(found, forms, optional)):
-                raise ModelError(f"{path}: contains the weights of another model: {wrong}; train the model again")
+            _check_headers(stream, path.stat().st_size)
             with np.load(stream, allow_pickle=False) as held:
                 return {name: held[name] for name in held.files}
     except FileNotFoundError:
@@ -65,9 +55,9 @@ def read_arrays(
         raise ModelError(f"{path}: cut short or damaged ({error})") from None
 
 
-def _read_headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
-    """Return what an archive's arrays say that they are; `ValueError` where they claim more bytes than the file has."""
-    found: dict[str, ArrayForm] = {}
+def _check_headers(stream: BinaryIO, size: int) -> None:
+    """Raise `ValueError` where an archive's arrays claim other bytes than the file has."""
+    names = set[str]()
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if any(of.compress_type != zipfile.ZIP_STORED for of in members) or sum(of.file_size for of in members) > size:
@@ -82,14 +72,21 @@ def _read_headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
                     raise ValueError(f"{member.filename[:80]!r} contains no numbers")
                 if array.tell() + dtype.itemsize * math.prod(shape) != member.file_size:
                     raise ValueError(f"{member.filename[:80]!r} claims {shape} of {dtype}, which its bytes are not")
-            found[member.filename.removesuffix(".npy")] = dtype.name, shape
-    if len(found) != len(members):
+            names.add(member.filename)
+    if len(names) != len(members):
         raise ValueError("two arrays of one name")
     stream.seek(0)
-    return found
 
 
 _READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def check_arrays(
+    arrays: Mapping[str, NDArray[np.generic]], forms: Mapping[str, ArrayForm], optional: Collection[str] = ()
+) -> None:
+    """Raise `ModelError` unless arrays have these names, types and shapes; those that are ``optional`` may be missing."""
+    if wrong := _find_wrong_form({name: (of.dtype.name, of.shape) for name, of in arrays.items()}, forms, optional):
+        raise ModelError(f"contains the weights of another model: {wrong}; train the model again")
 
 
 def _find_wrong_form(

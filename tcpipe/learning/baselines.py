@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.cost.prediction_errors import Residuals
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import DatasetError, ModelError
@@ -17,20 +20,19 @@ from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult
 from tcpipe.learning.metrics import (
     ALL,
+    FEWEST_GROUPS,
     LEAST,
-    LEAST_VELOCITY_MPS,
     Array,
-    Costs,
     Errors,
     Spread,
     compare_errors,
-    compute_costs,
     compute_errors,
     compute_errors_by_class,
 )
 from tcpipe.learning.models import Model
-from tcpipe.learning.physics_model import Curves, Form, find_idle_power, fit_curves, fit_physics_model
-from tcpipe.learning.predictions import Measured, predict_costs, predict_spreads
+from tcpipe.learning.physics_model import Form, find_idle_power, fit_curves, fit_physics_model
+from tcpipe.learning.predictions import Measured, Predicted, make_residuals, predict_costs, predict_spreads
+from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import Variant
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -43,87 +45,99 @@ CURVES: Mapping[Form, str] = {
 }
 PHYSICS, TREES = "physics", "gradient boosting"
 SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
-
-_FEWEST_RUNS = 10
-"""Runs of a split that are drawn as wholes; of fewer, blocks of ground are."""
+BASELINE_OF_KIND = {"boosting": TREES, "physics": PHYSICS}
+"""What a baseline is called that would be the model itself."""
 
 _ALIKE = 1.005
 """Ratio up to which errors are the same: by digits of rounding nobody is better."""
 
-Predictor = Callable[[Split], Array]
+Predict = Callable[[Split], Array]
 """Power [W] and velocity [m/s] of the samples of a split, shape (N, 2)."""
 
 
+Fit = Callable[[Split], tuple[Predict, Array | None]]
+"""From training samples to a predictor; and what the other folds say of each of them, where that comes with it."""
+
+
 def compare_baselines(
-    ours: Model, data: Dataset, sets: Mapping[str, Measured], said: Mapping[str, Costs], *, seed: int
+    ours: Model, data: Dataset, sets: Mapping[str, Measured], said: Mapping[str, Predicted], *, seed: int
 ) -> tuple[list[BaselineResult], list[Finding]]:
     """Return the results of every baseline, and a finding for each that cannot be fitted.
 
-    The baselines are fitted on the training samples of ``data`` and evaluated on ``sets``, the same samples as the predictions ``said`` of
-    the model. ``seed`` is that of the bootstrap.
+    The baselines are fitted on the training samples of ``data``, centred as the model is, and evaluated on ``sets``, the same samples as
+    the predictions ``said`` of the model. ``seed`` is that of the bootstrap.
     """
-    kind = ours.card.training.config.model
-    own = {"boosting": TREES, "physics": PHYSICS}.get(kind)
+    own = BASELINE_OF_KIND.get(ours.card.training.config.model)
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
         return [], [make_finding("baseline-missing", Subject("model", "baselines"), names=names)]
-    predictors, lacking = _fit_baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
-    logger.info("baselines: %s, fitted on %d samples", ", ".join(predictors), len(train))
-    found: list[BaselineResult] = []
+    fitted, lacking = _fit_baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
+    logger.info("baselines: %s, fitted on %d samples", ", ".join(fitted), len(train))
+    found, block_m = list[BaselineResult](), data.card.recipe.split.block_m
     for split, part in sets.items():
-        for name, predict in predictors.items():
-            power, velocity = predict(part.split).T
-            theirs = compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), ours.chord_m)
-            found += compare_with_baseline(
-                name, split, part, said[split], theirs, block_m=data.card.recipe.split.block_m, seed=seed
-            )
+        class_ids = read_extra_features(part.split).class_id
+        for name, (predict, residuals) in fitted.items():
+            theirs = Predicted.centre(residuals, predict(part.split), class_ids, ours.chord_m)
+            found += compare_with_baseline(name, split, part, said[split], theirs, block_m=block_m, seed=seed)
     return found, lacking
 
 
 def _select_fitted_samples(train: Split, ours: Model) -> Split:
     """Return the samples that a model of this kind is fitted on: for a network without the fold that stops it."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
-    if ours.card.training.config.model != "resnet18":
+    if not find_kind(ours.card.training.config.model).stops_by_fold:
         return labelled
     fitted, _ = labelled.fold(ours.card.training.config.fold)
     return fitted if len(fitted) else labelled
 
 
-def _fit_baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[Finding]]:
-    """Return the baselines by name, and a finding for each that cannot be fitted."""
-    found, lacking = dict(_fit_curves(train)), list[Finding]()
-    for name, fit in ((PHYSICS, _fit_physics), (TREES, _fit_trees)):
-        if name in wanted:
-            try:
-                found[name] = fit(train, ours)
-            except ModelError as error:
-                names = {"error": error.problems[0]}
-                lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
+def _fit_baselines(
+    train: Split, ours: Model, wanted: Sequence[str]
+) -> tuple[dict[str, tuple[Predict, Residuals]], list[Finding]]:
+    """Return the baselines by name, with their held-out predictions, and a finding for each that cannot be fitted."""
+    fits: dict[str, Fit] = {name: partial(_fit_curves, form) for form, name in CURVES.items()}
+    fits |= {PHYSICS: _fit_physics, TREES: partial(_fit_trees, ours)}
+    found, lacking = dict[str, tuple[Predict, Residuals]](), list[Finding]()
+    for name in wanted:
+        try:
+            predict, said = fits[name](train)
+            found[name] = predict, make_residuals(train, _cross_fit(fits[name], train) if said is None else said)
+        except ModelError as error:
+            names = {"error": error.problems[0]}
+            lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
     return found, lacking
 
 
-def _fit_curves(train: Split) -> Iterator[tuple[str, Predictor]]:
-    labels, extra_features = train.labels.astype(np.float64), read_extra_features(train)
-    for form, name in CURVES.items():
-        curves = fit_curves(form, extra_features.slope_rad, extra_features.class_id, labels)
-
-        def predict(split: Split, curves: Curves = curves) -> Array:
-            there = read_extra_features(split)
-            return curves.predict(there.slope_rad, there.class_id)
-
-        yield name, predict
+def _cross_fit(fit: Fit, train: Split) -> Array:
+    """Return what is said of each sample by a fit to the other folds; NaN where these are too few, which centres nothing."""
+    said, folds = np.full((len(train), 2), np.nan), train.column("fold")
+    for fold in np.unique(folds):
+        held = folds == fold
+        with suppress(ModelError):
+            said[held] = np.nan if held.all() else fit(train.take(~held))[0](train.take(held))
+    return said
 
 
-def _fit_physics(train: Split, ours: Model) -> Predictor:
-    del ours
+def _fit_curves(form: Form, train: Split) -> tuple[Predict, None]:
+    features = read_extra_features(train)
+    curves = fit_curves(form, features.slope_rad, features.class_id, train.labels.astype(np.float64))
+
+    def predict(split: Split) -> Array:
+        there = read_extra_features(split)
+        return curves.predict(there.slope_rad, there.class_id)
+
+    return predict, None
+
+
+def _fit_physics(train: Split) -> tuple[Predict, None]:
     fitted = fit_physics_model(
         read_extra_features(train), train.labels.astype(np.float64), idle_watt=find_idle_power(train)
     )
-    return lambda split: fitted.predict(read_extra_features(split))
+    return lambda split: fitted.predict(np.empty(0, np.float32), read_extra_features(split)), None
 
 
-def _fit_trees(train: Split, ours: Model) -> Predictor:
+def _fit_trees(ours: Model, train: Split) -> tuple[Predict, Array]:
     """Return trees over features of all layers, and of the turn."""
     from tcpipe.learning.table_model import compute_features, fit_table  # noqa: PLC0415  numba loads with it
 
@@ -141,16 +155,16 @@ def _fit_trees(train: Split, ours: Model) -> Predictor:
             ]
         )
 
-    model, _ = fit_table(
+    model, said = fit_table(
         features(train), labels, np.ones_like(labels), folds, channels=train.channels, class_count=ours.classes.count
     )
-    return lambda split: model.predict(features(split))
+    return lambda split: model.predict(features(split)), said
 
 
 def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
     """Return groups of samples with correlated errors: runs where there are enough, else blocks of ground."""
     runs = split.column("run_id").astype(np.str_)
-    if len(np.unique(runs)) >= _FEWEST_RUNS:
+    if len(np.unique(runs)) >= FEWEST_GROUPS:
         return "runs", runs
     lon_deg, lat_deg = (split.column(f"start_{axis}_deg").astype(np.float64) for axis in ("lon", "lat"))
     datum = float(lon_deg[0]), float(lat_deg[0]), 0.0  # one for all: x and y of a sample are in its own run's frame
@@ -159,23 +173,24 @@ def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "block
 
 
 def compare_with_baseline(
-    name: str, split: str, part: Measured, ours: Costs, theirs: Costs, *, block_m: float, seed: int
+    name: str, split: str, part: Measured, ours: Predicted, theirs: Predicted, *, block_m: float, seed: int
 ) -> Iterator[BaselineResult]:
     """Yield the results of a baseline for every quantity that it predicts.
 
     ``ours`` and ``theirs`` are predictions for the samples of ``part``; the bootstrap with ``seed`` draws runs, or blocks of ``block_m``.
     """
     drawn_by, groups = _group_samples(part.split, block_m)
-    for quantity in theirs:
-        measured = part.costs[quantity]
-        large = measured >= LEAST[quantity]
-        off, other = (np.abs(costs_of[quantity] - measured) for costs_of in (ours, theirs))
-        over = np.where(large, measured, 1.0)
+    for quantity, measured in part.costs.items():
+        if quantity not in theirs.costs:
+            continue
+        ratios = [
+            compare_errors((mine[quantity] - measured) ** 2, (other[quantity] - measured) ** 2, groups, seed=seed)
+            for mine, other in ((ours.costs, theirs.costs), (ours.uncentred, theirs.uncentred))
+        ]
         yield BaselineResult(
             baseline=name, split=split, quantity=quantity,
-            errors=compute_errors(theirs[quantity], measured, LEAST[quantity]),
-            rmse_ratio=compare_errors(off**2, other**2, groups, power=0.5, seed=seed),
-            mape_ratio=compare_errors(off[large] / over[large], other[large] / over[large], groups[large], power=1.0, seed=seed),
+            errors=compute_errors(theirs.costs[quantity], measured, LEAST[quantity]), rmse_ratio=ratios[0],
+            uncentred=compute_errors(theirs.uncentred[quantity], measured, LEAST[quantity]), uncentred_rmse_ratio=ratios[1],
             groups=len(np.unique(groups)), drawn_by=drawn_by,
         )  # fmt: skip
 
@@ -223,6 +238,7 @@ def _is_better(row: BaselineResult) -> bool:
 
 
 OURS, GRASS_ONLY, PER_CLASS = "ours", "Wei & Isler, grass only", "Wei & Isler, a net per class"
+ALL_LAYERS_PER_CLASS = "a net per class, all layers"
 
 FEWEST = 20
 """Samples of a class in train that a network of its own needs."""
@@ -234,54 +250,63 @@ def make_energy_table(
     ours: Model,
     data: Dataset,
     sets: Mapping[str, Measured],
-    said: Mapping[str, Mapping[str, Array]],
+    said: Mapping[str, Predicted],
     trained: Trained | None,
     *,
     seed: int,
 ) -> tuple[dict[str, dict[str, Errors]], list[BaselineResult]]:
-    """Return errors of E by predictor and split, and the baselines' results (table IV).
+    """Return errors of E by predictor and split, and the results of the networks beside it (table IV).
 
     They are of the samples whose class has a network of its own; of all samples where ``trained`` is None.
     """
-    networks = {} if trained is None or "height" not in data.card.layers else _fit_networks(ours, trained)
-    grass = next((entry.id for entry in ours.classes.classes if entry.name == "grass" and entry.id in networks), None)
+    networks: dict[str, dict[int, Model]] = {}
+    if trained is not None:
+        networks[ALL_LAYERS_PER_CLASS] = _train_by_class(ours, trained, "class", Variant())
+        if "height" in data.card.layers:
+            of_height = Variant(channels=("height",), energy_only=True)
+            networks[PER_CLASS] = _train_by_class(ours, trained, "wei_isler_class", of_height)
+            grass = {entry.id for entry in ours.classes.classes if entry.name == "grass"} & networks[PER_CLASS].keys()
+            networks[GRASS_ONLY] = {class_id: networks[PER_CLASS][class_id] for class_id in grass}
+    known = set.intersection(*(set(of) for name, of in networks.items() if name != GRASS_ONLY)) if networks else set()
     errors, results = dict[str, dict[str, Errors]](), list[BaselineResult]()
     for split, part in sets.items():
-        rows = np.flatnonzero(np.isin(part.class_ids, list(networks)) | (not networks))
-        same, mine = part.take(rows), {"E": said[split]["E"][rows]}
-        errors.setdefault(OURS, {})[split] = _compute_error(mine, same, predict_spreads(ours, mine, same.class_ids))
-        if not networks or not len(rows):
-            continue
-        theirs = {PER_CLASS: _predict_by_class_network(networks, same)}
-        if grass is not None:
-            theirs[GRASS_ONLY] = predict_costs(networks[grass], same.split)["E"]
-        for name, energy in theirs.items():
-            errors.setdefault(name, {})[split] = _compute_error({"E": energy}, same)
+        rows = np.flatnonzero(np.isin(part.class_ids, list(known)) | (not known))
+        same, mine = part.take(rows), said[split].take(rows)
+        errors.setdefault(OURS, {})[split] = _compute_error(
+            mine, same, predict_spreads(ours, mine.costs, same.class_ids)
+        )
+        for name, by_class in networks.items():
+            if not by_class or not known or not len(rows):
+                continue
+            theirs = _predict_by_class(by_class, same, of_all=name == GRASS_ONLY)
+            errors.setdefault(name, {})[split] = _compute_error(theirs, same)
             block_m = data.card.recipe.split.block_m
-            results += compare_with_baseline(name, split, same, mine, {"E": energy}, block_m=block_m, seed=seed)
+            results += compare_with_baseline(name, split, same, mine, theirs, block_m=block_m, seed=seed)
     return errors, results
 
 
-def _fit_networks(ours: Model, trained: Trained) -> dict[int, Model]:
+def _train_by_class(ours: Model, trained: Trained, name: str, variant: Variant) -> dict[int, Model]:
     """Return a network for every class with enough samples, by class id."""
     found = {}
     for class_id in (class_id for class_id, count in ours.card.training_range.class_counts.items() if count >= FEWEST):
         try:
-            variant = Variant(channels=("height",), classes=(class_id,), energy_only=True)
-            found[class_id] = trained(f"wei_isler_class_{class_id}", variant)
+            found[class_id] = trained(f"{name}_{class_id}", replace(variant, classes=(class_id,)))
         except DatasetError as error:
             logger.info("no network for class %d alone: %s", class_id, error.problems[0])
     return found
 
 
-def _predict_by_class_network(networks: Mapping[int, Model], found: Measured) -> Array:
-    energy = np.empty(len(found.split))
+def _predict_by_class(networks: Mapping[int, Model], found: Measured, *, of_all: bool) -> Predicted:
+    """Return E of each sample by the network of its class, or of all samples by the only network."""
+    costs, uncentred = np.empty(len(found.split)), np.empty(len(found.split))
     for class_id, network in networks.items():
-        here = np.flatnonzero(found.class_ids == class_id)
+        here = np.flatnonzero((found.class_ids == class_id) | of_all)
         if len(here):
-            energy[here] = predict_costs(network, found.split.take(here))["E"]
-    return energy
+            said = predict_costs(network, found.split.take(here))
+            costs[here], uncentred[here] = said.costs["E"], said.uncentred["E"]
+    return Predicted({"E": costs}, {"E": uncentred})
 
 
-def _compute_error(energy: Mapping[str, Array], found: Measured, spreads: Mapping[str, Spread] | None = None) -> Errors:
+def _compute_error(said: Predicted, found: Measured, spreads: Mapping[str, Spread] | None = None) -> Errors:
+    energy = {"E": said.costs["E"]}
     return compute_errors_by_class(energy, found.costs, found.class_ids, found.names, spreads)["E"][ALL]

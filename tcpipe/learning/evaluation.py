@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.balance.correlation import Floor
-from tcpipe.cost.prediction_errors import fit_bias_correction
+from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
@@ -22,7 +22,6 @@ from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import (
     CURVES,
     OURS,
-    PER_CLASS,
     PHYSICS,
     TREES,
     Trained,
@@ -39,12 +38,12 @@ from tcpipe.learning.evaluation_facts import (
     EvaluatedModel,
     Evaluation,
     Leakage,
-    Plotted,
     SplitErrors,
 )
 from tcpipe.learning.metrics import (
     ALL,
     Array,
+    Costs,
     Errors,
     Spread,
     average_draws,
@@ -55,12 +54,14 @@ from tcpipe.learning.metrics import (
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import (
     Measured,
+    Predicted,
     check_fit,
     collect_measured,
     make_predictions_table,
     predict_costs,
     predict_spreads,
 )
+from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import Variant, compute_dataset_checksum, make_training_task, train
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
@@ -84,8 +85,8 @@ PlantCosts = Callable[[Split], dict[str, Array]]
 """Costs of samples by a predictor that knows how they were simulated."""
 
 Sets = dict[str, Measured]
-Said = Mapping[str, Mapping[str, Array]]
-"""What a model says of each split: costs by quantity, shape (N,) each."""
+Said = Mapping[str, Predicted]
+"""What a model says of each split."""
 
 
 def evaluate(
@@ -119,7 +120,7 @@ def evaluate(
             f"{data.path}: no labelled samples in test nor unseen: nothing to evaluate on; build it with a --split"
         )
     said = {name: predict_costs(ours, found.split) for name, found in sets.items()}
-    spreads = {name: predict_spreads(ours, said[name], found.class_ids) for name, found in sets.items()}
+    spreads = {name: predict_spreads(ours, said[name].costs, found.class_ids) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
 
@@ -134,7 +135,7 @@ def evaluate(
         return load_model(place)
 
     ablation = list(_iterate_ablation(ours, sets, config, trained))
-    with_networks = config.baselines and fitting.model == "resnet18"
+    with_networks = config.baselines and find_kind(fitting.model).stops_by_fold
     energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(
@@ -151,11 +152,10 @@ def evaluate(
         baselines=tuple(baselines),
         blocks=compute_block_errors(ours, names),
         repeatability=_estimate_repeatability(data.card, ENERGIES[ours.label_energy]),
-        plots={name: _select_plotted(part, said[name], config.plotted) for name, part in sets.items()},
     )
     findings = (*lacking, *_find_mismatches(ours, data, sets, energy), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
-    return evaluation, make_predictions_table(sets, said, spreads)
+    return evaluation, make_predictions_table(sets, {name: of.costs for name, of in said.items()}, spreads)
 
 
 def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:
@@ -166,17 +166,25 @@ def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floo
 
 
 def _split_errors(
-    data: Dataset, found: Measured, said: Mapping[str, Array], spreads: Mapping[str, Spread], plant: PlantCosts | None
+    data: Dataset, found: Measured, said: Predicted, spreads: Mapping[str, Spread], plant: PlantCosts | None
 ) -> SplitErrors:
     def errors_of(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
         return compute_errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
 
+    runs, uncentred = found.split.column("run_id"), errors_of(said.uncentred)
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
         samples=len(found.split),
         classes=counts,
         class_order=tuple(counts),
-        errors=errors_of(said, spreads),
+        errors=errors_of(said.costs, spreads),
+        coverage={
+            quantity: measure_coverage(
+                (spread.low <= found.costs[quantity]) & (found.costs[quantity] <= spread.high), runs
+            )
+            for quantity, spread in spreads.items()
+        },
+        uncentred={quantity: by_class[ALL] for quantity, by_class in uncentred.items()},
         leakage=measure_leakage(data, found.split),
         label_floor=label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
         simulation_floor=None if plant is None else errors_of(plant(found.split)),
@@ -193,7 +201,9 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: 
         for at, (name, found) in enumerate(sets.items()):
             draws = [
                 _compute_errors(
-                    predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found, ours
+                    predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)).costs,
+                    found,
+                    ours,
                 )
                 for draw in range(config.noise_draws if noise else 1)
             ]
@@ -202,7 +212,8 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: 
         if config.retrain_ablation and noise:
             anew = trained("ablation_" + "".join(letters), Variant(channels=left))
             by_split = {
-                name: _compute_errors(predict_costs(anew, found.split), found, anew) for name, found in sets.items()
+                name: _compute_errors(predict_costs(anew, found.split).costs, found, anew)
+                for name, found in sets.items()
             }
             yield AblationRow(letters, "retrained", **by_split)
 
@@ -214,7 +225,7 @@ def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:
     return list(dict.fromkeys(letters for letters in found if letters))
 
 
-def _compute_errors(said: Mapping[str, Array], found: Measured, by: Model | None = None) -> dict[str, Errors]:
+def _compute_errors(said: Costs, found: Measured, by: Model | None = None) -> dict[str, Errors]:
     """Return the errors of all classes, and how well a model told them; ``by`` None tells none."""
     spreads = None if by is None else predict_spreads(by, said, found.class_ids)
     by_class = compute_errors_by_class(said, found.costs, found.class_ids, found.names, spreads)
@@ -229,7 +240,7 @@ def _find_fastest_mps(robot: str, data: Dataset) -> float | None:
 
 def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's maximum speed."""
-    found = {OURS: {name: _compute_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
+    found = {OURS: {name: _compute_errors(said[name].costs, part, ours)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:
         expected = {
             name: {"T": np.full(len(part.split), ours.chord_m / max_velocity_mps)} for name, part in sets.items()
@@ -254,22 +265,9 @@ def _find_mismatches(
                 yield make_finding("class-not-in-training", unseen, names={"split": name}, sample_count=count)
         if unlabelled := total - len(found.split):
             yield make_finding("samples-without-label", subject, unlabelled_count=unlabelled, sample_count=total)
-        if PER_CLASS in energy and (without := len(found.split) - energy[PER_CLASS][name].count):
+        if len(energy) > 1 and (without := len(found.split) - energy[OURS][name].count):
             total = len(found.split)
             yield make_finding("classes-without-network", subject, left_count=without, sample_count=total)
-
-
-def _select_plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
-    """Return the first samples of every class (the rows stand in random order)."""
-    rows = [np.flatnonzero(found.class_ids == class_id)[:count] for class_id in found.names]
-    at = np.concatenate(rows)
-    return {
-        "class": [name for name, here in zip(found.names.values(), rows, strict=True) for _ in here],
-        "E_measured": found.costs["E"][at].tolist(),
-        "T_measured": found.costs["T"][at].tolist(),
-        "E_predicted": said["E"][at].tolist(),
-        "T_predicted": said["T"][at].tolist(),
-    }
 
 
 _UNKNOWN = {0: "unknown"}
@@ -301,12 +299,10 @@ def compute_block_errors(model: Model, names: Mapping[int, str]) -> ErrorsByClas
         for name in ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
     )
     class_ids = np.nan_to_num(found["terrain_class"].astype(np.float64)).astype(np.int64)
-    centred = fit_bias_correction(found).apply(said_power, said_velocity, class_ids)
+    centred = Predicted.centre(model.residuals, np.column_stack([said_power, said_velocity]), class_ids, model.chord_m)
     known = {**_UNKNOWN, **names}
     own = {number: known.get(number, str(number)) for number in np.unique(class_ids).tolist()}
-    return compute_errors_by_class(
-        compute_costs(*centred, model.chord_m), compute_costs(power, velocity, model.chord_m), class_ids, own
-    )
+    return compute_errors_by_class(centred.costs, compute_costs(power, velocity, model.chord_m), class_ids, own)
 
 
 _QUANTITIES = {"energy": "E", "time": "T"}
@@ -361,10 +357,8 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
 
 
 def _find_coverage(part: SplitErrors, subject: Subject) -> Iterator[Finding]:
-    percent = part.errors["E"][ALL].coverage_percent
-    if percent is None:
+    if not part.coverage:
         yield make_finding("no-intervals", subject)
-    elif percent / 100.0 < read_threshold("energy-overconfident", "min_coverage_fraction"):
-        yield make_finding("energy-overconfident", subject, coverage_fraction=percent / 100.0)
-    elif percent / 100.0 > read_threshold("underconfident", "max_coverage_fraction"):
-        yield make_finding("underconfident", subject, coverage_fraction=percent / 100.0)
+        return
+    for name, quantity in _QUANTITIES.items():
+        yield from find_miscalibration(part.coverage[quantity], name, subject)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeAlias, TypedDict
+from typing import Annotated, Literal, TypeAlias
 
 from tcpipe.balance.correlation import Floor
+from tcpipe.cost.coverage import Coverage
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors, Ratio
@@ -30,13 +31,11 @@ class EvaluateConfig:
     noise_draws: Annotated[int, Bounds(ge=1, le=1000)] = 5
     """Draws of noise that each ablated input set is the mean of."""
     baselines: bool = True
-    """Train the networks of Wei & Isler."""
+    """Train networks of each class alone, and those of Wei & Isler."""
     retrain_ablation: bool = False
     """Train a network for each input set of the ablation, too."""
     seed: Seed = 0
     """Of the noise."""
-    plotted: int = 21
-    """Patches a class in the pictures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +82,10 @@ class SplitErrors:
     """Samples by the name of their class."""
     class_order: tuple[str, ...]
     errors: ErrorsByClass
+    coverage: Mapping[str, Coverage]
+    """By quantity, of all classes; empty where the model states no intervals."""
+    uncentred: Mapping[str, Errors]
+    """Of all classes, by quantity, of predictions as the model gives them; all other errors are of predictions centred by class."""
     label_floor: ErrorsByClass
     simulation_floor: ErrorsByClass | None = field(default=None, metadata=ABSENT)
     """Of what can be predicted at best where the samples were simulated."""
@@ -120,23 +123,12 @@ class BaselineResult:
     errors: Errors
     rmse_ratio: Ratio
     """Of the model over the baseline: below 1 the model is better."""
-    mape_ratio: Ratio
+    uncentred: Errors
+    """Of its predictions as it gives them, not centred by class; the same of the ratio."""
+    uncentred_rmse_ratio: Ratio
     groups: int
     """That the intervals were drawn from."""
     drawn_by: Literal["runs", "blocks"]
-
-
-Plotted = TypedDict(  # a dataclass has no field called class
-    "Plotted",
-    {
-        "class": list[str],
-        "E_measured": list[float | None],
-        "T_measured": list[float | None],
-        "E_predicted": list[float | None],
-        "T_predicted": list[float | None],
-    },
-)
-"""Measured and predicted E [J] and T [s] of some samples of every class."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +136,7 @@ class Evaluation:
     """All of evaluation.json."""
 
     kind: str = KIND
-    schema_version: int = 2
+    schema_version: int = 3
     tcpipe_version: str
     key: str
     """Hash of model, dataset and options: the same key, the same evaluation."""
@@ -156,7 +148,7 @@ class Evaluation:
     energy: Mapping[str, Mapping[str, Errors]]
     """Table IV: errors of E by predictor and split, of the same samples."""
     networks: tuple[BaselineResult, ...] = ()
-    """Those of the networks of Wei and Isler, with the ratios of the model's to them."""
+    """Those of networks of each class and of Wei and Isler, with the ratios of the model's to them."""
     time: Mapping[str, Mapping[str, Errors]]
     """Table V: errors of T by predictor and split."""
     blocks: ErrorsByClass | None = field(default=None, metadata=ABSENT)
@@ -167,8 +159,6 @@ class Evaluation:
     """How well each label repeats itself where ground was driven twice; None where none was."""
     findings: tuple[Finding, ...] = ()
     verdict: Verdict = field(default_factory=Verdict)
-    plots: Mapping[str, Plotted]
-    """By split."""
 
     @property
     def ordered_splits(self) -> list[str]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tcpipe.balance.cells import SLOPE_NAMES, find_slope_ranges
 from tcpipe.dataset import Dataset
 from tcpipe.formats.json_files import Json
-from tcpipe.learning.evaluation_facts import Plotted
 from tcpipe.learning.metrics import QUANTITIES, UNITS
 from tcpipe.learning.predictions import (
     LEVELS,
@@ -23,17 +22,13 @@ from tcpipe.learning.predictions import (
     find_worst_rows,
     make_column_name,
 )
-from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, SPLIT_COLOURS, find_class_colour
+from tcpipe.report.colours import CLASS_COLOURS, FAINT, SPLIT_COLOURS, find_class_colour
 from tcpipe.report.dataset_patches import choose_thinning, make_sheets
 from tcpipe.report.page import Column, Section, Shaded, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import read_threshold
-
-MEASURED, PREDICTED = DROPPED, SPLIT_COLOURS["train"]
-MOST_PERCENT = 50.0
-"""Where the axis of errors ends, as the paper's."""
 
 _CALLED = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
 _DIGITS = {"w": 1, "v": 3, "T": 3, "E": 1}
@@ -69,7 +64,8 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
     if not parts:
         return EvaluatedSamples(table, shown, None)
     step = choose_thinning(data.card.patch_px)
-    pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in parts[0]}
+    plain = [layer for layer, of in parts[0].items() if of.ndim == 3]  # no picture of several bands
+    pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in plain}
     files = data[str(split[0])].view.stored.files
     return EvaluatedSamples(table, shown, make_sheets(np.searchsorted(shown, rows).tolist(), pixels, files))
 
@@ -106,8 +102,8 @@ def make_page_data(samples: EvaluatedSamples) -> Json:
     }
 
 
-def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> list[Section]:
-    """Return the sections on single samples, if any; ``audits`` describe how near to training each split is."""
+def sample_sections(samples: EvaluatedSamples, splits: Sequence[str]) -> list[Section]:
+    """Return the sections on single samples, if any."""
     if not samples.table.num_rows:
         return []
     worst = (
@@ -117,7 +113,7 @@ def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> lis
     return [
         _draw_predictions(samples),
         Section("Worst segments", worst, controls="gallery.html"),
-        *(_draw_errors_by_slope(samples.table, split, audit) for split, audit in audits.items()),
+        *(_draw_errors_by_slope(samples.table, split) for split in splits),
         _draw_calibration(samples.table),
     ]
 
@@ -162,7 +158,7 @@ def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any
     return plot, points
 
 
-def _draw_errors_by_slope(table: pa.Table, split: str, audit: str) -> Section:
+def _draw_errors_by_slope(table: pa.Table, split: str) -> Section:
     """Return the RMSE of E by class and range of slope, as a heat map."""
     part = table.filter(pc.and_(pc.equal(table.column("split"), split), pc.is_valid(table.column("slope_rad"))))
     off, ranges = compute_errors_joule(part), find_slope_ranges(to_floats(part, "slope_rad"))
@@ -189,7 +185,7 @@ def _draw_errors_by_slope(table: pa.Table, split: str, audit: str) -> Section:
 
     text = (
         "RMSE of E [J], mean error (predicted less measured), in brackets the number of segments; darker is worse. * and a dashed border: "
-        f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them. {audit}"
+        f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them."
     )
     header = ["class", *(SLOPE_NAMES[at] for at in columns)]
     table_rows = [[name, *(shade((name, at)) for at in columns)] for _, name in ids]
@@ -230,65 +226,3 @@ def _draw_calibration(table: pa.Table) -> Section:
         else "The model states no uncertainty: too few samples were held out."
     )
     return Section("Calibration of the stated uncertainty", text, plots=plots)
-
-
-def draw_paper_figures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
-    """Yield the paper's pictures: E of test samples and T of the unseen area, some of every class, each with its error."""
-    quantities: dict[str, Literal["E", "T"]] = {"test": "E", "unseen": "T"}
-    for split, quantity in quantities.items():
-        if split in plots:
-            label = f"{_CALLED[quantity]} [{UNITS[quantity]}]"
-            text = (
-                f"As the paper's figures. Below: the absolute percentage error; its axis ends at {MOST_PERCENT:.0f} %."
-            )
-            figures = _draw_by_patch(plots[split], quantity, label)
-            yield Section(f"{label}, {split}: measured and predicted", text, plots=figures, stacked=True)
-
-
-def _draw_by_patch(plotted: Plotted, quantity: Literal["E", "T"], label: str) -> list[Plot]:
-    keys: tuple[Literal["E_measured", "T_measured"], Literal["E_predicted", "T_predicted"]]
-    keys = ("E_measured", "E_predicted") if quantity == "E" else ("T_measured", "T_predicted")
-    measured, predicted = (np.asarray(plotted[key], np.float64) for key in keys)
-    number, classes = np.arange(1, len(measured) + 1), np.asarray(plotted["class"], np.str_)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        percent = 100.0 * np.abs(predicted - measured) / np.abs(measured)
-    source = {"patch": number, "class": classes, "measured": measured, "predicted": predicted, "percent": percent}
-    settings: dict[str, Any] = {
-        "tools": "xpan,xwheel_zoom,reset,save",
-        "tooltips": [
-            ("", "@class, patch @patch"),
-            *((name, f"@{name}{{0.00}}") for name in ("measured", "predicted")),
-            ("error", "@percent{0.0} %"),
-        ],
-        "waits": True,
-    }
-    legend = {"measured": MEASURED, "predicted": PREDICTED}
-    alt = f"Measured and predicted {label} of some patches of every class."
-    values = make_plot(f"patches {quantity}", alt=alt, axes=("", label), legend=legend, **settings)
-    alt, axes = "Their absolute error in percent.", ("", "absolute error [%]")
-    errors = make_plot(f"patch errors {quantity}", alt=alt, axes=axes, x_range=values.figure.x_range, **settings)
-    for name, colour in legend.items():
-        values.figure.line("patch", name, source=source, color=colour, line_width=1.5)
-        values.figure.scatter("patch", name, source=source, color=colour, size=4)
-    errors.figure.vbar(x="patch", top="percent", width=0.8, color=SPLIT_COLOURS["unseen"], source=source)
-    errors.figure.y_range.start = 0
-    if (percent[np.isfinite(percent)] > MOST_PERCENT).any():
-        errors.figure.y_range.end = MOST_PERCENT
-    _mark_classes(classes, [values, errors])
-    return [values, errors]
-
-
-def _mark_classes(classes: NDArray[np.str_], plots: Sequence[Plot]) -> None:
-    """Shade every other class, and write its name below."""
-    spans = {name: np.flatnonzero(classes == name) + 1 for name in dict.fromkeys(classes.tolist())}
-    for plot in plots:
-        odd = list(spans.values())[::2]
-        strip = plot.figure.vstrip(
-            x0=[rows[0] - 0.5 for rows in odd], x1=[rows[-1] + 0.5 for rows in odd], color=FAINT, alpha=0.15
-        )
-        strip.level = "underlay"
-        plot.figure.hover.renderers = [renderer for renderer in plot.figure.renderers if renderer is not strip]
-        plot.figure.xaxis.ticker = [int(rows.mean()) for rows in spans.values()]
-        plot.figure.xaxis.major_label_overrides = {int(rows.mean()): name for name, rows in spans.items()}
-        plot.figure.xaxis.major_label_orientation = 0.6
-        plot.figure.xgrid.visible = False

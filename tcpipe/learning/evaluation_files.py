@@ -1,9 +1,7 @@
-"""The files of an evaluation: ``evaluation.json``, ``.csv`` and ``.html``, ``predictions.parquet``, and the networks that it trained."""
+"""The files of an evaluation: ``evaluation.json`` and ``.html``, ``predictions.parquet``, and the networks that it trained."""
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, select_evaluated_samples
-from tcpipe.learning.evaluation_page import COLUMNS, format_leakage, list_evaluation_rows, render_evaluation_page
+from tcpipe.learning.evaluation_page import format_leakage, render_evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.training import compute_dataset_checksum
@@ -32,7 +30,7 @@ from tcpipe.tables.findings import PREDICTED
 
 SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
 
-JSON, CSV, PAGE, SAMPLES = "evaluation.json", "evaluation.csv", "evaluation.html", "predictions.parquet"
+JSON, PAGE, SAMPLES = "evaluation.json", "evaluation.html", "predictions.parquet"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +49,9 @@ class EvaluationResult:
                 for quantity, of in ((quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES)
             )
             lines.append(f"{split}: {part.samples} samples, MAPE (of so many labels) {', '.join(figures)}")
-            energy = part.errors["E"][ALL]
-            if energy.coverage_percent is not None:
-                lines.append(
-                    f"{split}: 90 % intervals cover {energy.coverage_percent:.1f} % of E, CRPS {energy.crps:.2f} J"
-                )
+            lines += [
+                f"{split}: 90 % intervals of {name} cover {of}" for name, of in part.coverage.items() if name in "TE"
+            ]
             lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
@@ -72,8 +68,8 @@ def run_evaluation(
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
 
-    It may be a URL in a bucket, where it becomes the newest generation. Where the same evaluation is already, only its table and page
-    are written again; at a URL nothing is.
+    It may be a URL in a bucket, where it becomes the newest generation. Where the same evaluation is already, only its page
+    is written again; at a URL nothing is.
 
     Raises
     ------
@@ -84,14 +80,14 @@ def run_evaluation(
     rules = config or EvaluateConfig()
     key = _make_key(model, dataset, rules, simulated=plant is not None)
     if is_url(out):
-        if (known := _read_at_url(str(out))) is not None and known.values.key == key:
+        if (known := _read_at_url(str(out), key)) is not None:
             return known
         with write_generation(str(out), JSON) as made:
             result = run_evaluation(model, dataset, made, config=config, plant=plant)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)
     clear(place)
-    ours = {JSON, CSV, PAGE, SAMPLES, NETWORKS, "drives.json", "drives.html"}
+    ours = {JSON, PAGE, SAMPLES, NETWORKS, "drives.json", "drives.html"}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
@@ -108,10 +104,6 @@ def run_evaluation(
     name = values.dataset.name
     of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
     lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, compared with the paper."
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerows([COLUMNS, *list_evaluation_rows(values)])
-    write_text(place / CSV, table.getvalue())
     samples = read_evaluated_samples(place, dataset)
     write_text(
         place / PAGE,
@@ -127,13 +119,18 @@ def read_evaluated_samples(place: Path, dataset: str | Path) -> EvaluatedSamples
     return select_evaluated_samples(read_table(place / SAMPLES), open_dataset(dataset))
 
 
-def _read_at_url(url: str) -> EvaluationResult | None:
-    """Return the newest evaluation at a URL; None where there is none."""
+def _read_at_url(url: str, key: str) -> EvaluationResult | None:
+    """Return the newest evaluation at a URL if it has this key; None otherwise."""
     found = find_newest(url, [JSON])
     if found is None:
         return None
     where = found.place.where(JSON)
-    return EvaluationResult(found.place.where(), parse_typed(parse_json(found.data, where), Evaluation, where))
+    values = parse_json(found.data, where)
+    return (
+        EvaluationResult(found.place.where(), parse_typed(values, Evaluation, where))
+        if values.get("key") == key
+        else None
+    )
 
 
 def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:

@@ -16,8 +16,9 @@ from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.predictor import Inputs, find_kind
 from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
-from tcpipe.terrain.classes import TerrainClass
+from tcpipe.terrain.classes import ClassTable, TerrainClass
 
 KIND = "tcpipe model"
 
@@ -100,6 +101,15 @@ class ModelCard:
     checksums: Mapping[str, Checksum] = field(default_factory=dict)
     """Of the files beside it, by name."""
 
+    @property
+    def inputs(self) -> Inputs:
+        """Return what its predictor takes and gives."""
+        shape = self.architecture
+        return Inputs(
+            self.channels, shape.patch_px, shape.depth, self.patch_m, ClassTable(self.classes).count, self.extra_features,
+            self.outputs, self.scale,
+        )  # fmt: skip
+
 
 def is_current(found: Mapping[str, Json]) -> bool:
     """Return whether a document is the card of a model of this schema."""
@@ -119,20 +129,9 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 {%- if includes %}
   The measured power also feeds {{ includes }}.
 {%- endif %}
-{% if config.model == "boosting" -%}
-- Table: a curve over the slope of each class, and up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM),
-  number chosen by cross-validation over the folds of train; the loss {{ config.loss }} there is
-  {{ "%.4f" | format(told.held_out_loss) }}.
-{% elif config.model == "physics" -%}
-- Physics: idle power, drivetrain, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted
-  robustly. Its loss {{ config.loss }} where each fold of train is predicted by the others is {{ "%.4f" | format(told.held_out_loss) }}.
-  Of a patch it takes slope and class, which `predict` takes as extra features.
-{% else -%}
-- Network: ResNet-18 of width {{ width }}; loss {{ config.loss }}, Adam {{ config.learning_rate }}, batch {{ config.batch_size }},
-  seed {{ config.seed }}; best of {{ told.epochs }} epochs by fold {{ config.fold }} of train: {{ told.best_epoch }},
-  loss {{ "%.4f" | format(told.held_out_loss) }}. Its intervals rest on its errors on the
-  {{ told.samples["held out"] }} samples of that one fold, which make them slightly too small.
-{% endif -%}
+- Kind {{ config.model }}: {{ about }}.
+  Best {{ told.best_epoch }} of {{ told.epochs }} epochs or trees.
+  The loss {{ config.loss }} of {{ told.samples["held out"] }} samples that were held out is {{ "%.4f" | format(told.held_out_loss) }}.
 - Trained on {{ told.samples["fitted"] }} samples of {{ dataset.name }}, checksum {{ dataset.sha256 }}.
 - Training range: {{ classes }}; slope {{ slope }}; relief of a patch {{ relief }}. Do not use the model outside of these ranges.
 
@@ -157,8 +156,9 @@ def format_readme(card: ModelCard) -> str:
         depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
         velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
         extra_features=", ".join(f"{of.name} (usually {of.usual:.3g})" for of in card.extra_features),
-        includes="; ".join(map(_escape_markdown, card.label_includes)), robot=card.robot, width=card.architecture.width,
-        config=card.training.config, told=card.training, dataset=dataset, classes=", ".join(counts),
+        includes="; ".join(map(_escape_markdown, card.label_includes)), robot=card.robot,
+        config=card.training.config, about=find_kind(card.training.config.model).about, told=card.training,
+        dataset=dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.training_range.ranges["slope_rad"]),
         relief=" to ".join(f"{value:.2f} m" for value in card.training_range.ranges.get("relief_m", ())) or "not looked at",
     )  # fmt: skip

@@ -94,7 +94,7 @@ class EvaluateOptions:
     baselines: bool = option(
         True,
         Option(
-            "Train the height-only networks of Wei and Isler: one for grass, one per class.",
+            "Train networks beside the model: one per class with all layers; Wei and Isler's, height-only, for grass and per class.",
             ("--baselines/--no-baselines",),
         ),
     )

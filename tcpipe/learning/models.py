@@ -15,13 +15,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.dataset.extra_features import ExtraFeatures, append_planes, empty_extra_features, standardize_features
+from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
@@ -31,17 +30,12 @@ from tcpipe.formats.json_files import Json, digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.formats.weights import read_arrays, write_arrays
-from tcpipe.learning.architecture import check_trainable, list_weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import EARLIER_SCHEMA_VERSION, KIND, SCHEMA_VERSION, ModelCard, is_current
-from tcpipe.learning.physics_model import PhysicsModel, list_physics_arrays, read_physics_model
+from tcpipe.learning.predictor import Predictor, find_kind
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.terrain.classes import ClassTable
-
-if TYPE_CHECKING:
-    from tcpipe.learning.network import ResNet18
-    from tcpipe.learning.table_model import TableModel
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -53,8 +47,6 @@ FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
     "history.csv",
     "MODEL.md",
 )
-
-_TOGETHER = 256
 
 _SPEED_MARGIN_MPS = 0.01
 """By which a speed that is asked for may lie beside those of training: it is rounded."""
@@ -73,35 +65,15 @@ class Model:
     """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
 
     @cached_property
-    def network(self) -> ResNet18:
-        """Return the torch module, images (N, depth, px, px) to outputs over ``card.scale``; torch is imported for it."""
-        kind = self.card.training.config.model
-        if kind != "resnet18":
+    def predictor(self) -> Predictor:
+        """Return what predicts: a model of the card's kind, from its arrays; torch is imported for a network."""
+        path = self.place / WEIGHTS
+        try:
+            return find_kind(self.card.training.config.model).from_arrays(read_arrays(path), self.card.inputs)
+        except ModelError as error:
             raise ModelError(
-                f"{self.name}: is a model of kind {kind}, without a network; use predict, which works with any model"
-            )
-        check_trainable(self.card.architecture)
-        from tcpipe.learning.network import make_resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
-
-        arrays = read_arrays(self.place / WEIGHTS, list_weight_forms(self.card.architecture))
-        network = make_resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
-        network.set_arrays(arrays, str(self.place / WEIGHTS))
-        return network
-
-    @cached_property
-    def table(self) -> TableModel:
-        """Return the curves and trees of a table."""
-        from tcpipe.learning.table_model import list_table_arrays, read_table_model  # noqa: PLC0415  numba takes a second
-
-        arrays = read_arrays(self.place / WEIGHTS, list_table_arrays(len(self.card.outputs)))
-        return read_table_model(arrays, str(self.place / WEIGHTS), self.channels, self.classes.count)
-
-    @cached_property
-    def physics_model(self) -> PhysicsModel:
-        """Return the coefficients of a model of physics."""
-        older = ("drivetrain_newton",)
-        arrays = read_arrays(self.place / WEIGHTS, list_physics_arrays(), optional=older)
-        return read_physics_model(arrays, str(self.place / WEIGHTS))
+                *(text if text.startswith(f"{path}: ") else f"{path}: {text}" for text in error.problems)
+            ) from None
 
     @property
     def takes_turns(self) -> bool:
@@ -184,38 +156,13 @@ class Model:
             raise ModelError(
                 f"{self.name}: patches of shape {patches.shape[1:]}, expected {wanted}: {', '.join(self.channels)}"
             )
-        out = self.outputs(patches, extra_features)
-        if "velocity_mps" in self._short_outputs:
-            column = self._short_outputs.index("velocity_mps")
+        features = fill_unknown(self.card.extra_features, extra_features or empty_extra_features(len(patches)))
+        out = np.asarray(self.predictor.predict(patches, features)).astype(np.float32)
+        names = [name.removeprefix("fused_") for name in self.card.outputs]
+        if "velocity_mps" in names:
+            column = names.index("velocity_mps")
             out[:, column] = np.maximum(out[:, column], np.float32(LEAST_VELOCITY_MPS))
         return out
-
-    def outputs(self, patches: Floats, extra_features: ExtraFeatures | None = None) -> Floats:
-        """Return what the model gives, in the units of its outputs, shape (N, outputs)."""
-        kind = self.card.training.config.model
-        if kind == "physics":
-            if extra_features is None:
-                raise ModelError(
-                    f"{self.name}: physics needs the slope and class of each patch: predict(patches, beside)"
-                )
-            return self.physics_model.predict(extra_features).astype(np.float32)
-        numbers = standardize_features(self.card.extra_features, extra_features or empty_extra_features(len(patches)))
-        if kind == "resnet18":
-            return self.network.predict(append_planes(patches, numbers)) * np.array(self.card.scale, np.float32)
-        from tcpipe.learning.table_model import compute_patch_features  # noqa: PLC0415  where it is needed, as is the next
-
-        out = np.empty((len(patches), len(self.card.scale)), np.float32)
-        for first in range(0, len(patches), _TOGETHER):
-            rows = slice(first, first + _TOGETHER)
-            features = compute_patch_features(
-                patches[rows], channels=self.channels, class_count=self.classes.count, patch_m=self.patch_m
-            )
-            out[rows] = self.table.predict(np.column_stack([features, numbers[rows]]))
-        return out
-
-    @cached_property
-    def _short_outputs(self) -> list[str]:
-        return [name.removeprefix("fused_") for name in self.card.outputs]
 
 
 def write_model(

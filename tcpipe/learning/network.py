@@ -103,12 +103,12 @@ class ResNet18(nn.Module):
             for name, value in self._weights().items()
         }
 
-    def set_arrays(self, arrays: Arrays, where: str) -> None:
+    def set_arrays(self, arrays: Arrays) -> None:
         """Put weights in; `ModelError` if they are another network's."""
         there = self._weights()
         shapes = {_make_weight_name(name): tuple(_reorder_axes(value).shape) for name, value in there.items()}
         if {name: value.shape for name, value in arrays.items()} != shapes:
-            raise ModelError(f"{where}: contains the weights of another network; remove it and train the model again")
+            raise ModelError("contains the weights of another network; remove it and train the model again")
         for name, value in there.items():
             _reorder_axes(value).copy_(torch.from_numpy(np.ascontiguousarray(arrays[_make_weight_name(name)])))
 
@@ -206,11 +206,11 @@ class Trainer:
         """Return a copy of the step and the two moments of every weight."""
         return {name: value.numpy(force=True).copy() for name, value in self._list_state()}
 
-    def load_optimizer_state(self, arrays: Arrays, where: str) -> None:
+    def load_optimizer_state(self, arrays: Arrays) -> None:
         """Restore what `copy_optimizer_state` returned; `ModelError` if it is of another network."""
         there = dict(self._list_state())
         if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in there.items()}:
-            raise ModelError(f"{where}: contains the weights of another network; remove it and train the model again")
+            raise ModelError("contains the weights of another network; remove it and train the model again")
         for name, value in there.items():
             value.copy_(torch.from_numpy(np.array(arrays[name])))
 

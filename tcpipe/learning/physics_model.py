@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,9 @@ from tcpipe.dataset import Split
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.errors import ModelError
-from tcpipe.formats.weights import ArrayForm
+from tcpipe.formats.weights import ArrayForm, check_arrays
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
+from tcpipe.learning.predictor import Inputs, Patches, Predictor, Samples
 
 Floats = NDArray[np.float64]
 
@@ -29,8 +30,16 @@ _CLASSES = 256
 
 
 @dataclass(frozen=True, slots=True)
-class PhysicsModel:
+class PhysicsModel(Predictor):
     """P = P0 + D v / cos(s) + g(F v + N v tan(s) + M v |turn|), and v as a curve over the slope s."""
+
+    about: ClassVar[str] = (
+        "physics of idle power, drivetrain, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; "
+        "fitted robustly. Of a patch it takes slope and class, which `predict` takes as features"
+    )
+    optimizer: ClassVar[str] = "robust least squares"
+    channels: ClassVar[tuple[str, ...]] = ("height",)
+    features: ClassVar[tuple[str, ...] | None] = ("turn_radpm",)
 
     speed: Curves
     """One output [m/s], straight in each third of the slopes."""
@@ -49,40 +58,44 @@ class PhysicsModel:
     turning_joule_per_rad: Floats
     """M by class id, shape (256,)."""
 
-    def predict(self, extra_features: ExtraFeatures) -> Floats:
+    def predict(self, patches: Patches, features: ExtraFeatures) -> Floats:
         """Return power [W] and velocity [m/s], shape (N, 2)."""
-        velocity = np.maximum(
-            self.speed.predict(extra_features.slope_rad, extra_features.class_id)[:, 0], LEAST_VELOCITY_MPS
-        )
-        turn = np.where(np.isfinite(extra_features.turn_radpm), extra_features.turn_radpm, self.usual_turn_radpm)
-        force = self.rolling_newton[extra_features.class_id] + self.grade_newton * np.tan(extra_features.slope_rad)
-        work = velocity * (force + self.turning_joule_per_rad[extra_features.class_id] * turn)
-        always = self.no_load_watt + self.drivetrain_newton * velocity / np.cos(extra_features.slope_rad)
+        del patches
+        if len(features.slope_rad) and np.isnan(features.slope_rad).all():
+            raise ModelError("physics needs the slope and class of each patch: predict(patches, features)")
+        velocity = np.maximum(self.speed.predict(features.slope_rad, features.class_id)[:, 0], LEAST_VELOCITY_MPS)
+        turn = np.where(np.isfinite(features.turn_radpm), features.turn_radpm, self.usual_turn_radpm)
+        force = self.rolling_newton[features.class_id] + self.grade_newton * np.tan(features.slope_rad)
+        work = velocity * (force + self.turning_joule_per_rad[features.class_id] * turn)
+        always = self.no_load_watt + self.drivetrain_newton * velocity / np.cos(features.slope_rad)
         return np.column_stack([always + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
 
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return everything by name, as `read_physics_model` takes it."""
+    @classmethod
+    def fit(cls, samples: Samples) -> PhysicsModel:
+        """Fit it to samples."""
+        return fit_physics_model(samples.features, samples.labels, idle_watt=samples.idle_watt)
+
+    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Return everything by name."""
         return {**{name: getattr(self, name) for name in _NUMBERS}, **self.speed.arrays()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> PhysicsModel:
+        """Return the model of these arrays; models before 0.7 have no drivetrain: all of it is in P0."""
+        del inputs
+        check_arrays(arrays, {**_FORMS, **list_curve_arrays(1)}, optional=("drivetrain_newton",))
+        speed, rest = read_curves("linear", arrays)
+        if not all(np.isfinite(of).all() for of in rest.values()):
+            raise ModelError("contains coefficients that are not finite; train the model again")
+        return cls(speed, **{"drivetrain_newton": np.array(0.0), **rest})
 
 
 _NUMBERS = tuple(of.name for of in fields(PhysicsModel) if of.name != "speed")
 
 
-def list_physics_arrays() -> dict[str, ArrayForm]:
-    """Return types and shapes of the arrays of a model of physics."""
-    by_class = ("rolling_newton", "turning_joule_per_rad")
-    return {**{name: ("float64", (_CLASSES,) if name in by_class else ()) for name in _NUMBERS}, **list_curve_arrays(1)}
-
-
-def read_physics_model(arrays: Mapping[str, NDArray[Any]], where: str) -> PhysicsModel:
-    """Return the model that `PhysicsModel.arrays` told of; `ModelError` if these are another's."""
-    speed, rest = read_curves("linear", arrays, where)
-    rest = {"drivetrain_newton": np.array(0.0), **rest}  # models before 0.7 have all of it in P0
-    if rest.keys() != set(_NUMBERS):
-        raise ModelError(f"{where}: contains the weights of another model; train the model again")
-    if not all(np.isfinite(of).all() for of in rest.values()):
-        raise ModelError(f"{where}: contains coefficients that are not finite; train the model again")
-    return PhysicsModel(speed, **rest)
+_FORMS: Mapping[str, ArrayForm] = {
+    name: ("float64", (_CLASSES,) if name in {"rolling_newton", "turning_joule_per_rad"} else ()) for name in _NUMBERS
+}
 
 
 def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_watt: float | None) -> PhysicsModel:
@@ -187,21 +200,16 @@ def list_curve_arrays(outputs: int) -> dict[str, ArrayForm]:
     return {f"{_STORED}{name}": form for name, form in forms.items()}
 
 
-def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Curves, dict[str, NDArray[Any]]]:
+def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]]) -> tuple[Curves, dict[str, NDArray[Any]]]:
     """Return the curves of `Curves.arrays` and the other arrays; `ModelError` without valid curves."""
     rest = dict(arrays)
-    try:
-        curves = Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
-    except KeyError:
-        raise ModelError(
-            f"{where}: contains the weights of another model, or of an older kind; train the model again"
-        ) from None
+    curves = Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
     functions = (
         _evaluate_functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
     )
     finite = all(np.isfinite(of).all() for of in (curves.knots_rad, curves.pooled, curves.own))
     if len(curves.pooled) != functions or not finite or len(curves.class_id) > _MOST_CLASSES:
-        raise ModelError(f"{where}: contains curves that no training makes; train the model again")
+        raise ModelError("contains curves that no training makes; train the model again")
     return curves, rest
 
 

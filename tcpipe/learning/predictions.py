@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from tcpipe.cost.prediction_errors import COVERAGE, fit_bias_correction, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, fit_errors
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import ModelError
@@ -79,12 +79,37 @@ def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     )
 
 
-def predict_costs(
-    model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)
-) -> dict[str, Array]:
-    """Return what a model says of w, v, T, E of every sample, centred, shape (N,) each; of E alone where it predicts nothing else.
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """Costs of a split's samples by one predictor, quantity to values of shape (N,)."""
 
-    A model centres class by class (`tcpipe.cost.prediction_errors`), or as one where it is not shown the classes.
+    costs: Mapping[str, Array]
+    """Centred by class: what every figure is of unless it says otherwise."""
+    uncentred: Mapping[str, Array]
+
+    @classmethod
+    def centre(cls, residuals: Residuals, outputs: Array, class_ids: NDArray[np.int64], chord_m: float) -> Predicted:
+        """Return both of predictions, shape (N, outputs), by the predictor's own held-out samples."""
+        return cls(*(_convert_outputs(of, outputs, class_ids, chord_m) for of in (residuals, None)))
+
+    def take(self, rows: NDArray[np.int64]) -> Predicted:
+        """Return some of the samples."""
+        return Predicted(*({name: values[rows] for name, values in of.items()} for of in (self.costs, self.uncentred)))
+
+
+def make_residuals(train: Split, said: Array) -> Residuals:
+    """Return labels and held-out predictions of power and velocity, shape (N, 2), in the columns that a model keeps."""
+    labels = train.labels.astype(np.float64)
+    columns = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class")}
+    for number, (quantity, unit) in enumerate((("power", "watt"), ("velocity", "mps"))):
+        columns |= {f"{quantity}_{unit}": labels[:, number], f"{quantity}_predicted_{unit}": said[:, number]}
+    return columns
+
+
+def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)) -> Predicted:
+    """Return what a model says of w, v, T, E of every sample; of E alone where it predicts nothing else.
+
+    It is centred by class, or as one where it is not shown the classes.
 
     Parameters
     ----------
@@ -92,8 +117,14 @@ def predict_costs(
     noise : channels that are replaced by noise, uniform in [0, 1], each pixel on its own (section V-C).
     seed : of that noise.
     """
+    outputs = _predict_outputs(model, split, noise, np.random.default_rng(list(seed)))
+    is_class_shown = "terrain" in model.channels and "terrain" not in noise
+    class_ids = read_extra_features(split).class_id if is_class_shown else np.zeros(len(split), np.int64)
+    return Predicted.centre(model.residuals, outputs, class_ids, model.chord_m)
+
+
+def _predict_outputs(model: Model, split: Split, noise: Sequence[str], rng: np.random.Generator) -> Array:
     chosen = split.with_channels(*model.channels)
-    rng = np.random.default_rng(list(seed))
     replaced = [model.channels.index(name) for name in noise]
     parts = [np.empty((0, len(model.card.outputs)), np.float32)]
     extra_features, first = read_extra_features(split), 0
@@ -103,13 +134,32 @@ def predict_costs(
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
         parts.append(model.predict(patches, extra_features.take(slice(first, first + len(patches)))))
         first += len(patches)
-    said = np.concatenate(parts).astype(np.float64)
-    if said.shape[1] == 1:
-        return {"E": said[:, 0]}
-    shown = "terrain" in model.channels and "terrain" not in noise
-    class_id = extra_features.class_id if shown else np.zeros(len(said), np.int64)
-    power, velocity = fit_bias_correction(model.residuals).apply(said[:, 0], said[:, 1], class_id)
-    return compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), model.chord_m)
+    return np.concatenate(parts).astype(np.float64)
+
+
+def _convert_outputs(
+    residuals: Residuals | None, outputs: Array, class_ids: NDArray[np.int64], chord_m: float
+) -> dict[str, Array]:
+    """Return costs of what a predictor gives; centred where there are residuals to do so."""
+    if outputs.shape[1] == 1:
+        of_energy = None if residuals is None else _of_energy_alone(residuals)
+        at_one_mps = np.column_stack([outputs[:, 0], np.ones(len(outputs))])
+        return {"E": _convert_outputs(of_energy, at_one_mps, class_ids, 1.0)["E"]}
+    power, velocity = outputs.T
+    if residuals is not None:
+        power, velocity = fit_bias_correction(residuals).apply(power, velocity, class_ids)
+    return compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), chord_m)
+
+
+def _of_energy_alone(residuals: Residuals) -> Residuals:
+    """Return the residuals of a model of energy as those of a power at 1 m/s."""
+    names = {name: name.replace("_predicted", "") for name in residuals if "energy_predicted" in name}
+    if not names:
+        return {}
+    ((predicted, label),) = names.items()
+    ones = np.ones(len(residuals[label]))
+    known = {"power_watt": residuals[label], "power_predicted_watt": residuals[predicted]}
+    return {**residuals, **known, "velocity_mps": ones, "velocity_predicted_mps": ones}
 
 
 def predict_spreads(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.int64]) -> dict[str, Spread]:

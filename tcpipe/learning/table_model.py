@@ -13,48 +13,29 @@ others   mean, standard deviation (contrast), mean difference of neighbours alon
 ======== ==================================================================================================================
 
 Mirroring a patch across its travel changes none of them. A pixel without data counts as 0, as in the tensor.
-
-Fitting a table model or physics, without epochs; models of the other folds also predict each sample.
 """
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.dataset import Split
-from tcpipe.dataset.extra_features import read_extra_features, standardize_features
+from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
-from tcpipe.formats.weights import ArrayForm
-from tcpipe.learning.architecture import compute_loss_factors, mean_loss
-from tcpipe.learning.fitting import (
-    FitConfig,
-    Fitted,
-    Task,
-    TrainingProgress,
-    TrainingTimes,
-    collect_labels,
-    find_label_scale,
-)
-from tcpipe.learning.physics_model import (
-    Curves,
-    find_idle_power,
-    fit_curves,
-    fit_physics_model,
-    list_curve_arrays,
-    read_curves,
-)
+from tcpipe.formats.weights import ArrayForm, check_arrays
+from tcpipe.learning.fitting import TrainingTimes
+from tcpipe.learning.physics_model import Curves, fit_curves, list_curve_arrays, read_curves
+from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Predictor, Samples
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
 
 Floats = NDArray[np.float64]
-Patches = NDArray[np.float32]
 
 _OF_GROUND, _OF_OTHERS = 6, 3
 """Features of a channel."""
@@ -165,7 +146,7 @@ class Forest:
 
 
 _INDICES, _NUMBERS = ("uint32", ("nodes",)), ("float64", ("nodes",))
-FOREST_FORMS: Mapping[str, ArrayForm] = {
+_FOREST_FORMS: Mapping[str, ArrayForm] = {
     "feature": _INDICES, "threshold": _NUMBERS, "child": ("uint32", ("nodes", 2)), "value": _NUMBERS,
     "root": ("uint32", ("trees",)), "depth": ("uint32", ("trees",)), "output": ("uint32", ("trees",)),
 }  # fmt: skip
@@ -173,19 +154,17 @@ FOREST_FORMS: Mapping[str, ArrayForm] = {
 _MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
 
 
-def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
-    """Return the forest of `Forest.arrays`; `ModelError` if the arrays are of another model."""
-    if arrays.keys() != {of.name for of in fields(Forest)}:
-        raise ModelError(f"{where}: contains the weights of another model; remove it and train the model again")
+def read_forest(arrays: Mapping[str, NDArray[Any]]) -> Forest:
+    """Return the forest of `Forest.arrays`, of these forms; `ModelError` if no training makes it."""
     made = Forest(**arrays)
     nodes = len(made.feature)
     most = {
         "child": nodes, "root": nodes, "feature": _MOST_FEATURES, "output": _MOST_OUTPUTS, "depth": _MOST_DEPTH,
     }  # fmt: skip
     if not made.root.size or any((getattr(made, name) >= bound).any() for name, bound in most.items()):
-        raise ModelError(f"{where}: contains trees with invalid nodes; train the model again")
+        raise ModelError("contains trees with invalid nodes; train the model again")
     if not (np.isfinite(made.threshold).all() and np.isfinite(made.value).all()):
-        raise ModelError(f"{where}: contains trees with numbers that are not finite; train the model again")
+        raise ModelError("contains trees with numbers that are not finite; train the model again")
     return made
 
 
@@ -306,19 +285,6 @@ class TableModel:
         return {**self.forest.arrays(), **self.curves.arrays()}
 
 
-def list_table_arrays(outputs: int) -> dict[str, ArrayForm]:
-    """Return types and shapes of the arrays of a table model of so many outputs."""
-    return {**FOREST_FORMS, **list_curve_arrays(outputs)}
-
-
-def read_table_model(
-    arrays: Mapping[str, NDArray[Any]], where: str, channels: Sequence[str], class_count: int
-) -> TableModel:
-    """Return the model of `TableModel.arrays`; `ModelError` if the arrays are of another model."""
-    curves, rest = read_curves("linear", arrays, where)
-    return TableModel(curves, read_forest(rest, where), tuple(channels), class_count)
-
-
 def fit_table(
     features: Floats,
     labels: Floats,
@@ -352,77 +318,65 @@ def fit_table(
     return TableModel(curves, forest, tuple(channels), class_count), told + held_out
 
 
-logger = logging.getLogger("tcpipe")
-
-_READ_TOGETHER = 1024
-
-
 @dataclass(frozen=True, slots=True)
-class _FittedModel:
-    """A model's arrays, what it and what those of the other folds said of each sample, (N, outputs); how large it is."""
+class BoostingModel(Predictor):
+    """A table model of patches: it computes their features."""
 
-    weights: dict[str, NDArray[np.generic]]
-    said: Floats
-    held_out: Floats
-    rounds: int
-    fed_s: float = 0.0
+    table: TableModel
+    inputs: Inputs
 
-
-def fit_at_once(task: Task, config: FitConfig, *, name: str, key: str, patch_m: float, class_count: int) -> Fitted:
-    """Fit a table or physics to all of train.
-
-    Parameters
-    ----------
-    task, config : what, and how labels are weighed.
-    name : for the line about progress.
-    key : of dataset and options.
-    patch_m : side of a patch [m].
-    class_count : largest class id of the dataset's table.
-
-    Raises
-    ------
-    ModelError : LightGBM is not installed, or there are too few samples.
-    """
-    split, scale, began = task.train, find_label_scale(task), time.perf_counter()
-    labels = collect_labels(split, task.outputs).astype(np.float64)
-    weighed = config.inverse_variance_weights and split.weights.shape == labels.shape
-    weights = split.weights.astype(np.float64) if weighed else np.ones_like(labels)
-    logger.info("%s: %d samples, each predicted by the other folds", name, len(split))
-    made = (
-        _fit_physics(split, labels)
-        if config.model == "physics"
-        else _fit_trees(task, labels, weights, patch_m, class_count)
+    about: ClassVar[str] = (
+        "a curve over the slope of each class, and boosted trees over features of the patch (LightGBM), their number chosen by "
+        "cross-validation over the folds of train"
     )
-    factors, over = compute_loss_factors(config.loss, scale), np.array(scale)
-    loss, held = (float(mean_loss(said / over, labels / over, factors, weights)) for said in (made.said, made.held_out))
-    progress = TrainingProgress(key, made.rounds, made.rounds, held, [(made.rounds, loss, held)])
-    training_times_s = TrainingTimes(time.perf_counter() - began, made.fed_s, len(split))
-    return Fitted(made.weights, (1.0,) * labels.shape[1], split, made.held_out, progress, training_times_s, "cpu")
+    optimizer: ClassVar[str] = "LightGBM"
+
+    def predict(self, patches: Patches, features: ExtraFeatures) -> Floats:
+        """Return outputs, shape (N, outputs)."""
+        numbers = standardize_features(self.inputs.extra_features, features)
+        out = np.empty((len(patches), len(self.inputs.outputs)))
+        for first in range(0, len(patches), _TOGETHER):
+            rows = slice(first, first + _TOGETHER)
+            out[rows] = self.table.predict(np.column_stack([self._compute_features(patches[rows]), numbers[rows]]))
+        return out
+
+    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Return curves and trees by name."""
+        return self.table.arrays()
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> BoostingModel:
+        """Return the model of these arrays."""
+        check_arrays(arrays, {**_FOREST_FORMS, **list_curve_arrays(len(inputs.outputs))})
+        curves, rest = read_curves("linear", arrays)
+        return cls(TableModel(curves, read_forest(rest), inputs.channels, inputs.class_count), inputs)
+
+    @classmethod
+    def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
+        """Fit curves and trees, as many trees as are best where each fold is predicted by the others."""
+        del job
+        began, inputs = time.perf_counter(), samples.inputs
+        numbers = standardize_features(inputs.extra_features, samples.features)
+        features = np.column_stack([compute_features(samples.split, inputs.patch_m, inputs.class_count), numbers])
+        fed_s = time.perf_counter() - began
+        table, held_out = fit_table(
+            features,
+            samples.labels,
+            samples.weights,
+            samples.folds,
+            channels=inputs.channels,
+            class_count=inputs.class_count,
+        )
+        trees = int(np.bincount(table.forest.output).max())
+        times = TrainingTimes(time.perf_counter() - began, fed_s, len(samples))
+        return Fitted(cls(table, inputs), held_out, trees, trees, training_times_s=times)
+
+    def _compute_features(self, patches: Patches) -> Floats:
+        of = self.inputs
+        return compute_patch_features(patches, channels=of.channels, class_count=of.class_count, patch_m=of.patch_m)
 
 
-def _fit_trees(task: Task, labels: Floats, weights: Floats, patch_m: float, class_count: int) -> _FittedModel:
-    """Grow trees, as many as the folds are told best by."""
-    split, began = task.train, time.perf_counter()
-    numbers = standardize_features(task.extra_features, read_extra_features(split))
-    features = np.column_stack([compute_features(split, patch_m, class_count), numbers])
-    fed_s = time.perf_counter() - began
-    model, held_out = fit_table(
-        features, labels, weights, split.column("fold"), channels=split.channels, class_count=class_count
-    )
-    rounds = int(np.bincount(model.forest.output).max())
-    return _FittedModel(model.arrays(), model.predict(features), held_out, rounds, fed_s)
-
-
-def _fit_physics(split: Split, labels: Floats) -> _FittedModel:
-    """Fit physics to all, and to all but each fold."""
-    extra_features, folds, idle_watt = read_extra_features(split), split.column("fold"), find_idle_power(split)
-    held_out = np.empty_like(labels)
-    for fold in np.unique(folds):
-        held = folds == fold
-        fitted = fit_physics_model(extra_features.take(~held), labels[~held], idle_watt=idle_watt)
-        held_out[held] = fitted.predict(extra_features.take(held))
-    whole = fit_physics_model(extra_features, labels, idle_watt=idle_watt)
-    return _FittedModel(whole.arrays(), whole.predict(extra_features), held_out, 1)
+_TOGETHER, _READ_TOGETHER = 256, 1024
 
 
 def compute_features(split: Split, patch_m: float, class_count: int) -> Floats:

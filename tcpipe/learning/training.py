@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
-from tcpipe.dataset.extra_features import available_features, read_extra_features
+from tcpipe.dataset.extra_features import ExtraFeature, available_features, read_extra_features
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, has_card
@@ -22,18 +22,22 @@ from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.fitting import (
-    FitConfig,
-    Fitted,
-    ModelKind,
-    Task,
-    TrainingTimes,
-    collect_labels,
-    fit,
-    read_checkpoint,
-)
+from tcpipe.learning.fitting import FitConfig, ModelKind, Task, TrainingTimes, collect_labels
 from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, format_readme, is_current
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
+from tcpipe.learning.network_model import read_checkpoint
+from tcpipe.learning.physics_model import find_idle_power
+from tcpipe.learning.predictor import (
+    Fitted,
+    Inputs,
+    Job,
+    Labels,
+    Predictor,
+    Samples,
+    compute_held_loss,
+    find_held_out,
+    find_kind,
+)
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
 from tcpipe.terrain.sampling import compute_relief_m
@@ -46,9 +50,6 @@ FEW_SAMPLES = 20_000
 """Training samples below which a network is not expected to do better than a table (ADR-23)."""
 
 _CALLED = {"turn_radpm": "turn (mean_abs_yaw_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
-
-
-_OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "boosting": "LightGBM", "physics": "robust least squares"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,25 +87,11 @@ class TrainResult:
         """Return how it went, as plain lines."""
         if self.status == "unchanged":
             return f"{self.path}: nothing to do: trained on the same dataset with the same options"
-        fitted, held = self.samples["fitted"], self.samples["held out"]
-        if self.model == "physics":
-            return (
-                f"{self.path}: physics of {fitted} samples, each predicted by the other folds\n"
-                f"held-out loss {self.held_out_loss:.4f}; {self.training_times_s.total_s:.1f} s"
-            )
-        if self.model == "boosting":
-            features = f"{100.0 * self.feeding_share:.0f} % of it for features"
-            return (
-                f"{self.path}: {self.best_epoch} trees a label of {fitted} samples, each predicted by the other folds\n"
-                f"held-out loss {self.held_out_loss:.4f}; {self.training_times_s.total_s:.1f} s, {features}"
-            )
-        speed, share = (
-            self.training_times_s.samples / max(self.training_times_s.total_s, 1e-9),
-            100.0 * self.feeding_share,
-        )
+        times = self.training_times_s
         return (
-            f"{self.path}: trained on {fitted} samples, stopped by {held}; best of {self.epochs} epochs is {self.best_epoch}\n"
-            f"held-out loss {self.held_out_loss:.4f}; {speed:.0f} samples/s on {self.device}, {share:.1f} % of the time feeding"
+            f"{self.path}: {self.model} of {self.samples['fitted']} samples, best {self.best_epoch} of {self.epochs} epochs or trees\n"
+            f"loss {self.held_out_loss:.4f} of {self.samples['held out']} held-out samples; {times.total_s:.1f} s on {self.device}, "
+            f"{100.0 * self.feeding_share:.0f} % of it feeding"
         )
 
 
@@ -127,7 +114,7 @@ def train(
     no_resume: bool = False,
     disposable: bool = False,
 ) -> TrainResult:
-    """Train the paper's network on a dataset and write the model folder ``out``, whole or not at all.
+    """Train a model on a dataset and write the model folder ``out``, whole or not at all.
 
     Parameters
     ----------
@@ -145,8 +132,8 @@ def train(
     """
     rules, other = config or FitConfig(), variant or Variant()
     data = open_dataset(dataset, label=rules.label)
-    if rules.model == "physics":
-        other = replace(other, channels=("height",))  # the patch itself is not looked at; every dataset has heights
+    kind = find_kind(rules.model)
+    other = replace(other, channels=kind.channels or other.channels)
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
         return _train_into_bucket(dataset, str(out).rstrip("/"), key, rules, other)
@@ -161,17 +148,18 @@ def train(
     ):
         _remove_finished_state(checkpoint, key)
         return _make_result(place, "unchanged", known.training, TrainingTimes())
-    task = _add_extra_features(make_training_task(data, rules.fold, other), rules, data)
+    task = make_training_task(data, rules.fold, other)
     _reject_other_files(place)
     if rules.inverse_variance_weights and not other.energy_only:
         _require_deviations(task, data)
     if no_resume or (disposable and checkpoint.exists() and not _can_continue(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
-    fitted = _fit_model(task, rules, data, name=str(place), key=key, checkpoint=checkpoint)
-    card = _make_card(data, task, rules, fitted, key)
-    history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.progress.history)
+    samples = make_samples(task, rules, data, kind)
+    fitted = kind.fit_folds(samples, Job(str(place), key, checkpoint))
+    card = _make_card(data, task, samples, fitted, key)
+    history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.history)
     write_model(
-        place, card=card, weights=fitted.weights, residuals=_make_residuals_table(fitted, task.outputs),
+        place, card=card, weights=fitted.predictor.to_arrays(), residuals=_make_residuals_table(samples, fitted.held_out),
         history="epoch,loss,held_out_loss\n" + history, readme=format_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
@@ -186,16 +174,6 @@ def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig
     with write_generation(url, CARD) as place:
         result = train(dataset, place, config=rules, variant=other)
     return replace(result, path=url)
-
-
-def _fit_model(task: Task, rules: FitConfig, data: Dataset, *, name: str, key: str, checkpoint: Path) -> Fitted:
-    if rules.model == "resnet18":
-        return fit(task, rules, name=name, key=key, checkpoint=checkpoint)
-    from tcpipe.learning.table_model import fit_at_once  # noqa: PLC0415  numba loads with it
-
-    return fit_at_once(
-        task, rules, name=name, key=key, patch_m=data.card.patch_m, class_count=read_class_table(data.card).count
-    )
 
 
 def compute_dataset_checksum(card: DatasetCard) -> str:
@@ -238,21 +216,33 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     return Task(train, fitted, held, outputs)
 
 
-def _add_extra_features(task: Task, rules: FitConfig, data: Dataset) -> Task:
-    """Return the task with its model's extra features; physics always takes the turn, a network of energy alone none."""
-    if rules.model != "physics" and (not rules.extra_features or len(task.outputs) == 1):
-        return task
-    wanted = ("turn_radpm",) if rules.model == "physics" else ("turn_radpm", "command_mps")
-    found = tuple(of for of in available_features(read_extra_features(task.fit)) if of.name in wanted)
-    lacking = [_CALLED[name] for name in wanted if name not in {of.name for of in found}]
-    if lacking and not found and rules.model != "physics":
+def make_samples(task: Task, rules: FitConfig, data: Dataset, kind: type[Predictor]) -> Samples:
+    """Return what a model of a kind is fitted to; a network of energy alone takes no extra features."""
+    used = task.fit if kind.stops_by_fold else task.train
+    extra_features: tuple[ExtraFeature, ...] = ()
+    if kind.features or (kind.features is None and rules.extra_features and len(task.outputs) > 1):
+        extra_features = _find_extra_features(used, kind.features, data)
+    inputs = Inputs(
+        channels=task.train.channels, patch_px=data.card.patch_px, depth=task.train.view.form.depth, patch_m=data.card.patch_m,
+        class_count=read_class_table(data.card).count, extra_features=extra_features, outputs=task.outputs,
+        scale=tuple(map(float, collect_labels(task.train, task.outputs).max(axis=0))),
+    )  # fmt: skip
+    return Samples(task.train, inputs, rules, find_idle_power(task.train))
+
+
+def _find_extra_features(used: Split, wanted: Sequence[str] | None, data: Dataset) -> tuple[ExtraFeature, ...]:
+    """Return those of the wanted features that the samples have; `DatasetError` where --extra-features finds none."""
+    names = _CALLED if wanted is None else wanted
+    found = tuple(of for of in available_features(read_extra_features(used)) if of.name in names)
+    lacking = [_CALLED[name] for name in names if name not in {of.name for of in found}]
+    if lacking and not found and wanted is None:
         raise DatasetError(
             f"{data.path}: its samples have no {' and no '.join(lacking)}; ingest the logs again and build the dataset again, "
             "or train without --extra-features"
         )
     if lacking:
         logger.warning("%s: its samples have no %s: the model does not use it", data.path, " and no ".join(lacking))
-    return replace(task, extra_features=found)
+    return found
 
 
 def find_training_range(split: Split) -> TrainingRange:
@@ -348,21 +338,22 @@ def _make_result(place: Path | str, status: str, training: Training, times: Trai
     )  # fmt: skip
 
 
-def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:
-    card, form = data.card, task.fit.view.form
-    used = task.fit if config.model == "resnet18" else task.train
+def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key: str) -> ModelCard:
+    card, config, inputs = data.card, samples.config, samples.inputs
+    kind, is_held = type(fitted.predictor), find_held_out(fitted.held_out)
+    used, held = task.fit if kind.stops_by_fold else task.train, samples.take(is_held)
     return ModelCard(
         architecture=Architecture(
-            card.patch_px,
-            form.depth,
-            len(fitted.scale),
-            config.width if config.model == "resnet18" else 0,
-            len(task.extra_features),
+            inputs.patch_px,
+            inputs.depth,
+            len(inputs.outputs),
+            config.width if kind.stops_by_fold else 0,
+            len(inputs.extra_features),
         ),
-        channels=task.fit.channels,
-        outputs=task.outputs,
-        scale=fitted.scale,
-        extra_features=task.extra_features,
+        channels=inputs.channels,
+        outputs=inputs.outputs,
+        scale=inputs.scale,
+        extra_features=inputs.extra_features,
         patch_m=card.patch_m,
         chord_m=card.recipe.segment.chord_m,
         max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
@@ -377,11 +368,11 @@ def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key
         training=Training(
             key=key,
             config=config,
-            optimizer=_OPTIMIZERS[config.model],
-            samples={"fitted": len(used), "held out": len(fitted.held)},
-            epochs=fitted.progress.epoch,
-            best_epoch=fitted.progress.best_epoch,
-            held_out_loss=fitted.progress.best_loss,
+            optimizer=kind.optimizer,
+            samples={"fitted": len(used), "held out": len(held)},
+            epochs=fitted.epochs,
+            best_epoch=fitted.best_epoch,
+            held_out_loss=compute_held_loss(held, fitted.held_out[is_held]),
             device=fitted.device,
         ),
     )
@@ -392,13 +383,14 @@ def read_class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _make_residuals_table(fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
+def _make_residuals_table(samples: Samples, held_out: Labels) -> pa.Table:
     """Return labels and predictions of what was held out, one row a sample."""
-    held, said, labels = fitted.held, fitted.said, collect_labels(fitted.held, outputs)
+    is_held, outputs = find_held_out(held_out), samples.inputs.outputs
+    held, said, labels = samples.split.take(is_held), held_out[is_held], samples.labels[is_held]
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class")}
     for number, name in enumerate(("power_watt", "velocity_mps") if len(outputs) > 1 else outputs):
         quantity, _, unit = name.rpartition("_")
-        columns[name] = labels[:, number].astype(np.float64)
+        columns[name] = labels[:, number]
         columns[f"{quantity}_predicted_{unit}"] = said[:, number].astype(np.float64)
     if len(outputs) > 1:  # what the labels have in common is in no residual
         columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}

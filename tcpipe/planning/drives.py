@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
+from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
@@ -369,9 +370,8 @@ def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Findin
             error = abs(of.off_percent) / 100.0
             if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
                 yield make_finding(f"{name}-far-off", Subject("run", run_id), error_fraction=error)
-        held = [of.held for of in sums.values() if of.held is not None]
-        if held and sum(held) < read_threshold(f"{name}-overconfident", "min_drive_coverage_fraction") * len(held):
-            yield make_finding(f"{name}-overconfident", model, coverage_fraction=sum(held) / len(held))
+        if held := [of.held for of in sums.values() if of.held is not None]:
+            yield from find_miscalibration(measure_coverage(np.array(held), np.arange(len(held))), name, model)
     if 0 < len(compared) < read_threshold("few-drives", "min_drive_count"):
         yield make_finding("few-drives", model, drive_count=len(compared))
 

@@ -42,7 +42,7 @@ def test_it_is_the_network_of_keras(case):
         rng.random(shape, np.float32) for shape in ((8, px, px, depth), (8, outputs), (8, outputs))
     )
     network = make_resnet18(Architecture(px, depth, outputs, 16), seed=0, start=[0.0] * outputs)
-    network.set_arrays(weights, "golden")
+    network.set_arrays(weights)
     assert network.predict(patches) == pytest.approx(predicted, rel=1e-5, abs=1e-5)
     assert all(np.array_equal(array, weights[name]) for name, array in network.arrays().items())
     trainer = Trainer(network, compute_loss_factors("nrmse", [1.0] * outputs))
@@ -50,7 +50,5 @@ def test_it_is_the_network_of_keras(case):
     assert first == pytest.approx(case["losses"][0], rel=1e-5)
     assert second == pytest.approx(case["losses"][1], rel=1e-3)
     del weights["head/bias"]
-    with pytest.raises(
-        ModelError, match="golden: contains the weights of another network; remove it and train the model"
-    ):
-        network.set_arrays(weights, "golden")
+    with pytest.raises(ModelError, match="contains the weights of another network; remove it and train the model"):
+        network.set_arrays(weights)

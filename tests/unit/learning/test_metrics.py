@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 from tcpipe.learning.metrics import (
     ALL,
+    FEWEST_GROUPS,
     LEAST,
     Spread,
     combine_errors,
@@ -104,21 +105,28 @@ def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_
 
 def test_a_ratio_by_hand():
     ours, theirs = np.array([1.0, 4.0, 4.0]), np.array([16.0, 16.0, 4.0])
-    rmse = compare_errors(ours, theirs, np.array(["a", "a", "b"]), power=0.5, seed=0)
+    rmse = compare_errors(ours, theirs, np.array(["a", "a", "b"]), seed=0)
     assert rmse.value == pytest.approx(np.sqrt(9.0 / 36.0))
     assert (rmse.low, rmse.high) == (None, None)  # of two groups nothing is said
-    assert compare_errors(ours, theirs, np.zeros(3), power=1.0, seed=0).value == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(("groups", "is_enough"), [(5, False), (9, False), (10, True)])
+def test_five_blocks_are_too_few_for_an_interval(groups, is_enough):
+    losses = np.random.default_rng(0).exponential(size=(2, 200))
+    found = compare_errors(*losses, np.arange(200) % groups, seed=0)
+    assert found.value is not None
+    assert (found.low is not None) == is_enough
 
 
 def test_the_same_errors_on_both_sides_are_surely_one():
     losses = np.random.default_rng(0).exponential(size=200)
-    found = compare_errors(2.0 * losses, losses, np.arange(200) // 10, power=1.0, seed=0)
+    found = compare_errors(4.0 * losses, losses, np.arange(200) // 10, seed=0)
     assert (found.value, found.low, found.high) == pytest.approx((2.0, 2.0, 2.0))
 
 
 @pytest.mark.parametrize("losses", [np.empty(0), np.zeros(30), np.full(30, np.nan)])
 def test_nothing_to_divide_by_is_no_ratio(losses):
-    found = compare_errors(np.ones(len(losses)), losses, np.arange(len(losses)), power=1.0, seed=0)
+    found = compare_errors(np.ones(len(losses)), losses, np.arange(len(losses)), seed=0)
     assert found.value is found.low is found.high is None
 
 
@@ -127,18 +135,19 @@ def test_groups_that_err_alike_make_it_less_sure():
     shared = np.repeat(rng.lognormal(0.0, 0.5, 20), 50)
     ours, theirs = shared * rng.exponential(size=1000), rng.exponential(size=1000)
     together, alone = (
-        compare_errors(ours, theirs, groups, power=1.0, seed=0) for groups in (np.arange(1000) // 50, np.arange(1000))
+        compare_errors(ours, theirs, groups, seed=0) for groups in (np.arange(1000) // 50, np.arange(1000))
     )
     assert np.log(together.high / together.low) > 1.5 * np.log(alone.high / alone.low)
 
 
-def test_how_often_an_interval_holds_the_truth():
-    """30 groups of 20 in which both sides err alike; 200 such data sets, 92 to 95 of 100 hold it, less three deviations of that share."""
-    held, sets, groups = 0, 200, np.repeat(np.arange(30), 20)
+@pytest.mark.parametrize("count", [FEWEST_GROUPS, 30])
+def test_how_often_an_interval_holds_the_truth(count):
+    """Groups of 20 in which both sides err alike; 200 such data sets, 92 to 95 of 100 hold it, less three deviations of that share."""
+    held, sets, groups = 0, 200, np.repeat(np.arange(count), 20)
     for seed in range(sets):
         rng = np.random.default_rng(seed)
-        easy, worse = np.exp(rng.normal(0.0, 0.3, 30))[groups], np.exp(rng.normal(0.0, 0.2, 30))[groups]
-        ours = (easy * worse * rng.normal(size=600)) ** 2
-        found = compare_errors(ours, (easy * rng.normal(size=600)) ** 2, groups, power=0.5, seed=seed)
+        easy, worse = np.exp(rng.normal(0.0, 0.3, count))[groups], np.exp(rng.normal(0.0, 0.2, count))[groups]
+        ours = (easy * worse * rng.normal(size=groups.size)) ** 2
+        found = compare_errors(ours, (easy * rng.normal(size=groups.size)) ** 2, groups, seed=seed)
         held += found.low <= np.exp(0.2**2) <= found.high
     assert 0.87 <= held / sets <= 0.98

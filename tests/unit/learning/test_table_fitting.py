@@ -33,9 +33,7 @@ def test_it_predicts_what_it_was_made_of(trained, dataset):
     place, result = trained
     model, split = load_model(place), open_dataset(dataset)["train"]
     assert result.samples == {"fitted": len(split), "held out": len(split)}
-    assert f"{result.best_epoch} trees a label of {len(split)} samples, each predicted by the other folds" in str(
-        result
-    )
+    assert f"boosting of {len(split)} samples, best {result.best_epoch} of" in str(result)
     said = model.predict(split.patches)
     assert said.dtype == np.float32
     errors = np.abs(said - split.labels).mean(axis=0)
@@ -43,7 +41,7 @@ def test_it_predicts_what_it_was_made_of(trained, dataset):
     assert model.predict(split.patches[3:4]) == pytest.approx(said[3:4])
     assert sum(model.class_counts.values()) == len(split)
     assert verify(place).problems == ()
-    assert "Table: a curve over the slope" in (place / README).read_text()
+    assert "Kind boosting: a curve over the slope" in (place / README).read_text()
 
 
 def test_every_sample_was_held_out_once(trained, dataset):
@@ -65,7 +63,7 @@ def test_the_same_again_is_nothing_to_do_and_the_same_bytes(trained, dataset, tm
 def test_one_layer_one_output_and_weights(dataset, tmp_path):
     train(dataset, tmp_path / "height", config=CONFIG, variant=Variant(channels=("height",), energy_only=True))
     model = load_model(tmp_path / "height")
-    said = model.outputs(open_dataset(dataset)["train"].with_channels("height").patches)
+    said = model.predict(open_dataset(dataset)["train"].with_channels("height").patches)
     assert said.shape[1] == 1
     train(dataset, tmp_path / "weighed", config=replace(CONFIG, inverse_variance_weights=True))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):

@@ -5,7 +5,8 @@ import pytest
 
 from tcpipe.errors import ModelError
 from tcpipe.learning import table_model as forest
-from tcpipe.learning.table_model import compute_patch_features, fit_table, read_table_model
+from tcpipe.learning.predictor import Inputs
+from tcpipe.learning.table_model import BoostingModel, compute_patch_features, fit_table
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
@@ -73,9 +74,7 @@ def test_trees_by_hand():
     features = np.array([[0.0, 0.5], [3.0, 0.6], [3.0, -1.0], [2.0, 0.0]])
     assert made.predict(features).tolist() == [[11.0, 3.0], [12.0, 5.0], [11.0, 4.0], [11.0, 3.0]]
     assert made.predict(np.tile(features, (200, 1)))[796:].tolist() == made.predict(features).tolist()
-    assert forest.read_forest(made.arrays(), "here").predict(features[:1]).tolist() == [[11.0, 3.0]]
-    with pytest.raises(ModelError, match="here: contains the weights of another model"):
-        forest.read_forest({"head/bias": np.zeros(2)}, "here")
+    assert forest.read_forest(made.arrays()).predict(features[:1]).tolist() == [[11.0, 3.0]]
 
 
 def test_they_say_what_lightgbm_says():
@@ -143,9 +142,8 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
 def test_arrays_there_and_back_and_an_older_kind(fitted):
     model, _ = fitted
     features, _, _ = ground(20)
-    again = read_table_model(model.arrays(), "weights.npz", CHANNELS, CLASSES)
+    inputs = Inputs(CHANNELS, 40, 3, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
+    again = BoostingModel.from_arrays(model.arrays(), inputs).table
     assert np.array_equal(again.predict(features), model.predict(features))
-    with pytest.raises(
-        ModelError, match="contains the weights of another model, or of an older kind; train the model again"
-    ):
-        read_table_model(model.forest.arrays(), "weights.npz", CHANNELS, CLASSES)
+    with pytest.raises(ModelError, match=r"the weights of another model: curve_.* is missing; train the model again"):
+        BoostingModel.from_arrays(model.forest.arrays(), inputs)

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.weights import read_arrays, write_arrays
-from tcpipe.learning import fitting
-from tcpipe.learning.fitting import FitConfig, TrainingProgress, read_checkpoint, write_checkpoint
+from tcpipe.learning import network_model
+from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
+from tcpipe.learning.network_model import TrainingProgress, read_checkpoint, write_checkpoint
 from tcpipe.learning.training import Variant, find_training_range, make_training_task, train
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_NODATA
@@ -97,14 +98,14 @@ def test_net_energy_can_be_trained_on(energy_only, dataset, tmp_path):
 )
 def test_the_rate_falls_where_nothing_gets_better_and_at_the_end(held, rate):
     history = [(number + 1, 1.0, float(loss)) for number, loss in enumerate(held)]
-    progress = fitting.TrainingProgress("key", len(history), history=history)
+    progress = network_model.TrainingProgress("key", len(history), history=history)
     config = replace(CONFIG, epochs=20, patience=4, learning_rate=1.0)
-    assert fitting.compute_learning_rate(config, progress) == pytest.approx(rate)
+    assert network_model.compute_learning_rate(config, progress) == pytest.approx(rate)
 
 
 def _stopped(monkeypatch, at, dataset, place, config, **options):
     """Train until the checkpoint after epoch ``at`` is written; return the epochs whose checkpoints were."""
-    real, epochs = fitting.write_checkpoint, []
+    real, epochs = network_model.write_checkpoint, []
 
     def write_and_stop(path, progress, parts):
         real(path, progress, parts)
@@ -112,11 +113,11 @@ def _stopped(monkeypatch, at, dataset, place, config, **options):
         if progress.epoch == at:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(fitting, "_STEPS_BETWEEN", 1)
-    monkeypatch.setattr(fitting, "write_checkpoint", write_and_stop)
+    monkeypatch.setattr(network_model, "_STEPS_BETWEEN", 1)
+    monkeypatch.setattr(network_model, "write_checkpoint", write_and_stop)
     with pytest.raises(KeyboardInterrupt):
         train(dataset, place, config=config, **options)
-    monkeypatch.setattr(fitting, "write_checkpoint", real)
+    monkeypatch.setattr(network_model, "write_checkpoint", real)
     assert not place.exists()
     return epochs
 
@@ -141,8 +142,10 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
 def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
     """As many as have 32 steps of 64 samples together, of a training set of a step or two."""
     epochs = []
-    monkeypatch.setattr(fitting, "write_checkpoint", lambda _path, progress, _parts: epochs.append(progress.epoch))
-    monkeypatch.setattr(fitting, "_train_epoch", lambda *_, **__: 1.0)
+    monkeypatch.setattr(
+        network_model, "write_checkpoint", lambda _path, progress, _parts: epochs.append(progress.epoch)
+    )
+    monkeypatch.setattr(network_model, "_train_epoch", lambda *_, **__: 1.0)
     result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch_size=64))
     assert epochs == list(range(0, 46, 32 * 64 // result.samples["fitted"]))
 
@@ -150,7 +153,7 @@ def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
 def test_a_held_out_loss_that_is_no_number_is_gone_on_from(dataset, tmp_path, monkeypatch):
     config = replace(CONFIG, epochs=2)
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "compute_held_loss", lambda *_, **__: float("nan"))
+        patch.setattr(network_model, "compute_held_loss", lambda *_, **__: float("nan"))
         _stopped(monkeypatch, 1, dataset, tmp_path / "model", config)
     assert train(dataset, tmp_path / "model", config=config).best_epoch == 2
 
@@ -176,7 +179,7 @@ def test_a_state_of_another_training_or_cut_short_is_told(dataset, tmp_path, mon
 
 def test_a_place_that_cannot_be_written_is_found_before_the_first_epoch(dataset, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(fitting, "_train_epoch", lambda *_, **__: pytest.fail("an epoch was trained"))
+    monkeypatch.setattr(network_model, "_train_epoch", lambda *_, **__: pytest.fail("an epoch was trained"))
     with pytest.raises(StoreError, match=r"model.checkpoint: cannot be written"):
         train(dataset, tmp_path / "file" / "model", config=CONFIG)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from made_models import CARD, made_comparison, made_evaluation
 
+from tcpipe.cost.coverage import Coverage
 from tcpipe.learning.evaluation import find_weaknesses
 from tcpipe.learning.evaluation_facts import EvaluatedModel, Leakage, SplitErrors
 from tcpipe.learning.fitting import FitConfig
@@ -16,14 +17,20 @@ BETTER = Ratio(0.8, 0.7, 0.9)
 SPLINE = "class and slope, spline"
 
 
-def told(energy=GOOD, ratio=BETTER, *, split="unseen", floor=1.0, near=0.0, baseline=SPLINE, kind="resnet18"):
+SURE = Coverage(0.9, 0.85, 0.93, 12, 500)
+
+
+def told(
+    energy=GOOD, ratio=BETTER, *, split="unseen", floor=1.0, near=0.0, baseline=SPLINE, kind="resnet18", coverage=SURE
+):
     """The findings on an evaluation of one split by code, from its own figures and those of the best baseline."""
     floors = {"E": {"all": Errors(500, floor, 1.0, 500)}}
     errors, leakage = {"E": {"all": energy}, "T": {"all": GOOD}}, Leakage("sample", 1.05, near, None)
+    stated = {} if coverage is None else {"E": coverage, "T": coverage}
     model = EvaluatedModel("", "", replace(CARD.training, config=FitConfig(model=kind)))
     evaluation = made_evaluation(
         model=model,
-        splits={split: SplitErrors(energy.count, {}, (), errors, floors, leakage=leakage)},
+        splits={split: SplitErrors(energy.count, {}, (), errors, stated, {}, floors, leakage=leakage)},
         baselines=(made_comparison(baseline, ratio, split=split),),
     )
     return {of.code: of for of in find_weaknesses(evaluation)}
@@ -65,17 +72,20 @@ def test_too_few_groups_show_neither():
 
 
 @pytest.mark.parametrize(
-    ("held", "code", "grade"),
+    ("coverage", "codes", "grades"),
     [
-        (60.0, "energy-overconfident", "usable with care"),
-        (99.0, "underconfident", "usable"),
-        (None, "no-intervals", "usable"),
+        (Coverage(0.6, 0.5, 0.7, 12, 500), {"energy-overconfident", "time-overconfident"}, {"usable with care"}),
+        (Coverage(0.76, 0.3, 0.97, 5, 500), set(), {"usable"}),
+        (Coverage(0.76, None, None, 2, 500), set(), {"usable"}),
+        (Coverage(0.99, 0.97, 1.0, 12, 500), {"underconfident"}, {"usable"}),
+        (None, {"no-intervals"}, {"usable"}),
     ],
 )
-def test_intervals_are_compared_with_what_they_state(held, code, grade):
-    found = told(replace(GOOD, coverage_percent=held))
-    assert set(found) == {code}
-    assert judge(found.values()).energy == grade
+def test_intervals_are_compared_with_what_they_state(coverage, codes, grades):
+    found = told(coverage=coverage)
+    assert set(found) == codes
+    verdict = judge(found.values())
+    assert {verdict.energy, verdict.time} == grades
 
 
 def test_few_samples_near_training_are_named():

@@ -14,7 +14,7 @@ class _Begun(Exception):  # noqa: N818
     ("module", "run"),
     [
         (demo, lambda place: demo.run_demo(place, seed=1, say=print)),
-        (reproduction, lambda place: reproduction.reproduce(place, quick=True)),
+        (reproduction, lambda place: reproduction.reproduce(place, size="quick")),
     ],
 )
 def test_what_a_killed_simulation_left_is_in_nobodys_way(module, run, tmp_path, monkeypatch):

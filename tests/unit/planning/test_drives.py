@@ -70,7 +70,7 @@ def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
     findings = {of.code: of for of in said.values.findings}
     assert findings["drive-in-training"].subject.name == north.run_id
     assert findings["few-drives"].numbers == {"drive_count": 1.0}
-    assert ("energy-overconfident" in findings) == (south.energy_joule.held is False)
+    assert "energy-overconfident" not in findings  # one drive decides nothing
     assert "[few-drives]" in page
     assert "J measured" in page
     assert json.loads((tmp_path / "out" / "drives.json").read_text())["drives"][1]["run_id"] == "south"

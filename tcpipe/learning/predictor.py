@@ -1,0 +1,217 @@
+"""What a model of the cost of a metre has to be able to do, and the kinds of model that there are.
+
+The kinds that tcpipe ships implement `Predictor` and nothing else, so that a model of your own can do all that they can. A kind is a
+class; only ``predict`` is needed, ``fit`` to be trained, and ``to_arrays`` with ``from_arrays`` to be kept in a model folder::
+
+    class MeanOfClass:
+        @classmethod
+        def fit(cls, samples): ...                     # Samples: patches, features, labels, weights, folds
+        def predict(self, patches, features): ...      # power [W] and velocity [m/s], shape (N, 2)
+        def to_arrays(self): ...                       # dict of numpy arrays
+        @classmethod
+        def from_arrays(cls, arrays, inputs): ...      # Inputs: channels, size of a patch, classes
+
+``patches`` are float32 (N, px, px, channels) in [0, 1], travel to the right; ``features`` (`tcpipe.dataset.extra_features.ExtraFeatures`)
+has slope, terrain class, turn and commanded speed of each. Intervals come from predictions of samples that a model was not fitted to:
+``fit`` is called for the other folds of each fold, unless the class has ``fit_folds``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeAlias, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.dataset import Split
+from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
+from tcpipe.learning.architecture import compute_loss_factors, mean_loss
+from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, collect_labels
+
+Patches: TypeAlias = NDArray[np.float32]
+Floats: TypeAlias = NDArray[np.float64]
+Labels: TypeAlias = NDArray[np.floating]
+Arrays: TypeAlias = Mapping[str, NDArray[Any]]
+
+_TOGETHER = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What the patches and features of a model are of, and what it predicts."""
+
+    channels: tuple[str, ...]
+    """What the last axis of patches holds."""
+    patch_px: int
+    depth: int
+    """Length of that axis: a channel may have several planes."""
+    patch_m: float
+    class_count: int
+    """Largest class id of the table by which the terrain channel is scaled."""
+    extra_features: tuple[ExtraFeature, ...]
+    """Features besides slope and class that are known, with their distribution over the training samples."""
+    outputs: tuple[str, ...]
+    """Columns: power and velocity, or energy alone."""
+    scale: tuple[float, ...]
+    """Largest label of each output in train."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Labelled samples that a model is fitted to."""
+
+    split: Split
+    """Of the dataset: every column of samples.parquet, and patches batch by batch."""
+    inputs: Inputs
+    config: FitConfig
+    idle_watt: float | None
+    """What the robot draws while it does not move; None where no run shows it."""
+
+    def __len__(self) -> int:
+        """Return how many they are."""
+        return len(self.split)
+
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Samples:
+        """Return some of them."""
+        return replace(self, split=self.split.take(rows))
+
+    @property
+    def patches(self) -> Patches:
+        """All patches at once, shape (N, px, px, channels)."""
+        return self.split.patches
+
+    @cached_property
+    def features(self) -> ExtraFeatures:
+        """Slope, class, turn and commanded speed."""
+        return read_extra_features(self.split)
+
+    @cached_property
+    def labels(self) -> Floats:
+        """What is to be predicted, shape (N, outputs)."""
+        return collect_labels(self.split, self.inputs.outputs).astype(np.float64)
+
+    @cached_property
+    def weights(self) -> Floats:
+        """Weight of each label, shape (N, outputs); 1 unless --inverse-variance-weights is given."""
+        weighed = self.config.inverse_variance_weights and self.split.weights.shape == self.labels.shape
+        return self.split.weights.astype(np.float64) if weighed else np.ones_like(self.labels)
+
+    @property
+    def folds(self) -> NDArray[np.generic]:
+        """Fold of each sample for cross-validation; a fold is a set of blocks of ground, or of runs."""
+        return self.split.column("fold")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A training: what messages call it, the hash of dataset and options, and where its state is kept until it is done."""
+
+    name: str
+    key: str
+    checkpoint: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """A fitted model, and what it, or models of the other folds, predict of samples that they were not fitted to."""
+
+    predictor: Predictor
+    held_out: Labels
+    """Shape (N, outputs); NaN for samples that the model was fitted to."""
+    epochs: int = 1
+    best_epoch: int = 1
+    """Or the number of trees of an output."""
+    history: Sequence[tuple[int, float, float]] = ()
+    """Epoch, loss, held-out loss."""
+    training_times_s: TrainingTimes = field(default_factory=TrainingTimes)
+    device: str = "cpu"
+
+
+class Predictor(Protocol):
+    """A kind of model. Everything but ``predict`` has a default."""
+
+    about: ClassVar[str] = ""
+    """One sentence, for MODEL.md."""
+    optimizer: ClassVar[str] = ""
+    channels: ClassVar[tuple[str, ...]] = ()
+    """Channels that it looks at; empty: all of the dataset."""
+    features: ClassVar[tuple[str, ...] | None] = None
+    """Of ``turn_radpm`` and ``command_mps``, those that it takes; None: both, with --extra-features."""
+    stops_by_fold: ClassVar[bool] = False
+    """Whether one fold of train stops its training, and the others alone are fitted."""
+
+    def predict(self, patches: Patches, features: ExtraFeatures) -> Labels:
+        """Return the outputs of N metres of ground, shape (N, outputs): power [W] and velocity [m/s], or energy [J]."""
+
+    @classmethod
+    def fit(cls, samples: Samples) -> Predictor:
+        """Return the model fitted to samples."""
+        raise NotImplementedError
+
+    @classmethod
+    def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
+        """Return the model fitted to all samples, and predictions of each by a model of the other folds."""
+        del job
+        return cross_fit(cls, samples)
+
+    def to_arrays(self) -> Arrays:
+        """Return all that `from_arrays` needs."""
+        return {}
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays, inputs: Inputs) -> Predictor:
+        """Return the model of `to_arrays`; `ModelError` where the arrays are those of another."""
+        del arrays, inputs
+        return cls()
+
+
+KINDS: Mapping[ModelKind, str] = {
+    "physics": "tcpipe.learning.physics_model:PhysicsModel",
+    "boosting": "tcpipe.learning.table_model:BoostingModel",
+    "resnet18": "tcpipe.learning.network_model:NetworkModel",
+}
+"""Class of each kind, simplest first; a class is imported when it is needed."""
+
+
+def find_kind(name: ModelKind) -> type[Predictor]:
+    """Return the class of a kind."""
+    module, _, attribute = KINDS[name].partition(":")
+    return cast("type[Predictor]", getattr(import_module(module), attribute))
+
+
+def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
+    """Fit a model to all samples and, for predictions of each, to the other folds."""
+    began, held_out = time.perf_counter(), np.empty_like(samples.labels)
+    for fold in np.unique(samples.folds):
+        held = samples.folds == fold
+        held_out[held] = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+    whole = kind.fit(samples)
+    return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, 0.0, len(samples)))
+
+
+def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
+    """Return predictions of samples, shape (N, outputs); their patches are formed some at a time."""
+    out = np.empty((len(samples), len(samples.inputs.outputs)))
+    for first in range(0, len(samples), _TOGETHER):
+        rows = np.arange(first, min(first + _TOGETHER, len(samples)))
+        out[rows] = predictor.predict(samples.split.batch(rows)[0], samples.features.take(rows))
+    return out
+
+
+def find_held_out(held_out: Labels) -> NDArray[np.bool_]:
+    """Return which samples have a held-out prediction, shape (N,)."""
+    return np.asarray(np.isfinite(held_out).all(axis=1))
+
+
+def compute_held_loss(held: Samples, predicted: Labels) -> float:
+    """Return the loss of predictions of held-out samples, as the options say."""
+    scale = np.array(held.inputs.scale, np.float32)
+    labels, predicted = (values.astype(np.float32) / scale for values in (held.labels, predicted))
+    factors = compute_loss_factors(held.config.loss, held.inputs.scale)
+    return float(mean_loss(predicted, labels, factors, held.weights.astype(np.float32)))
