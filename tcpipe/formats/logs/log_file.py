@@ -275,6 +275,17 @@ class Log(OpenLog):
         (tables,) = self.batches(topics, batch_bytes=None, threads=threads)
         return tables
 
+    def first_rows(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+        """Return the first rows of several topics, as `tables`; the log is read until each has some."""
+        found: dict[str, pa.Table] = {}
+        wanted = [name for name in topics if self.topics[name].message_count != 0]
+        if wanted:
+            for tables in self.batches(wanted, batch_bytes=0):
+                found = {**{name: table for name, table in tables.items() if table.num_rows}, **found}
+                if len(found) == len(wanted):
+                    break
+        return found
+
     def batches(
         self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES, threads: int = 1
     ) -> Iterator[dict[str, pa.Table]]:
