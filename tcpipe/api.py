@@ -79,7 +79,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
     `StoreError` where an input cannot be used.
     """
     model, dataset, out = options.model, options.dataset, options.out
-    if options.adapt:
+    if options.adapt is not None:
         from tcpipe.learning.evaluation_files import evaluate_adaptation
         from tcpipe.learning.models import load_model
         from tcpipe.planning.drives import collect_run, find_drive
@@ -135,7 +135,7 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
         from tcpipe.store import open_store
 
         known = collect_run(asked, source, find_drive(open_store(options.store), str(options.adapt)))
-    return run(asked, source, Path(options.path), None if options.out is None else Path(options.out), known=known)
+    return run(asked, source, Path(options.path), None if options.out is None else Path(options.out), adapted_by=known)
 
 
 predict_path = as_function(PredictPathOptions, run_predict_path)

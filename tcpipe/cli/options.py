@@ -214,13 +214,13 @@ def _parse_named_files(option: str, given: tuple[str, ...], hint: str) -> dict[s
     return files
 
 
-def parse_lengths(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...]:
+def parse_lengths(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...] | None:
     """Turn ``0,10,50`` into lengths [m]."""
-    if not value:
-        return ()
+    if value is None:
+        return None
     if re.fullmatch(r"\d{1,5}(\.\d{1,3})?(,\d{1,5}(\.\d{1,3})?)*", value) is None:
         raise click.BadParameter(f"{value!r}: expected metres with commas between, as 0,10,50,100")
-    return tuple(sorted({float(part) for part in value.split(",")}))
+    return tuple(float(part) for part in value.split(","))
 
 
 def parse_holdout(_: click.Context, __: click.Parameter, value: str | None) -> str | None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
-from tcpipe.cost.prediction_errors import COVERAGE, Errors
+from tcpipe.cost.prediction_errors import COVERAGE, Errors, SumDistribution
 from tcpipe.tables.facts import PhysicsFit
 
 Floats = NDArray[np.float64]
@@ -60,12 +60,12 @@ class Metres:
 
 @dataclass(frozen=True, slots=True)
 class Adapted:
-    """What an adapted model says of metres, shape (N,), and of their sum: value and ends of its interval."""
+    """What an adapted model says of metres, shape (N,), with the ends of their intervals, and of their sum."""
 
     value: Floats
     low: Floats
     high: Floats
-    total: tuple[float, float, float]
+    total: SumDistribution
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +94,9 @@ class Adaptation:
         known = np.isfinite(there.predicted)
         if not known.all():
             parts = self.predict(there.take(known))
-            columns = [np.full(known.shape, np.nan) for _ in range(3)]
-            for column, values in zip(columns, (parts.value, parts.low, parts.high), strict=True):
-                column[known] = values
-            return Adapted(*columns, parts.total)
+            columns = np.full((3, known.size), np.nan)
+            columns[:, known] = parts.value, parts.low, parts.high
+            return Adapted(columns[0], columns[1], columns[2], parts.total)
         design, spread = _make_design(there, self.per_metre), self.errors.compute_std(there.predicted, there.class_id)
         neighbours, ground = (_sum_products(spread, there, of) for of in (_find_neighbour(self.errors), None))
         weights = np.array([of.weight for of in self.components])
@@ -114,7 +113,7 @@ class Adaptation:
         common = wider * self.errors.common_share * float(np.abs(mean).sum())
         half = float(np.hypot(wider * np.sqrt(total_variance), common))
         low, high = (_widen(end, self.freedom) * np.sqrt(variance) for end in (self.errors.low, self.errors.high))
-        return Adapted(mean, mean + low, mean + high, (float(total), float(total) - half, float(total) + half))
+        return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half))
 
 
 def adapt(errors: Errors, known: Metres) -> Adaptation:
@@ -182,6 +181,11 @@ def _widen(quantile: float, freedom: float) -> float:
 _NORMAL = 1.6448536269514722
 
 
+def _make_sum(middle: float, half: float) -> SumDistribution:
+    """Return the distribution of a sum whose 90 % interval has this half-width."""
+    return SumDistribution(middle, half / _NORMAL, half / _NORMAL)
+
+
 @dataclass(frozen=True, slots=True)
 class Run:
     """Measured metres of a run, by quantity (``duration``, ``energy``), in order."""
@@ -207,12 +211,10 @@ def make_metres(
     distance_m: Floats,
 ) -> dict[str, Metres]:
     """Return metres of a run by quantity; what grade and turns cost in energy is that of the model's own robot, where it is known."""
-    found = {} if physics is None else {of.term: of.value for of in physics.terms}
-    columns = [
-        found[term] * cause
-        for term, cause in (("grade", length_m * np.tan(slope_rad)), ("turning", np.abs(turn_rad)))
-        if term in found
-    ]
+    columns = []
+    for term, cause in (("grade", length_m * np.tan(slope_rad)), ("turning", np.abs(turn_rad))):
+        if values := [of.value for of in (physics.terms if physics else ()) if of.term == term]:
+            columns.append(float(np.mean(values)) * cause)
     nothing = np.empty((len(length_m), 0))
     parts = {"duration": nothing, "energy": np.column_stack(columns) if columns else nothing}
     return {
@@ -279,8 +281,8 @@ def _predict_rest(errors: Errors, known: Metres, rest: Metres, predictor: str) -
     if len(known.predicted):
         return adapt(errors, known).predict(rest)
     low, high = errors.compute_intervals(rest.predicted, rest.class_id)
-    ends = errors.compute_sum_interval(rest.predicted, rest.class_id)
-    return Adapted(rest.predicted, low, high, (float(rest.predicted.sum()), *ends))
+    total = errors.compute_sum(rest.predicted, rest.class_id)
+    return Adapted(rest.predicted, low, high, total)
 
 
 def _predict_mean(known: Metres, rest: Metres) -> Adapted:
@@ -292,16 +294,14 @@ def _predict_mean(known: Metres, rest: Metres) -> Adapted:
     value, length_m = mean * rest.length_m, float(rest.length_m.sum())
     half = wider * std * np.sqrt(1.0 + 1.0 / count) * rest.length_m
     whole = wider * std * float(np.sqrt((rest.length_m**2).sum() + length_m**2 / count))
-    return Adapted(
-        value, value - half, value + half, (mean * length_m, mean * length_m - whole, mean * length_m + whole)
-    )
+    return Adapted(value, value - half, value + half, _make_sum(mean * length_m, whole))
 
 
 def _measure(quantity: str, metres_m: float, predictor: str, found: Sequence[tuple[Metres, Adapted]]) -> AdaptedErrors:
     error = np.concatenate([said.value - rest.measured for rest, said in found])
     inside = np.concatenate([(said.low <= rest.measured) & (rest.measured <= said.high) for rest, said in found])
     sums = np.array([rest.measured.sum() for rest, _ in found])
-    totals = np.array([said.total for _, said in found])
+    totals = np.array([[said.total.middle, *said.total.interval] for _, said in found])
     return AdaptedErrors(
         quantity=quantity, metres=metres_m, predictor=predictor, runs=len(found), samples=len(error),
         rmse=float(np.sqrt(np.mean(error**2))), coverage_percent=100.0 * float(inside.mean()),

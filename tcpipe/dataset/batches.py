@@ -17,7 +17,7 @@ from tcpipe.formats.dataset_files import PatchFiles
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Batch = tuple[Floats | tuple[Floats, Floats], ...]
-Pixels = dict[str, NDArray[np.uint8 | np.uint16 | np.float32]]
+Pixels = dict[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
 
 IN_MEMORY_BYTES = 2 << 30
 """A split whose stored layers are smaller is kept in memory; the paper's whole dataset takes 70 MB."""
@@ -47,8 +47,7 @@ class StoredPixels:
 
     def fit(self, layers: tuple[str, ...]) -> bool:
         """Return whether the layers are kept in memory."""
-        values = sum(self.files.layers[layer].stored.itemsize for layer in layers) * self.files.patch_px**2
-        return len(self.rows) * values <= IN_MEMORY_BYTES
+        return len(self.rows) * sum(self.files.make_room(layer, 1).nbytes for layer in layers) <= IN_MEMORY_BYTES
 
     def in_memory(self, layers: tuple[str, ...]) -> Pixels:
         """Return the layers of all samples, and others that were asked for before, read once and kept, each of shape (N, px, px)."""
@@ -81,8 +80,8 @@ class StoredPixels:
         parts = np.split(order, np.flatnonzero(np.diff(piece_of[order])) + 1) if len(order) else []
         if rng is not None:
             parts = [parts[number] for number in rng.permutation(len(parts))]
-        shape = (spare + min(pieces, len(parts)) * files.piece_rows, files.patch_px, files.patch_px)
-        pool = {layer: np.empty(shape, files.layers[layer].stored) for layer in layers}
+        room = spare + min(pieces, len(parts)) * files.piece_rows
+        pool = {layer: files.make_room(layer, room) for layer in layers}
         for first in range(0, len(parts), pieces):
             here, places = parts[first : first + pieces], []
             files.expect([int(piece_of[part[0]]) for part in here], layers)
@@ -96,8 +95,7 @@ class StoredPixels:
 
     def _read(self, rows: Ints, layers: Sequence[str]) -> Pixels:
         """Read the pieces that hold ``rows`` (of the files), each once."""
-        px = self.files.patch_px
-        out: Pixels = {layer: np.empty((len(rows), px, px), self.files.layers[layer].stored) for layer in layers}
+        out: Pixels = {layer: self.files.make_room(layer, len(rows)) for layer in layers}
         piece_of = np.searchsorted(self.files.starts, rows, side="right") - 1
         pieces = np.unique(piece_of).tolist()
         for number, piece in enumerate(pieces):

@@ -166,7 +166,8 @@ class Split:
 
     def with_channels(self, *channels: str) -> Split:
         """Return the split with these channels: layers by name, or ``terrain_one_hot`` (a channel a class; of any categorical layer)."""
-        form = make_tensor_layout(channels, self.view.stored.files.layers)
+        files = self.view.stored.files
+        form = make_tensor_layout(channels, files.layers, files.patch_px)
         return replace(self, view=replace(self.view, form=form))
 
     def take(self, chosen: ArrayLike) -> Split:
@@ -329,7 +330,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
         )
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
-    form = make_tensor_layout(asked, files.layers)
+    form = make_tensor_layout(asked, files.layers, files.patch_px)
     parts = {}
     for name, rows in find_rows_in_files(card, split).items():
         columns = SampleColumns(directory, np.flatnonzero(split == name))

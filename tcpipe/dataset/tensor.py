@@ -13,7 +13,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.terrain.layers import LAYERS, Layer, sort_layers
 
 Floats = NDArray[np.float32]
-Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float32]]
+Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
 
 ONE_HOT = "_one_hot"
 """Ending of a categorical layer's name: a channel for each of its classes, 1 where the pixel is of it."""
@@ -23,10 +23,14 @@ _BYTES = np.arange(256, dtype=np.uint8)
 
 @dataclass(frozen=True)
 class TensorLayout:
-    """Channels in their order: names of layers as in the paper, or of a categorical one with `ONE_HOT`; ``known`` are all layers."""
+    """Channels in their order: names of layers, those of several bands with as many channels, or of a categorical one with `ONE_HOT`.
+
+    ``known`` are all layers.
+    """
 
     channels: tuple[str, ...]
     known: Mapping[str, Layer]
+    patch_px: int
 
     @cached_property
     def layers(self) -> tuple[str, ...]:
@@ -43,17 +47,17 @@ class TensorLayout:
 
     def _width(self, channel: str) -> int:
         layer = self.known[self._of(channel)]
-        return 1 if layer.name == channel else round(layer.high)
+        return max(len(layer.bands), 1) if layer.name == channel else round(layer.high)
 
     def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats:
-        """Return the tensor of ``rows``, shape (B,), of stored layers, (N, px, px) each: float32, shape (B, px, px, depth).
+        """Return the tensor of ``rows``, shape (B,), of stored layers: float32, shape (B, px, px, depth).
 
         ``mirrored`` tells which of them are mirrored across their direction of travel, shape (B,).
         """
         from tcpipe.dataset.tensor_kernel import form_bytes, form_numbers, form_paper_tensor  # noqa: PLC0415  numba loads with the first batch
 
         flips = np.zeros(len(rows), np.bool_) if mirrored is None else mirrored
-        px = next(iter(pixels.values())).shape[1]
+        px = self.patch_px
         out = np.empty((len(rows), px, px, self.depth), np.float32)
         if self.channels == LAYERS:
             most = np.float32(255.0), np.float32(max(self.known["terrain"].high - 1.0, 1.0))
@@ -67,6 +71,10 @@ class TensorLayout:
                 for place in range(self._width(channel)):
                     is_it = np.equal(_BYTES, place + 1).astype(np.float32)
                     form_bytes(pixels[layer.name], rows, flips, is_it, at + place, out)
+            elif layer.bands:
+                values = np.array(pixels[channel][rows])
+                values[flips] = values[flips, :, ::-1]
+                out[..., at : at + self._width(channel)] = layer.band_channels(values, px)
             elif layer.stored == np.uint8:
                 form_bytes(pixels[channel], rows, flips, layer.channel(_BYTES), at, out)
             else:
@@ -76,11 +84,11 @@ class TensorLayout:
         return out
 
 
-def make_tensor_layout(channels: Sequence[str], known: Mapping[str, Layer]) -> TensorLayout:
+def make_tensor_layout(channels: Sequence[str], known: Mapping[str, Layer], patch_px: int) -> TensorLayout:
     """Return the layout with these channels; `DatasetError` names those that the stored layers cannot give."""
     possible = [*known, *(f"{name}{ONE_HOT}" for name, layer in known.items() if layer.kind == "categorical")]
     unknown = [channel for channel in channels if channel not in possible]
     if unknown or not channels:
         named = ", ".join(unknown) or "none"
         raise DatasetError(f"requested channels: {named}; this dataset has {', '.join(possible)}")
-    return TensorLayout(tuple(channels), known)
+    return TensorLayout(tuple(channels), known, patch_px)

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -38,8 +39,8 @@ from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
 
 FileFormat = Literal["zarr", "parquet"]
-LayerPixels = NDArray[np.uint8 | np.uint16 | np.float32]
-"""Patches of one layer as they are stored, shape (N, px, px)."""
+LayerPixels = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]
+"""Patches of one layer as they are stored, shape (N, px, px), or (N, bands, own px, own px)."""
 
 CARD = "dataset.json"
 CROISSANT = "croissant.json"
@@ -111,9 +112,8 @@ class ZarrShardWriter:
 
     def write(self) -> None:
         """Write what is not there yet."""
-        shard = (self.number, 0, 0)
         for layer, array in self.arrays.items():
-            name = f"{PATCHES}/{layer}/{array.shard_name(shard)}"
+            name = f"{PATCHES}/{layer}/{array.shard_name((self.number, *(0 for _ in array.shape[1:])))}"
             if self.out.size(name) is None:
                 patches = self.pixels.read(layer, self.pixels.slots)
                 self.out.put(name, array.encoded_shard(patches, threads=self.threads))
@@ -163,14 +163,17 @@ def make_zarr_writers(
     attributes = {"Conventions": "CF-1.11", "title": "patches of a tcpipe dataset, in the order of samples.parquet"}
     group = create_group(directory / PATCHES, attributes)
     for layer in pixels.layers.values():
+        patch, own = layer.patch_shape(px), f"{layer.name}_"
         add_array(
             group,
             layer.name,
-            shape=(n, px, px),
+            shape=(n, *patch),
             dtype=layer.stored,
-            chunks=(CHUNK_ROWS, px, px),
-            shards=(shard, px, px),
-            dimensions=("sample", "row", "column"),
+            chunks=(CHUNK_ROWS, *patch),
+            shards=(shard, *patch),
+            dimensions=("sample", *(f"{own}{axis}" for axis in ("band", "row", "column")))
+            if layer.bands
+            else ("sample", "row", "column"),
             fill_value=find_no_data_value(layer.stored),
             attributes={**make_cf_attributes(layer), "coordinates": "sample_id"},
             compression=compression,
@@ -204,11 +207,12 @@ def _open_layer_array(
     directory: Path, layer: Layer, samples: int, px: int, fetched: FetchedShards | None = None
 ) -> ShardedArray:
     """Return the array of a layer; `StoreError` if its description is not of so many patches of so many pixels."""
+    patch = layer.patch_shape(px)
     return open_sharded(
         directory / PATCHES / layer.name,
-        shape=(samples, px, px),
-        chunk_shape=(CHUNK_ROWS, px, px),
-        shard_shape=(_choose_shard_rows(samples), px, px),
+        shape=(samples, *patch),
+        chunk_shape=(CHUNK_ROWS, *patch),
+        shard_shape=(_choose_shard_rows(samples), *patch),
         dtype=np.dtype(layer.stored),
         fill=find_no_data_value(layer.stored),
         fetched=fetched,
@@ -239,11 +243,14 @@ def make_parquet_writers(
 
 def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array]:
     """Return a layer as a column: rows of the patch one after another."""
-    px = patches.shape[1]
     values = pa.array(np.ascontiguousarray(patches, layer.stored).reshape(-1))
-    metadata = {"shape": f"[{px}, {px}]", **{key: str(value) for key, value in make_cf_attributes(layer).items()}}
-    dtype = pa.list_(values.type, px * px)  # plain: a tensor extension type makes other readers fail
-    column = pa.FixedSizeListArray.from_arrays(values, px * px)
+    metadata = {
+        "shape": str(list(patches.shape[1:])),
+        **{key: str(value) for key, value in make_cf_attributes(layer).items()},
+    }
+    size = math.prod(patches.shape[1:])
+    dtype = pa.list_(values.type, size)  # plain: a tensor extension type makes other readers fail
+    column = pa.FixedSizeListArray.from_arrays(values, size)
     return pa.field(layer.name, dtype, nullable=False, metadata=metadata), column
 
 
@@ -345,6 +352,10 @@ class PatchFiles:
     fetched: FetchedShards | None = None
     """Where the files are; None: on this machine."""
 
+    def make_room(self, layer: str, rows: int) -> LayerPixels:
+        """Return an empty array for so many stored patches of a layer."""
+        return np.empty((rows, *self.layers[layer].patch_shape(self.patch_px)), self.layers[layer].stored)
+
     @property
     def piece_rows(self) -> int:
         """Room that a piece needs; the last one may hold fewer rows."""
@@ -355,12 +366,13 @@ class PatchFiles:
         if self.fetched is not None and self.arrays:
             with _convert_errors(_AGAIN):
                 for layer in layers:
-                    self.arrays[layer].expect((piece, 0, 0) for piece in pieces)
+                    array = self.arrays[layer]
+                    array.expect((piece, *(0 for _ in array.shape[1:])) for piece in pieces)
 
     def read(
         self, piece: int, layers: Iterable[str], out: Mapping[str, NDArray[Any]] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return layers of one piece, each of shape (rows, px, px); `DatasetError` if it cannot be read.
+        """Return layers of one piece, each of shape (rows, *patch); `DatasetError` if it cannot be read.
 
         Parameters
         ----------
@@ -368,12 +380,12 @@ class PatchFiles:
         out : where to, `piece_rows` or more rows a layer; None makes new arrays.
         """
         rows = int(self.starts[piece + 1] - self.starts[piece])
-        shape = (self.piece_rows, self.patch_px, self.patch_px)
-        into = {layer: np.empty(shape, self.layers[layer].stored) for layer in layers} if out is None else out
+        into = {layer: self.make_room(layer, self.piece_rows) for layer in layers} if out is None else out
         try:
             if self.arrays:
                 for layer in layers:
-                    self.arrays[layer].chunk((piece, 0, 0), out=into[layer][: self.piece_rows])
+                    array = self.arrays[layer]
+                    array.chunk((piece, *(0 for _ in array.shape[1:])), out=into[layer][: self.piece_rows])
             else:
                 name, group = self.groups[piece]
                 path = self.directory / name
@@ -382,7 +394,7 @@ class PatchFiles:
                 )
                 for layer in layers:
                     flat = table.column(layer).combine_chunks().flatten().to_numpy()
-                    into[layer][:rows] = flat.reshape(rows, *shape[1:])
+                    into[layer][:rows] = flat.reshape(rows, *into[layer].shape[1:])
         except StoreError as error:
             raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
         except (KeyError, ValueError):
@@ -412,7 +424,8 @@ def open_patches(
     px, samples = card.patch_px, card.samples
     layers = sort_layers(read_layers(card.layers, card.classes, directory / CARD))
     known = card.format in get_args(FileFormat)
-    if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES):
+    uneven = any(of.bands and (not of.own_px or px % of.own_px) for of in layers.values())
+    if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES) or uneven:
         raise DatasetError(
             f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: expected up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"

@@ -7,7 +7,9 @@ https://github.com/huggingface/hub-docs/blob/main/datasetcard.md?plain=1.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import pyarrow as pa
 
@@ -16,6 +18,7 @@ from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.finding_lines import format_verdict
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json, to_json
+from tcpipe.formats.maps.map_facts import read_layers
 
 _LICENCES = {
     "apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-2.0", "cc-by-3.0", "cc-by-4.0", "cc-by-sa-3.0", "cc-by-sa-4.0",
@@ -56,8 +59,8 @@ def _make_head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict
         data: list[Json] = [{"split": split, "path": list(paths)} for split, paths in files.items()]
         configs.insert(0, {"config_name": "patches", "default": True, "data_files": data})
         of_layers: list[Json] = [
-            {"name": name, "list": str(layer["dtype"]), "length": card.patch_px**2}
-            for name, layer in card.layers.items()
+            {"name": name, "list": layer.stored.name, "length": math.prod(layer.patch_shape(card.patch_px))}
+            for name, layer in read_layers(card.layers, card.classes, Path()).items()
         ]
         splits: list[Json] = [_split(card, split, card.splits[split], paths) for split, paths in files.items()]
         infos.insert(0, {"config_name": "patches", "features": [*columns, *of_layers], "splits": splits})

@@ -64,7 +64,8 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
     if not parts:
         return EvaluatedSamples(table, shown, None)
     step = choose_thinning(data.card.patch_px)
-    pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in parts[0]}
+    plain = [layer for layer, of in parts[0].items() if of.ndim == 3]  # no picture of several bands
+    pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in plain}
     files = data[str(split[0])].view.stored.files
     return EvaluatedSamples(table, shown, make_sheets(np.searchsorted(shown, rows).tolist(), pixels, files))
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from tcpipe import __version__
 from tcpipe.cost.adaptation import AdaptedErrors, Run, compare_adaptations, format_adaptations
 from tcpipe.cost.prediction_errors import fit_errors
@@ -192,8 +194,11 @@ def evaluate_adaptation(
 
     Raises
     ------
+    UsageError : the metres are none.
     ModelError, DatasetError : they do not fit, the model states no errors, or no run is long enough.
     """
+    if not known_m or not all(0.0 <= metres < np.inf for metres in known_m):
+        raise UsageError(f"adapt: {known_m} are no metres of a run; expected some, as 0, 10, 50")
     ours = load_model(model)
     data = open_dataset(dataset, label=ours.label_energy)
     errors = fit_errors(ours.residuals)
@@ -205,7 +210,7 @@ def evaluate_adaptation(
         check_fit(ours.card, data, str(model), any_robot=True)
         runs = collect_runs(ours, data)
     stated = {quantity: errors[quantity] for quantity in ("energy", "duration")}
-    found = tuple(compare_adaptations(stated, runs, known_m))
+    found = tuple(compare_adaptations(stated, runs, sorted(set(known_m))))
     if not found:
         longest_m = max((float(run.metres["energy"].length_m.sum()) for run in runs), default=0.0)
         raise DatasetError(
@@ -215,7 +220,7 @@ def evaluate_adaptation(
     place, robots = Path(out), (ours.robot, ", ".join(data.card.robots))
     place.mkdir(parents=True, exist_ok=True)
     values = AdaptationFacts(
-        model=ours.name, dataset=data.card.name, robots=robots, known_m=tuple(known_m), errors=found
+        model=ours.name, dataset=data.card.name, robots=robots, known_m=tuple(sorted(set(known_m))), errors=found
     )
     write_json(place / ADAPTATION, values)
     return AdaptationResult(place, values)

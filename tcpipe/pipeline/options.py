@@ -109,7 +109,13 @@ class AddMapOptions:
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
     layers: Mapping[str, Files] | None = option(
-        None, Option("Another raster of one band, as layer NAME; repeatable.", ("--layer",), "layers", "NAME=FILE")
+        None,
+        Option(
+            "Another raster, as layer NAME; several bands keep their own pixel size; repeatable.",
+            ("--layer",),
+            "layers",
+            "NAME=FILE",
+        ),
     )
     categorical: Mapping[str, str | Path | None] | None = option(
         None,

@@ -288,7 +288,7 @@ def _verify_piece(files: PatchFiles, piece: int) -> Iterator[CheckResult]:
         if layer.kind == "categorical" and pixels[name].max(initial=0) > layer.high:
             of = "" if name == "terrain" else f" of {name}"
             yield f"{where} hold classes{of} above {layer.high:g}, the last of the table"
-        if layer.stack == "floats" and not _is_within_range(pixels[name], layer):
+        if layer.stack in {"floats", "bands"} and not _is_within_range(pixels[name], layer):
             yield f"{where} hold {name} beyond {layer.low!r} to {layer.high!r} {layer.unit}"
     floor = pixels["height"].reshape(rows, -1).min(axis=1)
     if floor.any():
@@ -299,7 +299,7 @@ def _verify_piece(files: PatchFiles, piece: int) -> Iterator[CheckResult]:
 def _is_within_range(pixels: NDArray[np.generic], layer: Layer) -> bool:
     """Return whether all pixels with data lie in the layer's range, but for rounding."""
     there = pixels[np.isfinite(pixels)]
-    slack = 1e-5 * max(abs(layer.low), abs(layer.high))
+    slack = (1e-3 if layer.stored == np.float16 else 1e-5) * max(abs(layer.low), abs(layer.high))
     return bool(((there >= layer.low - slack) & (there <= layer.high + slack)).all())
 
 

@@ -219,6 +219,14 @@ def _verify_tiles(path: Path, fetched: FetchedShards | None = None) -> Iterator[
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:
             yield from _verify_layer(path, level, layer, None if factor > 1 else source.facts.covered[layer])
+    for bands in source.banded.values():
+        for row in range(0, bands.grid.rows, bands.tile_px):
+            for col in range(0, bands.grid.cols, bands.tile_px):
+                try:
+                    bands.read(row, row + bands.tile_px, col, col + bands.tile_px)
+                    yield "tiles", len(bands.layer.bands)
+                except TcpipeError as error:
+                    yield from error.problems
 
 
 def _isolate_errors(findings: Iterator[CheckResult]) -> Iterator[CheckResult]:

@@ -129,7 +129,7 @@ class Predicted:
 
 
 def _make_layout(model: CostModel) -> TensorLayout:
-    return TensorLayout(model.channels, make_paper_layers(PAPER_LAYERS, model.classes))
+    return TensorLayout(model.channels, make_paper_layers(PAPER_LAYERS, model.classes), model.patch_px)
 
 
 def check_model(model: CostModel, source: MapReader) -> None:

@@ -15,7 +15,7 @@ from pyarrow import csv
 from pyproj import Geod
 
 from tcpipe.cost.adaptation import Run, adapt, make_metres
-from tcpipe.cost.prediction_errors import COVERAGE, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
@@ -74,6 +74,8 @@ class PathCost:
 
     pieces: pa.Table
     totals: PathTotals
+    errors: Mapping[str, SumDistribution] | None
+    """Of ``duration`` [s] and ``energy`` [J] in all; None without held-out samples."""
 
 
 def find_projection(source: MapReader) -> Projection:
@@ -152,14 +154,14 @@ def _sum_costs(
         adapted = {name: adapt(errors[name], known.metres[name]).predict(of) for name, of in there.items()}
         duration, energy = adapted["duration"].value, adapted["energy"].value
         (fast, slow), (least, most) = ((of.low, of.high) for of in (adapted["duration"], adapted["energy"]))
-        sums = adapted["duration"].total[1:], adapted["energy"].total[1:]
+        sums = {name: of.total for name, of in adapted.items()}
     elif errors is not None:
         fast, slow = errors["duration"].compute_intervals(duration, class_id)
         least, most = errors["energy"].compute_intervals(energy, class_id)
-        sums = (
-            errors["duration"].compute_sum_interval(duration, class_id),
-            errors["energy"].compute_sum_interval(energy, class_id),
-        )
+        sums = {
+            "duration": errors["duration"].compute_sum(duration, class_id),
+            "energy": errors["energy"].compute_sum(energy, class_id),
+        }
     table = PIECES.table(
         piece=np.arange(len(bits)),
         **_locate_pieces(source, pieces),
@@ -189,14 +191,14 @@ def _sum_costs(
         energy_joule=float(np.nansum(energy)),
         turn_rad=float(turn_rad.sum()),
         turn_energy_joule=None if turning is None else float(np.nansum(turn_joule)),
-        duration_interval_s=sums[0] if sums else None,
-        energy_interval_joule=sums[1] if sums else None,
+        duration_interval_s=sums["duration"].interval if sums else None,
+        energy_interval_joule=sums["energy"].interval if sums else None,
         held_out_samples=errors["energy"].samples if errors else 0,
         held_out_runs=errors["energy"].runs if errors else 0,
         reasons=count_reasons(bits),
         complete=not without_cost,
     )
-    return PathCost(table, totals)
+    return PathCost(table, totals, sums)
 
 
 def _locate_pieces(source: MapReader, pieces: Pieces) -> dict[str, Floats]:

@@ -206,12 +206,27 @@ def check_same_layers(sources: Sequence[MapReader]) -> None:
     """Raise `MapError` if the maps have not the same layers and classes: their patches could not be learned from together."""
     first, problems = sources[0], []
     for other in sources[1:]:
-        if set(other.layers) != set(first.layers):
+        its_names, names = ([*source.layers, *source.banded] for source in (other, first))
+        if set(its_names) != set(names):
             problems.append(
-                f"map {other.name}: has {', '.join(other.layers)}, but map {first.name} has {', '.join(first.layers)}; "
+                f"map {other.name}: has {', '.join(its_names)}, but map {first.name} has {', '.join(names)}; "
                 "maps of one dataset have the same layers"
             )
             continue
+        for name, bands in first.banded.items():
+            got, wanted = (
+                (
+                    len(of.layer.bands),
+                    of.layer.own_px or f"{of.layer.pixel_size_m:.3g} m",
+                    of.layer.unit,
+                    of.layer.stored.name,
+                )
+                for of in (other.banded[name], bands)
+            )
+            if got != wanted:
+                problems.append(
+                    f"map {other.name}: {name} has bands, pixel size, unit and type {got}, but {wanted} in map {first.name}"
+                )
         for name, layer in first.layers.items():
             its = other.layers[name]
             if its.kind != layer.kind or its.unit != layer.unit:

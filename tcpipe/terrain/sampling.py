@@ -12,6 +12,7 @@ patch is a metre of *ground*: the projected chord over ``chord_m`` is the map's 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
@@ -25,7 +26,7 @@ from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
-from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
+from tcpipe.terrain.tiles import BandReader, MapReader, TilePool, choose_level, group_by_tile, read_window
 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -33,6 +34,11 @@ def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
     steps = np.where(height == HEIGHT_NODATA, np.uint16(0), height).max(axis=(1, 2), initial=np.uint16(0))
     return np.asarray(steps * HEIGHT_STEP_M)
 
+
+_BAND_VALUES = 2_000_000
+"""Values of a layer of several bands that are interpolated at once: 8 MB each."""
+
+_WIDER = 1e-6
 
 _MOVED_ROWS = 128
 """Patches moved at once: they stay in the processor's cache on the way."""
@@ -42,9 +48,9 @@ _MOVED_ROWS = 128
 class Patches:
     """N sampled patches.
 
-    ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says; the other arrays have shape (N,):
-    smallest height [m], slopes of the fitted plane [rad], valid share, share clipped by the tensor, majority class of terrain under the
-    chord (0: none) and its share.
+    ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says; those of several bands are
+    (N, bands, own px, own px). The other arrays have shape (N,): smallest height [m], slopes of the fitted plane [rad], valid share, share
+    clipped by the tensor, majority class of terrain under the chord (0: none) and its share.
     """
 
     pixels: Mapping[str, NDArray[Any]]
@@ -116,12 +122,17 @@ def sample_patches(
         pool.hold(boxes[chosen])
         sample_tiles(pool.tiles, ground, chosen, out)
     stats = out.stats
+    found = {
+        name: out.relative if stack == "relative" else getattr(out, stack)[number]
+        for stack, names in stacks.items()
+        for number, name in enumerate(names)
+    }
+    for name, source_bands in level.banded.items():
+        found[name] = sample_bands(source_bands, frames, patch_m=patch_m, patch_px=patch_px)
+        known = np.isfinite(found[name]).mean(axis=(1, 2, 3)) if chord_m.size else stats[:, 3]
+        stats[:, 3] = np.minimum(stats[:, 3], known)
     return Patches(
-        pixels={
-            name: out.relative if stack == "relative" else getattr(out, stack)[number]
-            for stack, names in stacks.items()
-            for number, name in enumerate(names)
-        },
+        pixels=found,
         height_min_m=stats[:, 0] + level.height_reference_m,
         slope_rad=stats[:, 1],
         cross_slope_rad=stats[:, 2],
@@ -130,6 +141,47 @@ def sample_patches(
         terrain_class=stats[:, 5].astype(np.uint8),
         terrain_purity=stats[:, 6],
     )
+
+
+def sample_bands(source: BandReader, frames: PatchFrames, *, patch_m: float, patch_px: int) -> NDArray[Any]:
+    """Return patches of all bands of a layer, bilinear, shape (N, bands, own px, own px); NaN where a tap has no data.
+
+    A patch whose pixels are wider than the layer's is averaged over so many points that none of these is skipped.
+    """
+    layer, count = source.layer.at_patch(patch_m, patch_px), len(frames.centre_xy_m)
+    parts = max(math.ceil(patch_m / layer.own_px / layer.pixel_size_m - _WIDER), 1)
+    side = layer.own_px * parts
+    pixels = map_px_from_patch(frames, source.grid, patch_m=patch_m, patch_px=side)
+    out = np.empty((count, *layer.patch_shape(patch_px)), layer.stored)
+    together = max(_BAND_VALUES // (len(layer.bands) * side**2), 1)
+    row, column = np.mgrid[:side, :side][..., None]
+    for group in group_by_tile(source.grid.px_from_xy(frames.centre_xy_m), source):
+        for first in range(0, len(group), together):
+            rows = group[first : first + together]
+            origin, along, down = (pixels[rows, None, None, n : n + 2] for n in (0, 2, 4))
+            found = _interpolate_bands(source, origin + column * along + row * down)
+            cells = found.reshape(len(rows), -1, layer.own_px, parts, layer.own_px, parts)
+            out[rows] = cells.mean(axis=(3, 5))
+    return out
+
+
+def _interpolate_bands(source: BandReader, px: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return all bands at positions, shape (N, S, S, 2), as (N, bands, S, S); a tap of weight zero need not have data."""
+    low = np.floor(px).astype(np.int64)
+    weight = (px - low).astype(np.float32)
+    high = low + (weight > 0.0)
+    (left, top), (right, bottom) = low.min(axis=(0, 1, 2)).tolist(), high.max(axis=(0, 1, 2)).tolist()
+    limit = source.grid.rows, source.grid.cols
+    window = np.full((bottom - top + 1, right - left + 1, len(source.layer.bands)), np.nan, np.float32)
+    row0, row1, col0, col1 = max(top, 0), min(bottom + 1, limit[0]), max(left, 0), min(right + 1, limit[1])
+    if row0 < row1 and col0 < col1:
+        there = np.moveaxis(source.read(row0, row1, col0, col1), 0, 2)
+        window[row0 - top : row1 - top, col0 - left : col1 - left] = there
+    (x0, y0), (x1, y1) = (np.moveaxis(of - (left, top), 3, 0) for of in (low, high))
+    across, along = weight[..., :1], weight[..., 1:]
+    upper = window[y0, x0] + across * (window[y0, x1] - window[y0, x0])
+    lower = window[y1, x0] + across * (window[y1, x1] - window[y1, x0])
+    return np.asarray(np.moveaxis(upper + along * (lower - upper), 3, 1))
 
 
 def _place(name: str, names: Sequence[str]) -> int:

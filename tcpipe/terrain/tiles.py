@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, Protocol
 
@@ -22,6 +22,29 @@ CACHED_TILES = 96
 
 _STRIP_TILES = CACHED_TILES // 3 - 3
 """Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
+
+
+class Tiled(Protocol):
+    """Pixels in tiles that are cheap to read."""
+
+    @property
+    def grid(self) -> MapGrid:
+        """Where the pixels lie."""
+
+    @property
+    def tile_px(self) -> int:
+        """Side of the square tiles, aligned with pixel (0, 0)."""
+
+
+class BandReader(Tiled, Protocol):
+    """A layer of several bands on a grid of its own."""
+
+    @property
+    def layer(self) -> Layer:
+        """What it is."""
+
+    def read(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+        """Return a window of all bands, shape (bands, rows, columns), NaN without data."""
 
 
 class MapReader(Protocol):
@@ -55,6 +78,13 @@ class MapReader(Protocol):
     def factors(self) -> tuple[int, ...]:
         """Levels that `at` gives: how many pixels of the full map a pixel of each spans, rising from 1."""
 
+    @property
+    def banded(self) -> Mapping[str, BandReader]:
+        """Its layers of several bands by name."""
+
+    def select(self, layers: Collection[str]) -> MapReader:
+        """Return the map with these of its layers alone; ``height`` is one of them."""
+
     def at(self, factor: int) -> MapReader:
         """Return the map at one of its ``factors``."""
 
@@ -83,7 +113,7 @@ def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
     return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 
 
-def group_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArray[np.int64]]:
+def group_by_tile(px: NDArray[np.float64], source: Tiled) -> Iterator[NDArray[np.int64]]:
     """Yield the indices of pixel positions, shape (N, 2), by tile; within a tile in Z-order.
 
     Tiles come row by row inside strips narrow enough that a tile is still held when the rows above and below want it.

@@ -26,6 +26,14 @@ def moisture(x, y):
     return 30.0 + 0.5 * (x - WORLD.x_m) - 0.3 * (y - WORLD.y_m)
 
 
+BANDS = np.arange(1, 10)[:, None, None]
+
+
+def embedding(x, y):
+    """Nine bands, linear; band 3 differs from the rest in sign."""
+    return np.where(BANDS == 3, -1.0, 1.0) * (0.125 * BANDS * (x - WORLD.x_m) - 0.25 * (y - WORLD.y_m))
+
+
 def canopy(x, y):
     """Raster values: 40 in the west, 7 in the east."""
     return np.where(x < WORLD.x_m, 40, 7)
@@ -40,6 +48,9 @@ def site(tmp_path_factory):
     where = Affine(PITCH_M, 0, WORLD.x_m - 20.0, 0, -PITCH_M, WORLD.y_m + 20.0)
     write_tif(here / "moisture.tif", moisture(x, y).astype(np.float32)[None], WORLD.crs, where)
     write_tif(here / "canopy.tif", canopy(x, y).astype(np.uint8)[None], WORLD.crs, where)
+    x, y = WORLD.centres(0.5)
+    where = Affine(0.5, 0, WORLD.x_m - 20.0, 0, -0.5, WORLD.y_m + 20.0)
+    write_tif(here / "embedding.tif", embedding(x, y).astype(np.float32), WORLD.crs, where, nbits=16)
     with rasterio.open(here / "moisture.tif", "r+") as raster:
         raster.set_band_unit(1, "%")
     (here / "canopy.csv").write_text("value,id,name,traversable\n40,1,open,yes\n7,2,closed canopy,yes\n")
@@ -65,10 +76,12 @@ def add(here, name, *more, ortho="ortho.tif"):
 @pytest.fixture(scope="module")
 def datasets(site):
     layers = ["--layer", f"moisture={site}/moisture.tif", "--layer", f"canopy={site}/canopy.tif"]
+    layers += ["--layer", f"embedding={site}/embedding.tif"]
     own = [*layers, "--categorical", f"canopy={site}/canopy.csv", "--ortho-bands", "rgb"]
     for name, more in (("plain", []), ("own", own)):
         result = add(site, name, *more, ortho="colour.tif")
         assert result.exit_code == 0, result.output
+    assert "embedding   100 % covered, from embedding.tif: 9 bands of 0.5 m (float16), -27." in result.output
     for out, name, file_format in (("plain", "plain", "zarr"), ("zarr", "own", "zarr"), ("parquet", "own", "parquet")):
         built = run(site, "build-dataset", site / out, "--map", name, "--format", file_format, "--holdout", "sample")
         assert built.exit_code in {0, 3}, built.output
@@ -109,6 +122,32 @@ def test_every_pixel_is_what_lies_there(datasets, name):
     np.testing.assert_array_equal(batch, train.patches[:8])
 
 
+@pytest.mark.parametrize("name", ["zarr", "parquet"])
+def test_bands_keep_their_own_resolution_and_type(datasets, name):
+    train = tcpipe.open_dataset(datasets / name, layers=["embedding"])["train"]
+    samples = train._columns.table()
+    ends = [to_world(*(samples[f"{end}_{axis}_deg"].to_numpy() for axis in ("lon", "lat"))) for end in ("start", "end")]
+    (x0, y0), (x1, y1) = ends
+    row, col = np.mgrid[:2, :2] * 0.5 - 0.25  # half-metre pixels: two each way in a patch of a metre
+    east, north = (of[:, None, None] for of in (x1 - x0, y1 - y0))
+    x = (x0 + x1)[:, None, None] / 2 + col * east + row * north
+    y = (y0 + y1)[:, None, None] / 2 + col * north - row * east
+    stored = train.layers(np.arange(len(train)))["embedding"]
+    assert (stored.shape, stored.dtype) == ((len(train), 9, 2, 2), np.float16)
+    np.testing.assert_allclose(stored, np.stack([embedding(*at) for at in zip(x, y, strict=True)]), atol=0.03)
+    assert train.patches.shape == (len(train), 40, 40, 9)
+    low, high = np.array(train._card.layers["embedding"]["bands"]).T
+    assert np.abs(high + low).max() < 0.5  # each band has its own range
+    assert np.allclose(high, 0.125 * BANDS[:, 0, 0] * 19.75 + 0.25 * 19.75, atol=0.03)
+    scaled = (stored.astype(float) - low[:, None, None]) / (high - low)[:, None, None]
+    np.testing.assert_allclose(train.patches[:, ::20, ::20], np.moveaxis(scaled, 1, 3), atol=1e-5)
+    np.testing.assert_array_equal(train.patches[:, 19, 39], train.patches[:, 0, 20])
+    batch, _ = next(iter(train.batches(8, from_disk=True)))
+    np.testing.assert_array_equal(batch, train.patches[:8])
+    mirrored = train.view.form.form({"embedding": stored}, np.arange(3), np.array([True, False, True]))
+    np.testing.assert_array_equal(mirrored, [train.patches[0, ::-1], train.patches[1], train.patches[2, ::-1]])
+
+
 def to_world(lon, lat):
     import pyproj
 
@@ -120,13 +159,14 @@ def test_all_that_describes_a_dataset_tells_of_them(datasets):
         assert verify(datasets / name).problems == ()
     patches = xr.open_zarr(datasets / "zarr" / "patches.zarr")
     assert patches.moisture.attrs["units"] == "%"
+    assert patches.embedding.dims == ("sample", "embedding_band", "embedding_row", "embedding_column")
     assert patches.canopy.attrs["flag_meanings"] == "open closed_canopy"
     fields = json.loads((datasets / "parquet" / "croissant.json").read_text())["recordSet"][1]["field"]
     kinds = {field["name"]: field["dataType"] for field in fields}
     assert (kinds["moisture"], kinds["canopy"]) == ("sc:Float", "sc:Integer")
     assert "canopy" in (datasets / "zarr" / "report.html").read_text()
     listed = CliRunner().invoke(cli, ["inspect", str(Store(datasets / "store").map_path("own"))]).output
-    assert all(name in listed for name in ("moisture", "canopy", "ortho_red"))
+    assert all(name in listed for name in ("moisture", "canopy", "ortho_red", "embedding"))
     sample_id = tcpipe.open_dataset(datasets / "zarr")["train"].column("sample_id")[0]
     assert explain(sample_id, dataset=datasets / "zarr", store=datasets / "store").differences == ()
 
@@ -174,7 +214,7 @@ def test_a_raster_s_own_names_are_its_classes(site, tmp_path):
         (["--layer", "moisture"], 2, "--layer moisture: expected NAME=FILE"),
         (["--layer", "m={}/moisture.tif", "--layer", "m={}/canopy.tif"], 2, "--layer m: is given twice"),
         (["--layer", "m={}/absent.tif"], 2, "absent.tif: there is no such file"),
-        (["--layer", "m={}/colour.tif"], 1, "colour.tif: m has 3 bands (red, green, blue), expected one"),
+        (["--layer", "m={}/colour.tif", "--categorical", "m"], 1, "m has 3 bands (red, green, blue), expected one"),
         (["--layer", "m={}/canopy.tif", "--categorical", "m"], 1, "does not define the meaning of its values"),
         (["--layer", "m={}/moisture.tif", "--categorical", "m={}/canopy.csv"], 1, "expected integer class values"),
         (["--layer", "m={}/away.tif"], 1, "has no data anywhere on the height raster"),

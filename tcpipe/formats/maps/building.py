@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -10,11 +11,13 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, Use
-from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
+from tcpipe.formats.maps.layer_building import Raster, RasterLayer, Tally, iterate_shards, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs, RasterOrigin
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
@@ -33,12 +36,23 @@ from tcpipe.terrain.layers import (
     COLOURS,
     PAPER_LAYERS,
     Layer,
+    make_banded_layer,
     make_categorical_layer,
     make_continuous_layer,
     make_paper_layers,
 )
 from tcpipe.terrain.projection import parse_crs
-from tcpipe.terrain.target_grid import Georeference, MapGrid, choose_crs, choose_grid, find_projection
+from tcpipe.terrain.target_grid import (
+    MAX_PIXELS,
+    Georeference,
+    MapGrid,
+    choose_crs,
+    choose_grid,
+    choose_layer_grid,
+    find_projection,
+)
+
+logger = logging.getLogger("tcpipe")
 
 Files = Path | Sequence[Path]
 """One file of a layer, or all; the last lies on top."""
@@ -56,7 +70,7 @@ class MoreLayers:
     """What a map is to have beside height, ortho and terrain."""
 
     files: Mapping[str, Files] = field(default_factory=dict)
-    """Rasters of one band by the layer's name."""
+    """Rasters by the layer's name; those of several bands keep their own pixels."""
     categorical: Mapping[str, Path | None] = field(default_factory=dict)
     """Those of them whose values are classes, and their class tables; None: the raster's own names say what its values mean."""
     ortho_bands: OrthoBands = "grey"
@@ -113,27 +127,72 @@ def build_map(
         map_crs = choose_crs(footings["height"], wanted)
         others = [footings[role] for role in ("ortho", "terrain") if role in footings]
         grid = choose_grid(footings["height"], others, map_crs, pixel_size_m)
-        layers: dict[str, LayerSource] = {
-            role: RasterLayer(
-                _make_layer(raster, schemes),
-                raster,
-                footings[role],
-                find_projection(footings[role], map_crs),
-                schemes.get(role),
-            )
-            for role, raster in rasters.items()
-        }
+        layers: dict[str, LayerSource] = {}
+        banded: dict[str, BandedLayer] = {}
+        for role, raster in rasters.items():
+            footing, layer = footings[role], _make_layer(raster, schemes)
+            source = RasterLayer(layer, raster, footing, find_projection(footing, map_crs), schemes.get(role))
+            if role in PAPER_LAYERS or raster.band_count == 1:
+                layers[role] = source
+            else:
+                banded[role] = _place_bands(source, choose_layer_grid(grid, footing, map_crs), name)
         if drawn:
             layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
         kinds = {role: source.layer for role, source in layers.items()}
         with write_atomic_directory(out_path) as half:
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
-            _refuse_empty(layers)
-            facts = replace(_make_facts(grid, layers, origin, inputs or MapInputs()), origins=tuple(origins))
-            writer.finish(facts, {role: _set_range(source) for role, source in layers.items()})
+            for of in banded.values():
+                of.write(writer)
+            every = layers | {role: of.find_sparsest() for role, of in banded.items()}
+            _refuse_empty(every)
+            sides_m = {role: of.grid.pixel_size_m for role, of in banded.items()}
+            facts = _make_facts(grid, every, sides_m, origin, inputs or MapInputs())
+            facts = replace(facts, origins=tuple(origins))
+            ranges = {role: _set_range(source) for role, source in layers.items()}
+            writer.finish(facts, ranges | {role: of.describe() for role, of in banded.items()})
             write_checksums(half)
     return facts
+
+
+@dataclass(frozen=True, slots=True)
+class BandedLayer:
+    """A raster of several bands: a layer of each, all on a grid of their own."""
+
+    bands: tuple[RasterLayer, ...]
+    grid: MapGrid
+    dtype: str
+
+    def write(self, writer: MapWriter) -> None:
+        """Write all bands, shard by shard."""
+        writer.add_bands(self.describe(), self.grid)
+        for number, band in enumerate(self.bands):
+            for row0, col0, rows, cols in iterate_shards(self.grid, SHARD_PX):
+                shard = band.shard(self.grid, row0, col0, rows, cols)
+                if band.tally.count(band.layer, band.label, shard):
+                    writer.write_band(band.layer.name, number, row0, col0, shard)
+
+    def describe(self) -> Layer:
+        """Return the layer with the range of each band, as far as they are written."""
+        layer, pixel_size_m = self.bands[0].layer, self.grid.pixel_size_m
+        ranges = [(band.tally.low, band.tally.high) for band in self.bands]
+        return make_banded_layer(layer.name, layer.unit, ranges, self.dtype, pixel_size_m)
+
+    def find_sparsest(self) -> RasterLayer:
+        """Return the band with the fewest pixels that have data."""
+        return min(self.bands, key=lambda band: band.tally.pixels)
+
+
+def _place_bands(of: RasterLayer, grid: MapGrid, name: str) -> BandedLayer:
+    """Return the bands of a raster on a grid of their own; log how large that becomes."""
+    count, dtype = of.raster.band_count, "float16" if all(tile.is_half for tile in of.raster.tiles) else "float32"
+    size_mb = count * grid.rows * grid.cols * np.dtype(dtype).itemsize / 1e6
+    message = "map %s: layer %s: %d bands, %d x %d px of %g m, %s: up to %.1f MB"
+    logger.info(message, name, of.layer.name, count, grid.cols, grid.rows, grid.pixel_size_m, dtype, size_mb)
+    if count * grid.rows * grid.cols > MAX_PIXELS:
+        raise MapError(f"{of.label}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all")
+    bands = [replace(of, raster=of.raster.select_band(band), tally=Tally()) for band in range(count)]
+    return BandedLayer(tuple(bands), grid, dtype)
 
 
 def _make_layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
@@ -266,8 +325,14 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
     return tuple(findings)
 
 
-def _make_facts(grid: MapGrid, layers: Mapping[str, LayerSource], origin: str, inputs: MapInputs) -> MapFacts:
-    covered = {role: layer.tally.pixels / (grid.rows * grid.cols) for role, layer in layers.items()}
+def _make_facts(
+    grid: MapGrid, layers: Mapping[str, LayerSource], sides_m: Mapping[str, float], origin: str, inputs: MapInputs
+) -> MapFacts:
+    """Return what was found; ``sides_m`` are the pixels of layers that keep their own, which may reach beyond the map."""
+    pixels = {role: (sides_m.get(role, grid.pixel_size_m) / grid.pixel_size_m) ** 2 for role in layers}
+    covered = {
+        role: min(layer.tally.pixels * pixels[role] / (grid.rows * grid.cols), 1.0) for role, layer in layers.items()
+    }
     shares = {name: found for name, layer in layers.items() if (found := _compute_class_shares(layer))}
     return MapFacts(
         sources={role: layer.name for role, layer in layers.items()},

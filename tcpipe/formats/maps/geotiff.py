@@ -36,7 +36,7 @@ from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
 from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.terrain.layers import LUMA_RGB
+from tcpipe.terrain.layers import LUMA_RGB, MAX_BANDS
 
 Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
 """What is taken of a raster: heights, an orthophoto or one of its colours, class values, or numbers in a unit of their own."""
@@ -138,6 +138,8 @@ class Tile:
     """Scale and offset to metres, or to the numbers that are meant."""
     unit: str
     """Of numbers, as the file says; empty where it does not."""
+    is_half: bool
+    """Whether float16 keeps the numbers: they are of 16 bits, or whole ones of 8 bits."""
     opaque: NDArray[np.bool_] | None
     """Which indices of a palette can be seen."""
 
@@ -161,7 +163,8 @@ class RasterTiles:
         dataset = self._dataset(tile)
         try:
             raw = dataset.read(tile.bands, window=window)
-            valid = dataset.dataset_mask(window=window) >= _OPAQUE
+            masked = dataset.read_masks(tile.bands[0], window=window) if tile.use == "numbers" else None
+            valid = (dataset.dataset_mask(window=window) if masked is None else masked) >= _OPAQUE
         except RasterioError as error:
             raise MapError(
                 f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
@@ -228,6 +231,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
             unit = (dataset.units[bands[0] - 1] or "").strip() if use == "numbers" else ""
             palette = use == "classes" and dataset.colorinterp[bands[0] - 1] == ColorInterp.palette
             colours = ", ".join(dataset.colorinterp[band - 1].name for band in bands)
+            many = f"{len(bands)} x " if len(bands) > 1 else ""
             return Tile(
                 path=path,
                 role=role,
@@ -236,7 +240,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
                 affine=tuple(dataset.transform)[:6],
                 rows=dataset.height,
                 cols=dataset.width,
-                kind=f"{dataset.dtypes[bands[0] - 1]} ({colours}{', ' if unit else ''}{unit})",
+                kind=f"{many}{dataset.dtypes[bands[0] - 1]} ({_shorten(colours)}{', ' if unit else ''}{unit})",
                 findings=(*unusual, *ignored),
                 names=read_value_names(_describe_as_vrt(dataset), bands[0]) if use == "classes" else {},
                 source=source,
@@ -244,6 +248,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
                 bands=bands,
                 scale=scale,
                 unit=unit,
+                is_half=use == "numbers" and _fits_half(dataset, bands, scale),
                 opaque=np.isfinite(_read_palette_grey(dataset.colormap(bands[0]))) if palette else None,
             )
 
@@ -408,8 +413,10 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
             return tuple(plain), (make_finding("ortho-colours-assumed", subject, names=file),)
         wanted = "grey or red, green, blue" if use == "grey" else "red, green, blue for --ortho-bands rgb"
         raise MapError(f"{path}: ortho has {dataset.count} bands ({names}), expected {wanted}, and alpha at most")
-    if len(plain) != 1:
-        raise MapError(f"{path}: {role} has {dataset.count} bands ({names}), expected one")
+    most = MAX_BANDS if use == "numbers" else 1
+    if not 1 <= len(plain) <= most or len(kinds) > 1:
+        wanted = "one" if most == 1 else f"1 to {most} of one type"
+        raise MapError(f"{path}: {role} has {dataset.count} bands ({_shorten(names)}), expected {wanted}")
     kind = kinds.pop()
     wanted = "metres" if use == "metres" else "numbers"
     if use != "classes" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
@@ -419,7 +426,19 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         raise MapError(f"{path}: {role} is {kind}, expected floating point or integer {wanted}")
     if use == "classes" and kind.kind not in "iu":
         raise MapError(f"{path}: {role} is {kind}, expected integer class values")
-    return (plain[0],), ()
+    return tuple(plain), ()
+
+
+def _shorten(names: str) -> str:
+    return names if len(names) < 80 else f"{names[:80]} …"
+
+
+def _fits_half(dataset: Any, bands: tuple[int, ...], scale: tuple[float, float]) -> bool:
+    """Return whether float16 keeps all numbers of these bands."""
+    if np.dtype(dataset.dtypes[bands[0] - 1]).itemsize == 1:
+        return 255.0 * abs(scale[0]) + abs(scale[1]) < float(np.finfo(np.float16).max)
+    stored = {dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS") for band in bands}
+    return dataset.dtypes[bands[0] - 1] == "float16" or (stored == {"16"} and scale == (1.0, 0.0))
 
 
 def _read_scaling(
@@ -428,6 +447,8 @@ def _read_scaling(
     """Return scale and offset to metres or numbers; for other uses, a finding that such tags were not applied."""
     scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
     if use == "numbers":
+        if len({(dataset.scales[band - 1], dataset.offsets[band - 1], dataset.units[band - 1]) for band in bands}) > 1:
+            raise MapError(f"{path}: bands of {role} differ in scale, offset or unit; write them as one kind of number")
         return (scale, offset), ()
     if use != "metres":
         if (scale, offset) == (1.0, 0.0):

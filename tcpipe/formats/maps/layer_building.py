@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,15 @@ class Raster:
     _corners: NDArray[np.int64] = field(repr=False)
     """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
     _pool: RasterTiles = field(repr=False)
+
+    @property
+    def band_count(self) -> int:
+        """How many bands each tile has."""
+        return len(self.tiles[0].bands)
+
+    def select_band(self, number: int) -> Raster:
+        """Return one band, by its number from 0."""
+        return replace(self, tiles=tuple(replace(tile, bands=(tile.bands[number],)) for tile in self.tiles))
 
     @property
     def name(self) -> str:

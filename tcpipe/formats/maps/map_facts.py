@@ -10,16 +10,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Annotated, Literal, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
 
 from tcpipe.formats.json_files import parse_typed
+from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.terrain.classes import ClassTable, TerrainClass
 from tcpipe.terrain.layers import (
     PAPER_LAYERS,
     Kind,
     Layer,
+    make_banded_layer,
     make_categorical_layer,
     make_continuous_layer,
     make_paper_layers,
@@ -132,8 +134,9 @@ def _format_detail(layer: str, of: MapSummary) -> str:
     if layer == "height":
         return f": {of.height_min_m:.1f} to {of.height_max_m:.1f} m"
     own = read_layers(of.described, (), Path(of.name)).get(layer)
-    if own is not None and own.stack == "floats":
-        return f": {own.low:.6g} to {own.high:.6g}" + ("" if own.unit == "1" else f" {own.unit}")
+    if own is not None and own.kind == "continuous" and own.stack != "greys":
+        bands = f" {len(own.bands)} bands of {own.pixel_size_m:g} m ({own.mapped})," if own.bands else ""
+        return f":{bands} {own.low:.6g} to {own.high:.6g}" + ("" if own.unit == "1" else f" {own.unit}")
     if layer == "terrain" or own is not None:
         classes = of.class_share if layer == "terrain" else of.class_shares[layer]
         shares = sorted(classes.items(), key=lambda entry: (-entry[1], entry[0]))
@@ -204,7 +207,7 @@ def _parse_single_value(row: Sequence[str], column: int, uppers: Sequence[int]) 
     return int(value) if value == upper and value.is_integer() else None
 
 
-Value: TypeAlias = str | int | float | Sequence[float | Mapping[str, str | int | bool]] | None
+Value: TypeAlias = str | int | float | Sequence[float | Sequence[float] | Mapping[str, str | int | bool]] | None
 Description: TypeAlias = Mapping[str, Value]
 
 
@@ -217,6 +220,11 @@ class _LayerDescription:
     units: str = "1"
     actual_range: tuple[float, float] = (0.0, 1.0)
     classes: tuple[TerrainClass, ...] = ()
+    dtype: Literal["uint8", "uint16", "float16", "float32"] = "float32"
+    bands: tuple[tuple[float, float], ...] = ()
+    """Of a layer of several bands: the range of each; so are the next two."""
+    pixel_size_m: Annotated[float, Bounds(gt=0)] = 1.0
+    own_px: Annotated[int, Bounds(ge=0, le=1024)] = 0
 
 
 def make_cf_flags(classes: ClassTable | None) -> dict[str, Value]:
@@ -231,7 +239,7 @@ def make_cf_attributes(layer: Layer) -> dict[str, Value]:
     about: dict[str, Value] = {"long_name": layer.long_name, "units": layer.unit}
     if layer.kind == "categorical":
         return {**about, **make_cf_flags(layer.classes)}
-    if layer.stack == "floats":
+    if layer.stack in {"floats", "bands"}:
         return {**about, "actual_range": [layer.low, layer.high]}
     about |= {"scale_factor": layer.step, "add_offset": 0.0}
     return {**about, "missing_value": layer.nodata} if layer.kind == "relative" else about
@@ -242,6 +250,9 @@ def describe_layer(layer: Layer) -> Description:
     known = {"dtype": layer.stored.name, "nodata": layer.nodata, **make_cf_attributes(layer)}
     if layer.name in PAPER_LAYERS:
         return known
+    if layer.bands:
+        known |= {"bands": [list(band) for band in layer.bands], "pixel_size_m": layer.pixel_size_m}
+        known |= {"own_px": layer.own_px} if layer.own_px else {}
     table = () if layer.classes is None else layer.classes.classes
     return {**known, "kind": layer.kind, **({"classes": [asdict(entry) for entry in table]} if table else {})}
 
@@ -256,6 +267,8 @@ def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass
             layers[name] = replace(known[name], long_name=told.long_name or known[name].long_name)
         elif told.kind == "categorical":
             layers[name] = make_categorical_layer(name, ClassTable(told.classes))
+        elif told.bands:
+            layers[name] = make_banded_layer(name, told.units, told.bands, told.dtype, told.pixel_size_m, told.own_px)
         else:
             low, high = told.actual_range
             layers[name] = make_continuous_layer(name, unit=told.units, low=low, high=high)

@@ -9,6 +9,7 @@ terrain      uint8    class ids of the class table; 0: no data
 ortho_red …  uint8    red, green and blue of an orthophoto kept in colour, as ortho
 any other    float32  a user's continuous layer, in its own unit; NaN: no data
 any other    uint8    a user's categorical layer: class ids of its own table; 0: no data
+bands/NAME   float    a user's layer of several bands, a group: (band, y, x) on a grid of its own, x and y; NaN: no data
 x, y         float64  pixel centres in the map's CRS [m]
 spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
 ===========  =======  ==========================================================================
@@ -20,7 +21,7 @@ so does GDAL from 3.13 on, the first that reads shards.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -47,11 +48,14 @@ from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
 TILE_PX = 512
 """Side of a tile: the unit that is decoded."""
 
+BANDS = "bands"
+"""Group of the layers of several bands."""
+
 SHARD_PX = 2048
 """Side of a shard: the unit that is a file, and that is written at once."""
 
-PAPER_VERSION, MAP_VERSION = "1.1", "1.2"
-"""1.2: a map has other layers than the paper's, which its key ``described`` tells of; one without is of 1.1 as before."""
+PAPER_VERSION, OWN_VERSION, MAP_VERSION = "1.1", "1.2", "1.3"
+"""1.2: a map has other layers than the paper's, which its key ``described`` tells of; 1.3: some of several bands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,10 +69,32 @@ class _Attributes:
     id_by_value: Mapping[int, int]
     layers: tuple[str, ...]
     described: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
+    band_grids: Mapping[str, MapGrid] = field(default_factory=dict, metadata=LEFT_OUT)
+    """Of layers of several bands."""
     factors: tuple[int, ...]
     tile_px: int
     height_reference_m: float
     facts: MapFacts
+
+
+@dataclass(frozen=True, slots=True)
+class BandFile:
+    """A layer of several bands; satisfies `tcpipe.terrain.tiles.BandReader`."""
+
+    name: str
+    """Of the map."""
+    layer: Layer
+    grid: MapGrid
+    tile_px: int
+    _array: ShardedArray
+
+    def read(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+        """Return a window of all bands, shape (bands, rows, columns), NaN without data; `MapError`: a tile is damaged."""
+        try:
+            bands = range(self._array.shape[0])
+            return np.stack([self._array.window(row0, row1, col0, col1, lead=(band,)) for band in bands])
+        except StoreError as error:
+            raise MapError(f"map {self.name}: {self.layer.name} cannot be read ({error}); add the map again") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +113,23 @@ class MapFile:
     factors: tuple[int, ...]
     _levels: Mapping[int, Mapping[str, ShardedArray]]
     """The arrays of each factor."""
+    banded: Mapping[str, BandFile]
+    """Layers of several bands, at their own resolution; the same at every factor."""
     _factor: int = 1
 
     def at(self, factor: int) -> MapFile:
         """Return the map at one of its ``factors``, which are the full map's."""
         return replace(self, grid=make_overview_grid(self.grid, factor), factors=(1,), _factor=factor)
+
+    def select(self, layers: Collection[str]) -> MapFile:
+        """Return the map with these of its layers alone."""
+        kept = {name: layer for name, layer in self.layers.items() if name in layers}
+        return replace(self, layers=kept, banded={name: of for name, of in self.banded.items() if name in layers})
+
+    @property
+    def all_layers(self) -> dict[str, Layer]:
+        """All layers, those of several bands last."""
+        return {**self.layers, **{name: of.layer for name, of in self.banded.items()}}
 
     def summary(self) -> MapSummary:
         """Return what the map is as a whole."""
@@ -105,10 +143,10 @@ class MapFile:
             cols=grid.cols,
             pixel_size_m=grid.pixel_size_m,
             bounds_m=grid.bounds_m,
-            layers=tuple(self.layers),
+            layers=tuple(self.all_layers),
             overviews=self.factors[1:],
             class_table=self.classes.classes,
-            described=_describe_layers(self.layers),
+            described=_describe_layers(self.all_layers),
         )
 
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
@@ -156,17 +194,19 @@ def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = 
     except StoreError as error:
         raise MapError(f"{path}: not a map ({error.problems[0]}); add one with: tcpipe add-map") from None
     found = attributes.get("tcpipe_map") if isinstance(attributes, dict) else None
-    if not isinstance(found, dict) or found.get("version") not in {PAPER_VERSION, MAP_VERSION}:
+    if not isinstance(found, dict) or found.get("version") not in {PAPER_VERSION, OWN_VERSION, MAP_VERSION}:
         version = found.get("version") if isinstance(found, dict) else None
         raise MapError(f"{path}: not a map of this version (got {version}, expected {MAP_VERSION}); add it again")
     try:
         kept = parse_typed(found | {"grid": rename_keys(found.get("grid"))}, _Attributes, path)
-        described = {name: kept.described.get(name, {}) for name in kept.layers}
-        layers = read_layers(described, kept.class_table, path)
+        described = {name: kept.described.get(name, {}) for name in (*kept.layers, *kept.band_grids)}
+        every = read_layers(described, kept.class_table, path)
+        layers = {name: every[name] for name in kept.layers}
         _refuse_sizes(kept, path)
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
     wanted = [f"{_level_path(factor)}{layer}" for factor in kept.factors for layer in kept.layers]
+    wanted += [f"{BANDS}/{name}/{name}" for name in kept.band_grids]
     missing = [array for array in wanted if not (path / array / DESCRIPTION).is_file()]
     if missing:
         raise MapError(f"{path}: the map's {', '.join(missing)} is missing; add the map again")
@@ -177,18 +217,24 @@ def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = 
             factor: {name: _open_array(path, layer, kept.grid, factor, fetched) for name, layer in layers.items()}
             for factor in kept.factors
         }
+        banded = {
+            name: BandFile(kept.name, every[name], grid, TILE_PX, _open_bands(path, every[name], grid, fetched))
+            for name, grid in kept.band_grids.items()
+        }
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
-    return convert_record(kept, MapFile, classes=ClassTable(kept.class_table), layers=layers, _levels=levels)
+    classes = ClassTable(kept.class_table)
+    return convert_record(kept, MapFile, classes=classes, layers=layers, _levels=levels, banded=banded)
 
 
 def _refuse_sizes(kept: _Attributes, path: Path) -> None:
     """Raise `StoreError` where a map says that it is larger than any, or cut otherwise than every map is."""
-    rows, cols, pixel_size_m = kept.grid.rows, kept.grid.cols, kept.grid.pixel_size_m
-    if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
-        raise StoreError(
-            f"{path}: says that it has {rows} x {cols} pixels of {pixel_size_m} m, at most {MAX_SIDE_PX} a side"
-        )
+    for grid in (kept.grid, *kept.band_grids.values()):
+        rows, cols, pixel_size_m = grid.rows, grid.cols, grid.pixel_size_m
+        if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
+            raise StoreError(
+                f"{path}: says that it has {rows} x {cols} pixels of {pixel_size_m} m, at most {MAX_SIDE_PX} a side"
+            )
     wanted = (TILE_PX, list_factors(kept.grid))
     if (kept.tile_px, kept.factors) != wanted:
         raise StoreError(f"{path}: tiles and overviews are {(kept.tile_px, kept.factors)}, expected {wanted}")
@@ -203,6 +249,19 @@ def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: 
         shard_shape=(shard_px, shard_px),
         dtype=np.dtype(layer.mapped),
         fill=find_no_data_value(layer.mapped),
+        sparse=True,
+        fetched=fetched,
+    )
+
+
+def _open_bands(path: Path, layer: Layer, grid: MapGrid, fetched: ShardFetcher | None) -> ShardedArray:
+    return open_sharded(
+        path / BANDS / layer.name / layer.name,
+        shape=(len(layer.bands), grid.rows, grid.cols),
+        chunk_shape=(1, TILE_PX, TILE_PX),
+        shard_shape=(1, SHARD_PX, SHARD_PX),
+        dtype=layer.mapped,
+        fill=float("nan"),
         sparse=True,
         fetched=fetched,
     )
@@ -245,7 +304,17 @@ def _level_path(factor: int) -> str:
 class MapWriter:
     """Writes a map and its overviews shard by shard into a directory; `finish` makes it complete."""
 
-    __slots__ = ("_factors", "_grid", "_group", "_layers", "_levels", "_name", "_scheme", "height_reference_m")
+    __slots__ = (
+        "_banded",
+        "_factors",
+        "_grid",
+        "_group",
+        "_layers",
+        "_levels",
+        "_name",
+        "_scheme",
+        "height_reference_m",
+    )
 
     def __init__(
         self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: Mapping[str, Layer]
@@ -254,6 +323,7 @@ class MapWriter:
         self._factors = list_factors(grid)
         self._group = create_group(directory)
         self._levels = {factor: self._add_level(factor) for factor in self._factors}
+        self._banded: dict[str, tuple[Any, MapGrid]] = {}
         self.height_reference_m: float | None = None
         """What stored heights are above [m]: the floor of the smallest of the first shard that has any."""
 
@@ -272,8 +342,30 @@ class MapWriter:
         for factor, level in iterate_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
 
+    def add_bands(self, layer: Layer, grid: MapGrid) -> None:
+        """Add a layer of several bands on a grid of its own, whose bands `write_band` writes."""
+        group = self._group.create_group(f"{BANDS}/{layer.name}")
+        _place(group, grid, f"{self._name}, {layer.name}")
+        array = add_array(
+            group,
+            layer.name,
+            shape=(len(layer.bands), grid.rows, grid.cols),
+            dtype=layer.mapped,
+            chunks=(1, TILE_PX, TILE_PX),
+            shards=(1, SHARD_PX, SHARD_PX),
+            dimensions=("band", "y", "x"),
+            fill_value=float("nan"),
+            attributes={"long_name": layer.long_name, "units": layer.unit, "grid_mapping": "spatial_ref"},
+        )
+        self._banded[layer.name] = array, grid
+
+    def write_band(self, layer: str, band: int, row0: int, col0: int, values: Pixels) -> None:
+        """Write a shard of one band, as `write`."""
+        array, (rows, cols) = self._banded[layer][0], values.shape
+        array[band, row0 : row0 + rows, col0 : col0 + cols] = values.astype(array.dtype)
+
     def finish(self, facts: MapFacts, layers: Mapping[str, Layer]) -> None:
-        """Write coordinates and attributes; ``layers`` are those of the beginning, with the range that was found."""
+        """Write coordinates and attributes; ``layers`` are all those of before, with the range that was found."""
         reference_m = self.height_reference_m or 0.0
         for factor, arrays in self._levels.items():
             arrays["height"].attrs.update({"add_offset": reference_m})
@@ -284,13 +376,14 @@ class MapWriter:
                 f"{self._name}, {factor} x coarser" if factor > 1 else self._name,
             )
         kept = _Attributes(
-            version=PAPER_VERSION if set(layers) <= set(LAYERS) else MAP_VERSION,
+            version=MAP_VERSION if self._banded else PAPER_VERSION if set(layers) <= set(LAYERS) else OWN_VERSION,
             name=self._name,
             grid=self._grid,
             class_table=self._scheme.table.classes,
             id_by_value=self._scheme.id_by_value,
-            layers=tuple(layers),
+            layers=tuple(name for name in layers if name not in self._banded),
             described=_describe_layers(layers),
+            band_grids={name: grid for name, (_, grid) in self._banded.items()},
             factors=self._factors,
             tile_px=TILE_PX,
             height_reference_m=reference_m,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shlex
 import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
@@ -382,7 +383,8 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         format_hub_card(replace(card, checksums=files), schema, samples_file=SAMPLES, picture=OVERVIEW),
     )
     files = {**files, HUB_CARD: compute_checksum(directory / HUB_CARD)}
-    patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
+    sizes = {name: math.prod(layer.patch_shape(spool.patch_px)) for name, layer in spool.layers.items()}
+    patches = {name: (sizes[name], layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
     croissant = format_croissant(
         name=card.name,
         description=card.description,

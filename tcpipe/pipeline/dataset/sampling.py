@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -38,8 +39,8 @@ from tcpipe.terrain.tiles import TilePool, choose_level
 
 logger = logging.getLogger("tcpipe")
 
-_BATCH_ROWS = 8_192
-"""Segments sampled together: 50 MB of patches."""
+_BATCH_ROWS, _BATCH_BYTES = 8_192, 200_000_000
+"""Segments sampled together: 50 MB of patches, unless a layer has many bands."""
 
 _ROW_BITS = 32
 _ROW_MASK = (1 << _ROW_BITS) - 1
@@ -113,14 +114,15 @@ class Spool:
             sampled = _read_sampled(self.place.read_range(name, max(end - more, 0), min(more, end)))
         except (ValueError, OSError, EOFError, KeyError, BadZipFile):
             sampled = None
-        if sampled is None or size != len(sampled.kept) * sum(map(self._patch_bytes, self.layers)) + more + _SIZE_BYTES:
+        if sampled is None or size != len(sampled.kept) * self.sample_bytes + more + _SIZE_BYTES:
             self.place.delete(name)
             return None
         return sampled
 
     def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
-        """Return the patches in ``slots``, shape (n, px, px); one span is read of each batch."""
-        dtype, shape, each = self.layers[layer].stored, (self.patch_px, self.patch_px), self._patch_bytes(layer)
+        """Return the patches in ``slots``, shape (n, *patch); one span is read of each batch."""
+        kind, each = self.layers[layer], self._patch_bytes(layer)
+        dtype, shape = kind.stored, kind.patch_shape(self.patch_px)
         patches = np.empty((len(slots), *shape), dtype)
         before = sum(self._patch_bytes(name) for name in itertools.takewhile(lambda name: name != layer, self.layers))
         order = np.argsort(slots, kind="stable")
@@ -132,8 +134,13 @@ class Spool:
             patches[order[span]] = np.frombuffer(data, dtype).reshape(-1, *shape)[rows[span] - first]
         return patches
 
+    @property
+    def sample_bytes(self) -> int:
+        """Bytes of the patches of a sample."""
+        return sum(map(self._patch_bytes, self.layers))
+
     def _patch_bytes(self, layer: str) -> int:
-        return self.patch_px**2 * self.layers[layer].stored.itemsize
+        return math.prod(self.layers[layer].patch_shape(self.patch_px)) * self.layers[layer].stored.itemsize
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,9 +204,15 @@ def sample_all_segments(
     """
     sources = [open_map(*of) for of in maps()]
     check_same_layers(sources)
-    rows = list(_iterate_batches(segments))
-    layers = sort_layers(join_layers([source.layers for source in sources]))
+    joined = sort_layers(join_layers([source.all_layers for source in sources]))
+    layers = {name: layer.at_patch(config.patch_m, config.patch_px) for name, layer in joined.items()}
     spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
+    each = spool.sample_bytes
+    if len(layers) > len(sources[0].layers):
+        shapes = (f"{name} {' x '.join(map(str, of.patch_shape(0)))}" for name, of in layers.items() if of.bands)
+        message = "patches: %d segments of %.1f kB (%s) take up to %.1f MB before compression"
+        logger.info(message, segments.num_rows, each / 1e3, ", ".join(shapes), segments.num_rows * each / 1e6)
+    rows = list(_iterate_batches(segments, max(min(_BATCH_ROWS, _BATCH_BYTES // each), 1)))
     if count := len(spool.place.files()):
         logger.info("resuming: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
@@ -256,12 +269,12 @@ def _make_columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
     return {**sampled.patches.columns(), **{name: getattr(sampled, name) for name in _PLACING}}
 
 
-def _iterate_batches(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
+def _iterate_batches(segments: pa.Table, size: int) -> Iterator[NDArray[np.int64]]:
     """Yield the rows of each batch, rising."""
     places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
     order = np.argsort(compute_morton(*(place.astype(np.int64) for place in places)), kind="stable")
-    for first in range(0, len(order), _BATCH_ROWS):
-        yield np.sort(order[first : first + _BATCH_ROWS])
+    for first in range(0, len(order), size):
+        yield np.sort(order[first : first + size])
 
 
 def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:

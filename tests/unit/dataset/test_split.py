@@ -222,8 +222,10 @@ def test_every_stored_value_becomes_what_the_layers_say(count):
     wanted = np.stack([grey, classes, heights], axis=-1)[rows]
     wanted[mirrored] = wanted[mirrored, ::-1]
     known = make_paper_layers(LAYERS, ClassTable((TerrainClass(count, "last", traversable=True),)))
-    np.testing.assert_array_equal(make_tensor_layout(LAYERS, known).form(pixels, rows, mirrored), wanted)
-    apart = make_tensor_layout(("height", "ortho", "terrain"), known).form(pixels, rows, mirrored)
+    np.testing.assert_array_equal(
+        make_tensor_layout(LAYERS, known, heights.shape[1]).form(pixels, rows, mirrored), wanted
+    )
+    apart = make_tensor_layout(("height", "ortho", "terrain"), known, heights.shape[1]).form(pixels, rows, mirrored)
     np.testing.assert_array_equal(apart, wanted[..., [2, 0, 1]])
 
 
