@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
+from tcpipe.cost.adaptation import Run, make_metres
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.dataset import Dataset
@@ -18,10 +19,13 @@ from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import require_card
+from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, format_verdict
 from tcpipe.formats.json_files import write_json
+from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import (
     CostModel,
@@ -32,10 +36,13 @@ from tcpipe.planning.cost_model import (
     join_predictions,
     predict_segments,
 )
+from tcpipe.planning.search import find_turning
+from tcpipe.recipe import SampleConfig
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
 from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
@@ -131,7 +138,9 @@ def find_drive(store: Store, log: str) -> RunDirectory:
     return found[0]
 
 
-def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str) -> DriveCost:
+def compute_drive_cost(
+    model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
+) -> DriveCost:
     """Return what a drive took beside what a model says of it.
 
     Parameters
@@ -140,6 +149,7 @@ def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, d
     run : the drive, ingested.
     data : the dataset that the model was trained on: what of the drive it has seen.
     log : what the user calls it.
+    shifts : of runs on the map.
 
     Raises
     ------
@@ -153,8 +163,11 @@ def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, d
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
     segments = segments.sort_by("start_ns")
-    said = _predict_drive(model, source, segments, data)
-    reasons, energy = _list_reasons(model, segments, said, data), ENERGIES[model.label_energy].energy
+    shift_m, recipe = np.array((shifts or {}).get(run.run_id, (0.0, 0.0, 0.0))), data.card.recipe
+    said = _predict_drive(model, source, segments, recipe.read.gnss_crs, shift_m[:2])
+    std_m = np.hypot(to_floats(segments, "position_std_m"), shift_m[2])
+    reasons = _list_reasons(model, segments, said, std_m > recipe.sample.max_position_std_m)
+    energy = ENERGIES[model.label_energy].energy
     length_m, good = to_floats(segments, "arc_length_m"), np.array([not why for why in reasons])
     named = sorted({name for why in reasons for name in why})
     trained = data["train"]
@@ -180,22 +193,56 @@ def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, d
     )  # fmt: skip
 
 
-def _predict_drive(model: CostModel, source: MapReader, segments: pa.Table, data: Dataset) -> SegmentPredictions:
-    """Return what the model says of each segment, where it was driven."""
-    projection = find_map_projection(source, data.card.recipe.read.gnss_crs)
-    start, end = (projection.forward(read_lonlat_deg(segments, name)) for name in ("start", "end"))
-    turn_radpm = (
-        to_floats(segments, "mean_abs_yaw_rate_radps")
-        * to_floats(segments, "duration_s")
-        / to_floats(segments, "arc_length_m")
-    )
+def _predict_drive(
+    model: CostModel, source: MapReader, segments: pa.Table, gnss_crs: str, shift_m: Floats
+) -> SegmentPredictions:
+    """Return what the model says of each segment, on its ground by the map: where it was driven, moved by a shift (x, y)."""
+    projection = find_map_projection(source, gnss_crs)
+    start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m for name in ("start", "end"))
+    turn_radpm = _find_turns(segments) / to_floats(segments, "arc_length_m")
     frames = make_patch_frames(start, end, to_floats(segments, "chord_m"))
     return join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
 
 
-def _list_reasons(model: CostModel, segments: pa.Table, said: SegmentPredictions, data: Dataset) -> list[list[str]]:
-    """Return why each segment is not compared; nothing where it is."""
-    uncertain = to_floats(segments, "position_std_m") > data.card.recipe.sample.max_position_std_m
+def _find_turns(segments: pa.Table) -> Floats:
+    """Return how far each segment turns, both ways counted [rad]."""
+    return to_floats(segments, "mean_abs_yaw_rate_radps") * to_floats(segments, "duration_s")
+
+
+def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
+    """Return the labelled segments of a run on ground that the model knows, predicted and measured; `UsageError` if there are none.
+
+    The run may be of another robot, payload or season: a model is adapted by it.
+    """
+    check_model(model, source)
+    segments, gnss_crs = run.segments().sort_by("start_ns"), run.manifest.recipe.read.gnss_crs
+    said = _predict_drive(model, source, segments, gnss_crs, np.zeros(2)) if segments.num_rows else None
+    uncertain = to_floats(segments, "position_std_m") > SampleConfig().max_position_std_m
+    reasons = [] if said is None else _list_reasons(model, segments, said, uncertain)
+    good = np.array([not why for why in reasons], np.bool_)
+    if said is None or not good.any():
+        named = ", ".join(sorted({name.replace("_", " ") for why in reasons for name in why})) or "it has no segments"
+        raise UsageError(
+            f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
+        )
+    duration, energy = to_floats(segments, "chord_m") / said.velocity_mps, ENERGIES[model.label_energy].energy
+    length_m, turn_rad = to_floats(segments, "arc_length_m"), _find_turns(segments)
+    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+    turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, said.terrain_class)
+    start_xy_m = find_map_projection(source, gnss_crs).forward(read_lonlat_deg(segments, "start"))
+    metres = make_metres(
+        model.physics, length_m=length_m, class_id=said.terrain_class, slope_rad=said.slope_rad, turn_rad=turn_rad,
+        predicted={"duration": duration, "energy": said.power_watt * duration + turn_joule},
+        measured={"duration": to_floats(segments, "duration_s"), "energy": to_floats(segments, energy)},
+        distance_m=np.insert(np.cumsum(np.linalg.norm(np.diff(start_xy_m, axis=0), axis=1)), 0, 0.0),
+    )  # fmt: skip
+    return Run(run.run_id, {name: of.take(good) for name, of in metres.items()})
+
+
+def _list_reasons(
+    model: CostModel, segments: pa.Table, said: SegmentPredictions, uncertain: NDArray[np.bool_]
+) -> list[list[str]]:
+    """Return why each segment is not compared; nothing where it is. ``uncertain``: whose place is not known well enough, shape (N,)."""
     unlabelled = ~np.isfinite(
         to_floats(segments, ENERGIES[model.label_energy].energy) + to_floats(segments, "duration_s")
     )
@@ -295,9 +342,11 @@ class DrivesResult:
 
 
 def evaluate_drives(
-    model: CostModel, data: Dataset, source: MapReader, logs: Sequence[str], *, store: str | Path, out: str | Path
+    model: CostModel, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
 ) -> DrivesResult:
     """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``, or to a URL.
+
+    Where the dataset's runs were moved onto their map (``sample.align``), drives are moved by the same method, or a finding says why not.
 
     Raises
     ------
@@ -312,11 +361,16 @@ def evaluate_drives(
     clear(place)
     if place.exists() and not place.is_dir():
         raise UsageError(f"{place}: is a file, expected a directory to write {JSON} and {PAGE} into")
-    found = tuple(compute_drive_cost(model, source, run, data, log=log) for run, log in zip(runs, logs, strict=True))
-    held, findings = (
-        [drive for drive in found if drive.held_back],
-        tuple(_find_doubts(found, Subject("model", model.name))),
+    recipe, shifts, moved = data.card.recipe, dict[str, tuple[float, float, float]](), list[Finding]()
+    if recipe.sample.align:
+        registrations, moved = register_runs(runs, source, recipe)
+        shifts = list_shifts(registrations)
+    found = tuple(
+        compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
+        for run, log in zip(runs, logs, strict=True)
     )
+    held = [drive for drive in found if drive.held_back]
+    findings = (*_find_doubts(found, Subject("model", model.name)), *moved)
     values = Drives(
         model=model.name, model_checksum=model.checksum, drives=found,
         duration_s=_sum([drive.duration_s for drive in held]), energy_joule=_sum([drive.energy_joule for drive in held]),
