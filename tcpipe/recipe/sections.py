@@ -326,36 +326,36 @@ class CovariateConfig:
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
-    """Settings of `tcpipe train`; options of the command override those that it has."""
+    """Settings of `tcpipe train`; its options override them."""
 
     epochs: Annotated[int, Bounds(ge=1, le=100_000)] = 100
     """ResNet-18: most epochs."""
     patience: Annotated[int, Bounds(ge=1, le=100_000)] = 12
-    """ResNet-18: epochs without a better held-out loss before training stops."""
+    """ResNet-18: epochs without a better held-out loss."""
     batch_size: Annotated[int, Bounds(ge=1, le=65_536)] = 64
-    """ResNet-18: samples in a batch."""
+    """ResNet-18."""
     learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 1e-4
-    """ResNet-18: learning rate of Adam (the paper's)."""
+    """ResNet-18."""
     width: Annotated[int, Bounds(ge=16, le=512)] = 64
     """ResNet-18: filters of the first stage, a multiple of 16."""
     mirror: bool = True
-    """Networks: mirror every other patch across its direction of travel."""
+    """Networks: mirror every other patch."""
     trees: Annotated[int, Bounds(ge=1, le=10_000)] = 150
-    """Boosting: most trees of an output; cross-validation over the folds chooses their number."""
+    """Boosting: most trees of an output."""
     tree_learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 0.1
-    """Boosting: LightGBM's learning_rate."""
+    """Boosting (LightGBM)."""
     tree_leaves: Annotated[int, Bounds(ge=2, le=4096)] = 15
-    """Boosting: LightGBM's num_leaves."""
+    """Boosting: num_leaves."""
     tree_depth: Annotated[int, Bounds(ge=1, le=63)] = 6
-    """Boosting: LightGBM's max_depth."""
+    """Boosting: max_depth."""
     leaf_samples: Annotated[int, Bounds(ge=1, le=1_000_000)] = 10
-    """Boosting: LightGBM's min_data_in_leaf."""
+    """Boosting: min_data_in_leaf."""
     residual_passes: Annotated[int, Bounds(ge=1, le=10_000)] = 30
-    """Residual network: passes over the samples, of at least 300 and at most 2400 steps together."""
+    """Residual network: passes over the samples (300 to 2400 steps)."""
     residual_learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 3e-3
-    """Residual network: highest learning rate of AdamW."""
+    """Residual network (AdamW)."""
     residual_weight_decay: Annotated[float, Bounds(ge=0, le=1)] = 1e-2
-    """Residual network: weight decay of AdamW."""
+    """Residual network (AdamW)."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "train")
