@@ -142,7 +142,7 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
 def test_arrays_there_and_back_and_an_older_kind(fitted):
     model, _ = fitted
     features, _, _ = ground(20)
-    inputs = Inputs(CHANNELS, 40, 3, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
+    inputs = Inputs(CHANNELS, 40, CHANNELS, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
     again = BoostingModel.from_arrays(model.arrays(), inputs).table
     assert np.array_equal(again.predict(features), model.predict(features))
     with pytest.raises(ModelError, match=r"the weights of another model: curve_.* is missing; train the model again"):
