@@ -119,8 +119,8 @@ class ModelCard:
     def inputs(self) -> Inputs:
         """Return what its predictor takes and gives."""
         return Inputs(
-            self.channels, self.architecture.patch_px, self.layout.planes, self.patch_m, ClassTable(self.classes).count, self.extra_features,
-            self.outputs, self.scale,
+            self.channels, self.architecture.patch_px, self.layout.planes, self.patch_m, ClassTable(self.classes).count,
+            self.extra_features, self.outputs, self.scale,
         )  # fmt: skip
 
 

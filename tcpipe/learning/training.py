@@ -41,7 +41,7 @@ from tcpipe.learning.predictor import (
 )
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import PAPER_LAYERS
+from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS
 from tcpipe.terrain.sampling import compute_relief_m
 
 logger = logging.getLogger("tcpipe")
@@ -140,7 +140,11 @@ def train(
             f"--layers: a model of kind {rules.model} takes the slope and class of a metre, no patch; remove it"
         )
     other = replace(other, channels=kind.channels or other.channels or rules.layers)
-    if variant is None:
+    if kind.channels:
+        logger.info(
+            "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, rules.model
+        )
+    elif variant is None:
         _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
@@ -186,7 +190,11 @@ def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig
 
 def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -> None:
     """Log which layers of a dataset a model takes, and warn of those of the user's that it does not take unasked."""
-    taken = [name for name in data.card.layers if any(channel.removesuffix(ONE_HOT) == name for channel in channels)]
+    named = {channel.removesuffix(ONE_HOT) for channel in channels}
+    taken = [
+        *(name for name in LAYERS if name in named),
+        *(name for name in data.card.layers if name in named - {*LAYERS}),
+    ]
     unused = [name for name in data.card.layers if name not in taken]
     logger.info("%s: layers: %s; not used: %s", data.path, ", ".join(channels), ", ".join(unused) or "none")
     if own := [] if is_chosen else [name for name in unused if name not in PAPER_LAYERS]:

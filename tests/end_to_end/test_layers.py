@@ -14,6 +14,8 @@ from synthetic_store import WORLD, add_run, lanes, segments
 import tcpipe
 from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.learning.models import load_model
+from tcpipe.learning.training import _report_layers
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import Store, open_store
@@ -231,3 +233,74 @@ def test_what_cannot_be_a_layer_is_refused_in_a_line(site, more, code, line):
     assert (result.exception.exit_code, len(result.exception.problems)) == (code, 1)
     assert line in result.exception.problems[0]
     assert sorted((site / "store").rglob("*")) == before
+
+
+PAPER = "ortho,terrain,height"
+
+
+@pytest.fixture(scope="module")
+def models(datasets):
+    """Models of the paper's layers, with the embedding, which tells the place, and with layers that tell little of it."""
+    for name, layers in (
+        ("plain", PAPER),
+        ("bands", f"{PAPER},embedding"),
+        ("idle", f"{PAPER},canopy_one_hot,ortho_red"),
+    ):
+        more = ["--model", "boosting", "--layers", layers, "-q"]
+        trained = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(datasets / f"model-{name}"), *more])
+        assert trained.exit_code == 0, trained.output
+    return datasets
+
+
+def error_mps(here, name, dataset="zarr"):
+    """RMSE of velocity on test; it follows the place."""
+    model, test = load_model(here / f"model-{name}"), tcpipe.open_dataset(here / dataset)["test"]
+    said = model.predict(test.with_layout(model.card.layout).patches)[:, 1]
+    return float(np.sqrt(np.mean((said - test.labels[:, 1]) ** 2)))
+
+
+def test_bands_that_tell_the_cost_lower_the_error_of_held_out_samples(models):
+    plain, bands, idle = (error_mps(models, name) for name in ("plain", "bands", "idle"))
+    assert bands < 0.75 * plain
+    assert idle > 0.9 * plain
+    assert error_mps(models, "bands", "parquet") == pytest.approx(bands, rel=1e-6)
+
+
+def test_a_model_says_which_layers_it_takes(datasets, tmp_path, caplog):
+    result = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "model"), "--model", "physics"])
+    assert result.exit_code == 0
+    assert "takes the slope and class of each metre, and no layer" in result.output
+    with caplog.at_level("WARNING", "tcpipe"):
+        _report_layers(tcpipe.open_dataset(datasets / "zarr"), PAPER.split(","), is_chosen=False)
+    assert (
+        "does not use canopy, embedding, moisture; to use it: --layers ortho,terrain,height,canopy,emb" in caplog.text
+    )
+    for layers, model, line in (("ortho,soil", "boosting", "requested channels: soil"), (PAPER, "physics", "no patch")):
+        more = ["--model", model, "--layers", layers]
+        result = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "other"), *more])
+        assert isinstance(result.exception, TcpipeError)
+        assert line in result.exception.problems[0]
+
+
+def test_costs_need_the_layers_of_the_model(models):
+    said = {}
+    for name in ("own", "plain"):
+        more = ["--map", name, "--cell-size", "2"]
+        said[name] = run(models, "cost-map", models / "model-bands", models / f"cost-{name}", *more)
+    assert said["own"].exit_code == 0, said["own"].output
+    assert isinstance(said["plain"].exception, TcpipeError)
+    (line,) = said["plain"].exception.problems
+    assert line.endswith(
+        "has no embedding, which model "
+        + str(models / "model-bands")
+        + " needs; add the map with --layer embedding=FILE"
+    )
+
+
+def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
+    result = CliRunner().invoke(
+        cli, ["evaluate", *map(str, (models / "model-bands", models / "zarr", tmp_path / "e")), "--no-baselines"]
+    )
+    assert result.exit_code in {0, 3}, result.output
+    found = json.loads((tmp_path / "e" / "evaluation.json").read_text())
+    assert found
