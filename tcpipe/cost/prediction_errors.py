@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, nnls
-from scipy.special import stdtrit
+from scipy.special import ndtr, ndtri, stdtrit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -61,6 +61,36 @@ class Bias:
 
     value: Floats
     std: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class SumDistribution:
+    """Two halves of normal distributions that meet at the prediction: of the time or energy of a path."""
+
+    middle: float
+    std_below: float
+    std_above: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the ends of the interval of `COVERAGE`."""
+        return self.compute_quantile(_TAIL), self.compute_quantile(1.0 - _TAIL)
+
+    def compute_quantile(self, probability: float) -> float:
+        """Return the value that is not exceeded with a probability."""
+        z = float(ndtri(probability))
+        return self.middle + z * (self.std_above if z > 0.0 else self.std_below)
+
+    def compute_probability(self, limit: float) -> float:
+        """Return the probability that a limit is not exceeded."""
+        std = self.std_above if limit > self.middle else self.std_below
+        return float(ndtr((limit - self.middle) / std)) if std else float(limit >= self.middle)
+
+    def __add__(self, other: SumDistribution) -> SumDistribution:
+        """Return the distribution of both paths together: on the same ground a model errs alike, so that standard deviations add up."""
+        return SumDistribution(
+            self.middle + other.middle, self.std_below + other.std_below, self.std_above + other.std_above
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,20 +133,24 @@ class Errors:
 
     def compute_sum_interval(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[float, float]:
         """Return the interval of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
+        return self.compute_sum(predicted, class_id).interval
+
+    def compute_sum(self, predicted: Floats, class_id: NDArray[np.integer]) -> SumDistribution:
+        """Return the distribution of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
         known = np.isfinite(predicted)
         values = np.where(known, predicted, 0.0)
         spread = np.where(known, self.compute_std(values, class_id), 0.0)
         middle, alone = float(values.sum()), float((spread**2).sum())
         if not alone:
-            return middle, middle
+            return SumDistribution(middle, 0.0, 0.0)
         variance = max(self._variance(spread), alone / spread.size)
         size = np.abs(values)
         common = np.hypot(float((size * self.bias_std[class_id]).sum()), self.common_share * float(size.sum()))
         # Errors of a single metre are no normal ones, sums nearly.
         like_one = min(variance / float(spread.sum()) ** 2, 1.0)
-        ends = (np.array([self.low, self.high]) * like_one + np.array([-_Z, _Z]) * (1.0 - like_one)) / _Z
-        width = _Z * float(np.sqrt(variance + common**2))
-        return middle + width * float(ends[0]), middle + width * float(ends[1])
+        below, above = (end / _Z * like_one + (1.0 - like_one) for end in (-self.low, self.high))
+        std = float(np.sqrt(variance + common**2))
+        return SumDistribution(middle, std * below, std * above)
 
     def _variance(self, spread: Floats) -> float:
         """Return sum_ij a_i a_j rho_ij."""

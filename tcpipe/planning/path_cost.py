@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
-from tcpipe.cost.prediction_errors import COVERAGE, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
 from tcpipe.errors import PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
@@ -73,6 +73,8 @@ class PathCost:
 
     pieces: pa.Table
     totals: PathTotals
+    errors: Mapping[str, SumDistribution] | None
+    """Of ``duration`` [s] and ``energy`` [J] in all; None without held-out samples."""
 
 
 def find_projection(source: MapReader) -> Projection:
@@ -138,10 +140,10 @@ def _sum_costs(model: CostModel, source: MapReader, pieces: Pieces, said: Segmen
     if errors is not None:
         fast, slow = errors["duration"].compute_intervals(duration, class_id)
         least, most = errors["energy"].compute_intervals(energy, class_id)
-        sums = (
-            errors["duration"].compute_sum_interval(duration, class_id),
-            errors["energy"].compute_sum_interval(energy, class_id),
-        )
+        sums = {
+            "duration": errors["duration"].compute_sum(duration, class_id),
+            "energy": errors["energy"].compute_sum(energy, class_id),
+        }
     table = PIECES.table(
         piece=np.arange(len(bits)),
         **_locate_pieces(source, pieces),
@@ -171,14 +173,14 @@ def _sum_costs(model: CostModel, source: MapReader, pieces: Pieces, said: Segmen
         energy_joule=float(np.nansum(energy)),
         turn_rad=float(turn_rad.sum()),
         turn_energy_joule=None if turning is None else float(np.nansum(turn_joule)),
-        duration_interval_s=sums[0] if sums else None,
-        energy_interval_joule=sums[1] if sums else None,
+        duration_interval_s=sums["duration"].interval if sums else None,
+        energy_interval_joule=sums["energy"].interval if sums else None,
         held_out_samples=errors["energy"].samples if errors else 0,
         held_out_runs=errors["energy"].runs if errors else 0,
         reasons=count_reasons(bits),
         complete=not without_cost,
     )
-    return PathCost(table, totals)
+    return PathCost(table, totals, sums)
 
 
 def _locate_pieces(source: MapReader, pieces: Pieces) -> dict[str, Floats]:

@@ -22,10 +22,10 @@ from tcpipe.planning.cost_grid import make_survey, read_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, write_pieces
-from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
+from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_paths
 from tcpipe.store import open_store
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
 
 
 def choose_map(store: str | Path, name: str | None) -> MapFile:
@@ -177,9 +177,7 @@ def _compute_totals(out: Path, key: str) -> TableTotals | None:
     return found if found.key == key and found.sha256 == compute_checksum(out).sha256 else None
 
 
-_PLAN_VERSION = "1.1"
-
-_TAKEN = {"energy": "energy_joule", "time": "duration_s", "distance": "length_m"}
+_PLAN_VERSION = "1.2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +189,7 @@ class PlanRequest:
     objective: Objective = "energy"
     cell_size_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
     allow_extrapolation: bool = False
+    risk: Annotated[float, Bounds(ge=0.5, le=0.999)] | None = None
     cost_map: Path | None = None
 
 
@@ -256,17 +255,13 @@ class PlanResult:
         return clean_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
 
     def _find_doubts(self) -> Iterator[Finding]:
-        """Yield what the path segments of the plan show that its cells did not, and that another plan takes less."""
-        (objective, asked), path = next(iter(self.plans.items())), Subject("file", self.out.name)
+        """Yield what the path segments of the plan show that its cells did not."""
+        asked, path = self.plans[self.objective], Subject("file", self.out.name)
         yield from find_doubts(asked, path)
         if not asked.complete:
             yield make_finding("cells-too-large", path)
         if asked.negative_steps:
             yield make_finding("steps-gain-energy", path, step_count=asked.negative_steps)
-        taken = {other: getattr(found, _TAKEN[objective]) for other, found in self.plans.items() if found.complete}
-        least = min(taken, key=taken.__getitem__, default=objective)
-        if asked.complete and taken[least] < read_threshold("objective-missed", "max_cost_ratio") * taken[objective]:
-            yield make_finding("objective-missed", path, names={"other": least, "objective": objective})
 
 
 def plan(
@@ -303,10 +298,9 @@ def plan(
     else:
         survey = read_survey(model, source, open_cost_map(request.cost_map, card))
     wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
-    plans = {
-        name: plan_path(survey, start, goal, name, allow_extrapolation=request.allow_extrapolation, step=step)
-        for name in wanted
-    }
+    plans = plan_paths(
+        survey, start, goal, wanted, allow_extrapolation=request.allow_extrapolation, risk=request.risk, step=step
+    )
     origin = PlanOrigin(key, {name: found.totals for name, found in plans.items()}, wanted)
     if picture is not None:
         from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw

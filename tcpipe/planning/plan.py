@@ -3,20 +3,25 @@
 A path over a point p is at least as long as the straight lines start-p-goal, so a path shorter than a known one lies in an ellipse. The
 search judges the ground in this ellipse without predictions and enlarges it until the shortest path is proved. Then it asks the model about
 the ground of the shortest path and some cells of every class, and then about cells that could lie on a better path, until there are none.
+
+The grid knows cells, and a path is judged by its metres. So the search offers several paths: of each objective, with turns and without, as
+steps and as straight lines, and for ``risk`` with several multiples of the standard deviation of a cell added to its cost. The path
+returned is the one that costs least as `tcpipe predict-path` predicts it.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import PathError
+from tcpipe.cost.prediction_errors import Errors, fit_errors
+from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
 from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
 from tcpipe.planning.cost_model import Reason
@@ -25,9 +30,9 @@ from tcpipe.planning.search import (
     LeastCostPath,
     Steps,
     compute_least_costs,
+    compute_steps_within,
     find_best_potential,
-    find_least_cost_path,
-    find_least_turning_path,
+    find_least_cost_paths,
     find_turning,
     make_steps,
     straighten_path,
@@ -39,6 +44,7 @@ from tcpipe.terrain.sampling import find_classes_at
 logger = logging.getLogger("tcpipe")
 
 Floats = NDArray[np.float64]
+Classes = NDArray[np.uint8]
 Objective = Literal["energy", "time", "distance"]
 
 OBJECTIVES: tuple[Objective, ...] = ("energy", "time", "distance")
@@ -47,6 +53,9 @@ _FIRST = 1.3
 """The first ellipse is of all points that make the straight way no longer than so many times."""
 
 _GROWTH = 1.5
+
+_CAUTIONS = (0.5, 1.0, 2.0)
+"""Standard deviations of a cell that are added to its cost, for paths of little risk."""
 
 _FEWEST_ASKED = 512
 """Cells asked about together, at least: a few seconds, more than finding the next takes."""
@@ -58,12 +67,16 @@ class PlanTotals(PathTotals):
 
     objective: Objective
     """What it is the least of."""
-    grid_cost: float
-    """What it costs on the grid of cells, in the objective's unit, turns apart."""
+    finalists: int
+    """Paths that were judged; this one is the best of them."""
     predicted_cells: int
     """Cells that the model was asked about."""
     negative_steps: int
     """Steps that give back more than height explains, taken as free."""
+    risk: float | None = None
+    """Probability with which the path takes no more than ``risk_cost``, by which it was chosen; None: by its prediction."""
+    risk_cost: float | None = None
+    """In the objective's unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,46 +96,70 @@ class Plan:
     totals: PlanTotals
 
 
-def plan_path(
+def plan_paths(
     survey: LazyCostGrid,
     start_deg: Floats,
     goal_deg: Floats,
-    objective: Objective,
+    objectives: Sequence[Objective],
     *,
     allow_extrapolation: bool = False,
+    risk: float | None = None,
     step: Callable[[int, int], None] = lambda _, __: None,
-) -> Plan:
-    """Return the least-cost path from a point to another.
+) -> dict[Objective, Plan]:
+    """Return the least-cost path from a point to another of each objective.
 
     Parameters
     ----------
     survey : the map and the model, and what is known so far; it learns what it lacks.
     start_deg, goal_deg : longitude and latitude, WGS 84 [deg], shape (2,).
-    objective : what is to be least.
+    objectives : what is to be least.
     allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
+    risk : the probability with which a path shall take no more than what is least; None: its prediction is least.
     step : is told how many blocks of how many are looked at, or predicted, in each round.
 
     Raises
     ------
     PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
+    ModelError : the model states no errors for ``risk``.
     """
+    errors = fit_errors(survey.model.residuals)
+    if risk is not None and errors is None:
+        raise ModelError(
+            f"{survey.model.name}: has too few held-out samples for errors, which --risk and --budget need"
+        )
     ends_xy_m = find_projection(survey.source).forward(np.stack([start_deg, goal_deg]))
     search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_extrapolation, step)
     search.check_ends()
-    bound_m, shortest = search.shortest()
-    found = shortest if objective == "distance" else search.best(objective, bound_m)
-    xy_m, grid_cost = search.straight(found, objective)
-    lonlat = find_projection(survey.source).inverse(xy_m)
-    cost = compute_path_cost(survey.model, survey.source, lonlat, where="the planned path")
-    totals = convert_record(
-        cost.totals,
-        PlanTotals,
-        objective=objective,
-        grid_cost=grid_cost,
-        predicted_cells=int(np.count_nonzero(survey.predicted)),
-        negative_steps=found.negative_steps,
-    )
-    return Plan(lonlat, xy_m, cost, totals)
+    lines, negative = search.find_finalists(objectives, None if risk is None else errors)
+    lonlats = [find_projection(survey.source).inverse(xy_m) for xy_m in lines]
+    costs = [compute_path_cost(survey.model, survey.source, lonlat, where="the planned path") for lonlat in lonlats]
+    predicted_cells = int(np.count_nonzero(survey.predicted))
+    plans = {}
+    for objective in objectives:
+        of_all = [_judge(cost, objective, risk) for cost in costs]
+        best = min(range(len(lines)), key=lambda at, of_all=of_all: (costs[at].totals.pieces_without_cost, of_all[at]))  # type: ignore[misc]
+        totals = convert_record(
+            costs[best].totals,
+            PlanTotals,
+            objective=objective,
+            finalists=len(lines),
+            predicted_cells=predicted_cells,
+            negative_steps=negative.get(objective, 0),
+            risk=risk,
+            risk_cost=None if risk is None else of_all[best],
+        )
+        plans[objective] = Plan(lonlats[best], lines[best], costs[best], totals)
+    return plans
+
+
+def _judge(cost: PathCost, objective: Objective, risk: float | None) -> float:
+    """Return what a path costs in the objective's unit, and is not exceeded with the probability ``risk``."""
+    if objective == "distance":
+        return cost.totals.length_m
+    quantity = "energy" if objective == "energy" else "duration"
+    if risk is not None and cost.errors is not None:
+        return cost.errors[quantity].compute_quantile(risk)
+    return cost.totals.energy_joule if objective == "energy" else cost.totals.duration_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,25 +246,56 @@ class _Search:
     def _metres(self) -> Floats:
         return self.survey.frames.metres(self._cells)
 
-    def _found(
-        self, objective: Objective, known: Mask, class_id: NDArray[np.uint8] | None = None
-    ) -> LeastCostPath | None:
-        """Return the best path over known cells; with their classes, that of least energy with its turns."""
+    def _find(
+        self,
+        objective: Objective,
+        known: Mask,
+        class_id: Classes | None = None,
+        errors: Errors | None = None,
+        caution: float = 0.0,
+    ) -> tuple[Steps, tuple[LeastCostPath, ...]]:
+        """Return the steps over known cells and the best paths over them; with the cells' classes, that with turns comes first."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
         open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & known
+        per_metre = costs.per_metre(objective)
+        if errors is not None and class_id is not None:
+            for course in per_metre:
+                course += caution * errors.compute_std(course, class_id)  # noqa: PLW2901  in place
+        steps = make_steps(costs, per_metre, open_, self._metres())
         if start == goal or not open_.any():
-            return None
-        steps = make_steps(costs, objective, open_, self._metres())
+            return steps, ()
+        if objective != "energy" or class_id is None:
+            return steps, find_least_cost_paths(steps, 0.0, start, goal)
         turning = find_turning(self.survey.model.physics, self.survey.model.classes)
-        if objective == "energy" and turning is not None and class_id is not None:
-            told = np.isfinite(steps.cost)
-            known_steps = Steps(*(getattr(steps, name)[told] for name in Steps.__slots__))
-            per_rad = turning.joule_per_rad[class_id.reshape(-1)]
-            return find_least_turning_path(known_steps, costs.grid.cols, start, goal, per_rad)
-        return find_least_cost_path(steps, costs.grid.rows * costs.grid.cols, start, goal)
+        return steps, find_least_cost_paths(steps, find_best_potential(steps), start, goal, turning, class_id)
 
-    def shortest(self) -> tuple[float, LeastCostPath]:
-        """Return the shortest way that can be driven, and its length; only the ground is looked at."""
+    def find_finalists(
+        self, objectives: Sequence[Objective], errors: dict[str, Errors] | None
+    ) -> tuple[list[Floats], dict[Objective, int]]:
+        """Return the lines of paths that may be the best of any objective, (P, 2) each, and the steps taken as free by objective.
+
+        With the errors of predictions, also those of little risk.
+        """
+        bound_m, steps, paths = self._find_shortest()
+        lines, negative = list(self._draw_lines(steps, paths)), dict[Objective, int]()
+        class_id = self.survey.class_id() if set(objectives) - {"distance"} else None
+        for objective in objectives:
+            if objective != "distance" and class_id is not None:
+                steps, paths = self._find_best(objective, bound_m, class_id)
+                negative[objective] = paths[0].negative_steps
+                lines += self._draw_lines(steps, paths)
+        if class_id is not None:
+            for objective in OBJECTIVES[:2]:
+                quantity = "energy" if objective == "energy" else "duration"
+                cautions = _CAUTIONS if errors is not None and objective in objectives else ()
+                for caution in (*cautions, *((0.0,) if objective not in objectives else ())):
+                    of_all = None if errors is None else errors[quantity]
+                    lines += self._draw_lines(*self._find(objective, self.survey.predicted, class_id, of_all, caution))
+        different = {np.round(line, 3).tobytes(): line for line in lines}
+        return list(different.values()), negative
+
+    def _find_shortest(self) -> tuple[float, Steps, tuple[LeastCostPath, ...]]:
+        """Return the length of the shortest path that can be driven, the steps and the path; only the ground is looked at."""
         straight_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]) * self._metres().max())
         bound_m = straight_m * _FIRST
         while True:
@@ -236,17 +304,18 @@ class _Search:
                 logger.info("checking the ground of %d cells", np.count_nonzero(ellipse & ~self.survey.judged))
             self.survey.judge(ellipse, self.step)
             self._check_open()
-            found = self._found("distance", self.survey.judged)
-            if found is not None and (found.cost <= bound_m or ellipse.all()):
-                return found.cost, found
+            steps, paths = self._find("distance", self.survey.judged)
+            if paths and (paths[0].cost <= bound_m or ellipse.all()):
+                return paths[0].cost, steps, paths
             if ellipse.all():
                 raise PathError(self._no_way())
-            bound_m = max(bound_m * _GROWTH, found.cost if found else 0.0)
+            bound_m = max(bound_m * _GROWTH, paths[0].cost if paths else 0.0)
 
-    def best(self, objective: Objective, bound_m: float) -> LeastCostPath:
-        """Return the least-cost path; the model is asked about every cell that could be on it."""
-        survey = self.survey
-        class_id, open_ = survey.class_id(), np.asarray(self._maybe_open().any(axis=0))
+    def _find_best(
+        self, objective: Objective, bound_m: float, class_id: Classes
+    ) -> tuple[Steps, tuple[LeastCostPath, ...]]:
+        """Return the least-cost paths; the model is asked about every cell that could be on the first."""
+        survey, open_ = self.survey, np.asarray(self._maybe_open().any(axis=0))
         probes, ellipse = probe_cells(class_id, open_), self._ellipse(bound_m) & open_
         if not survey.predicted[probes | ellipse].all():
             logger.info(
@@ -258,12 +327,12 @@ class _Search:
         pace_s = self._ask(probes, 0.0)
         pace_s = self._ask(ellipse, pace_s)
         while True:
-            found = self._found(objective, survey.predicted, class_id)
-            wanted = self._could_be_better(objective, found, class_id)
+            steps, paths = self._find(objective, survey.predicted, class_id)
+            wanted = self._could_be_better(objective, paths[0] if paths else None, class_id)
             if not wanted.any():
-                if found is None:
+                if not paths:
                     raise PathError(self._no_way())
-                return found
+                return steps, paths
             pace_s = self._ask(wanted, pace_s)
 
     def _maybe_open(self) -> NDArray[np.bool_]:
@@ -272,12 +341,13 @@ class _Search:
             self.survey.costs.open_courses(allow_extrapolation=self.allow_extrapolation) | ~self.survey.judged
         )
 
-    def _could_be_better(self, objective: Objective, found: LeastCostPath | None, class_id: NDArray[np.uint8]) -> Mask:
+    def _could_be_better(self, objective: Objective, found: LeastCostPath | None, class_id: Classes) -> Mask:
         """Return those cells to ask about next that are the likeliest of all that could lie on a better path."""
         survey, (start, goal) = self.survey, self._cells.tolist()
         if survey.predicted.all():
             return ~survey.predicted
-        steps = make_steps(survey.costs, objective, self._maybe_open(), self._metres())
+        per_metre = survey.costs.per_metre(objective)
+        steps = make_steps(survey.costs, per_metre, self._maybe_open(), self._metres())
         over, better = find_possible_gain(steps, class_id, found, start, goal)
         cells = np.flatnonzero(better & ~survey.predicted.reshape(-1))
         most = max(_FEWEST_ASKED, int(survey.predicted.sum()) // 2)
@@ -295,29 +365,24 @@ class _Search:
         self.survey.predict(wanted, self.step)
         return (time.monotonic() - begun_s) / count
 
-    def straight(self, found: LeastCostPath, objective: Objective) -> tuple[Floats, float]:
-        """Return the path's points in the map's CRS [m], from end to end as they were given, and its cost; bends that cost are left out."""
-        costs = self.survey.costs
-        row, col = np.divmod(found.cells, costs.grid.cols)
-        points = np.stack([col, row], axis=1).astype(np.float64)
-        points[[0, -1]] = costs.grid.px_from_xy(self.ends_xy_m)
-        open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & (
-            objective == "distance" or self.survey.predicted
-        )
-        kept, cost = straighten_path(costs, objective, open_, self._metres(), points)
-        return costs.grid.xy_from_px(kept), cost
+    def _draw_lines(self, steps: Steps, paths: Iterable[LeastCostPath]) -> Iterator[Floats]:
+        """Yield each path in the map's CRS [m], from end to end as they were given: as its steps, and as straight lines that cost less."""
+        grid = self.survey.costs.grid
+        for path in paths:
+            points = np.stack(np.divmod(path.cells, grid.cols)[::-1], axis=1).astype(np.float64)
+            points[[0, -1]] = grid.px_from_xy(self.ends_xy_m)
+            yield grid.xy_from_px(points)
+            yield grid.xy_from_px(straighten_path(steps, points))
 
     def _no_way(self) -> str:
         """Say why there is no way."""
         text = f"no path from start to goal on map {self.survey.source.name}"
         if not self.allow_extrapolation:
             other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_extrapolation=True, step=self.step)
-            if other._found("distance", self.survey.judged) is not None:
+            if other._find("distance", self.survey.judged)[1]:
                 return f"{text} within the training range of the model; --allow-extrapolation crosses other ground"
         return f"{text}: the ground between them is not traversable or has no data"
 
-
-Classes = NDArray[np.uint8]
 
 _CHEAP = 0.1
 _FEWEST_STEPS = 20
@@ -344,33 +409,29 @@ def probe_cells(class_id: Classes, open_: NDArray[np.bool_]) -> NDArray[np.bool_
 
 def find_possible_gain(
     steps: Steps, class_id: Classes, found: LeastCostPath | None, start: int, goal: int
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Mask]:
     """Return the least that a path over each cell can cost, shape (cells,), and whether that is less than ``found`` costs.
 
     ``steps`` are all steps that may be possible, with a cost where it is known; ``class_id`` has shape (rows, cols); ``found`` is the best
     path over known steps; ``start`` and ``goal`` are flat indices of cells.
     """
-    known = np.isfinite(steps.cost)
-    sure = Steps(steps.begin[known], steps.end[known], steps.cost[known], steps.length_m[known], steps.rise_m[known])
-    reduced = sure.cost - (found.potential if found else find_best_potential(sure)) * sure.rise_m
-    of_cell = class_id.reshape(-1)
-    cheap = _find_cheap_by_class(sure, reduced, of_cell)
-    least = np.empty(steps.cost.size)
-    least[known] = reduced
-    least[~known] = (0.5 * (cheap[of_cell[steps.begin]] + cheap[of_cell[steps.end]]) * steps.length_m)[~known]
+    k = found.potential if found else find_best_potential(steps)
+    bounded = steps._replace(bound_per_m=_find_cheap_by_class(steps, k, class_id)[class_id])
     limit = found.reduced_cost * (1.0 - 1e-9) if found else np.inf
-    over = compute_least_costs(steps, least, of_cell.size, start, goal, limit=limit)
+    over = compute_least_costs(bounded, k, start, goal, limit=limit)
     return over, over < limit
 
 
-def _find_cheap_by_class(steps: Steps, reduced: Floats, of_cell: Classes) -> Floats:
-    """Return the cheapest tenth of a metre of each class, shape (256,)."""
-    found = np.full(_CLASSES, np.nan)
-    within, per_m = of_cell[steps.begin], reduced / steps.length_m
-    inside = within == of_cell[steps.end]
-    for number in np.unique(within).tolist():
-        own = per_m[inside & (within == number)]
+def _find_cheap_by_class(steps: Steps, k: float, class_id: Classes) -> NDArray[np.float32]:
+    """Return the cheapest tenth of a metre of each class without the grade, shape (256,)."""
+    per_m = np.full((COURSES, *steps.shape), np.nan, np.float32)
+    for course in range(COURSES):
+        compute_steps_within(steps, k, course, class_id, per_m[course])
+    cheap = np.full(_CLASSES, np.nan, np.float32)
+    for number in np.unique(class_id).tolist():
+        own = per_m[:, class_id == number]
+        own = own[np.isfinite(own)]
         if own.size >= _FEWEST_STEPS:
-            found[number] = max(float(np.quantile(own, _CHEAP)), 0.0)
-    known = found[np.isfinite(found)]
-    return np.where(np.isfinite(found), found, known.min() if known.size else 0.0)
+            cheap[number] = max(float(np.quantile(own, _CHEAP)), 0.0)
+    known = cheap[np.isfinite(cheap)]
+    return np.where(np.isfinite(cheap), cheap, known.min() if known.size else np.float32(0.0))

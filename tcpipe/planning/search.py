@@ -1,4 +1,4 @@
-"""Least-cost paths over a cost grid: scipy's Dijkstra on a sparse graph of 16 courses (ADR-27).
+"""Least-cost paths over a cost grid: Dijkstra and A* on an implicit graph of 16 courses (ADR-27).
 
 The cost of a step is the integral of the cost a metre, along the step's course, over the cells it crosses. Downhill a metre may cost less
 than zero, which Dijkstra forbids. A potential proportional to height removes the grade: c' = c - k (h_b - h_a) changes all paths from a
@@ -6,7 +6,9 @@ start to a goal by the same amount, so the best path stays the best. k maximises
 count as zero, and `LeastCostPath` has their number.
 
 Turns cost ``M |turn|`` beyond those of the model's segments, which were nearly straight: the torque of a skid-steered robot hardly depends
-on its turn rate (ADR-13). Turns take no time here.
+on its turn rate (ADR-13). Turns take no time here. The search with turns has a state for each cell and course. Its bound for A* is the
+exact cost to the goal without turns, which turns can only raise, so that it visits few states and its path is as cheap as that of a full
+search. No step is stored: both searches compute a step's cost when they reach it.
 
 Replacing steps along 16 courses by straight lines where these are cheaper.
 
@@ -18,11 +20,11 @@ never costs more than the steps and crosses no cell that is closed to them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import wrap_to_pi
@@ -31,9 +33,11 @@ from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Classes = NDArray[np.uint8]
 
 _LEAST = 1e-9
-"""Steps that cost nothing cost this: a zero is no edge to scipy."""
+"""Steps that cost nothing cost this, so that no two states precede each other."""
 
 _BINS = 512
 _FLAT = 1e-9
@@ -43,83 +47,127 @@ _STEEPEST_PER_M = 1e5
 _PRECISION = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """All steps between neighbouring cells that can be made.
+class Steps(NamedTuple):
+    """All steps between neighbouring cells, as what their costs are computed from; kernels take it as it is.
 
     Attributes
     ----------
-    begin, end : flat indices of cells, shape (M,).
-    cost : of the step, in the objective's unit, shape (M,); NaN where a cell that it crosses is not predicted.
-    length_m : on the ground [m], shape (M,).
-    rise_m : height of the end above the begin [m], shape (M,).
+    per_metre : cost of a metre in the objective's unit, shape (rows, cols, 16); infinite where a course may not be driven, NaN where it may
+        and no cost is known.
+    height_m : of the cells' middles, shape (rows, cols).
+    bound_per_m : least cost of a metre without the grade, for steps over cells of unknown cost, shape (rows, cols); infinite closes them.
+    length_m : of the step along each course, on the ground [m], shape (16,).
+    crossed : north and east, in cells, of the cells that a step touches, the last one where it ends, shape (16, 4, 2).
+    shares : of the step in each of them, shape (16, 4).
     """
 
-    begin: NDArray[np.int64]
-    end: NDArray[np.int64]
-    cost: Floats
+    per_metre: NDArray[np.float32]
+    height_m: Floats
+    bound_per_m: NDArray[np.float32]
     length_m: Floats
-    rise_m: Floats
+    crossed: Ints
+    shares: Floats
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.per_metre.shape[0], self.per_metre.shape[1]
 
 
 @dataclass(frozen=True, slots=True)
 class LeastCostPath:
     """A least-cost path: flat indices of its cells, its cost, its cost without the grade, and the potential a metre that takes it out."""
 
-    cells: NDArray[np.int64]
+    cells: Ints
     cost: float
     reduced_cost: float
     potential: float
     negative_steps: int
+    """Steps met by the search that give back more than height explains, taken as free."""
 
 
-def make_steps(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: Floats) -> Steps:
+def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[np.bool_], metres: Floats) -> Steps:
     """Return every step along every course.
 
     Parameters
     ----------
-    costs, objective : what a metre costs.
+    costs, per_metre : the cells, and what a metre costs, shape (16, rows, cols).
     open_ : where a course may be driven, shape (16, rows, cols): cells a step only touches at a corner must be open, too.
     metres : ground metres a map metre along each course, shape (16,).
     """
-    rows, cols = costs.grid.rows, costs.grid.cols
-    per_metre = costs.per_metre(objective)
     known_m = costs.height_m[np.isfinite(costs.height_m)]
-    height = np.nan_to_num(costs.height_m.astype(np.float64), nan=float(np.median(known_m)) if known_m.size else 0.0)
-    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats, Floats]] = []
+    merged = np.empty((*costs.height_m.shape, COURSES), np.float32)
     for course in range(COURSES):
-        east, north = MOVES[course].tolist()
-        length_m = float(np.hypot(east, north)) * costs.grid.pixel_size_m * float(metres[course])
-        row0, row1 = max(north, 0), rows + min(north, 0)  # rows run south
-        col0, col1 = max(-east, 0), cols - max(east, 0)
-        if row0 >= row1 or col0 >= col1:
-            continue
-        can = np.ones((row1 - row0, col1 - col0), np.bool_)
-        mean = np.zeros(can.shape)
-        for touch in find_crossed_cells(course):
-            part = (slice(row0 - touch.north, row1 - touch.north), slice(col0 + touch.east, col1 + touch.east))
-            can &= open_[course][part]
-            if touch.share:
-                mean += touch.share * np.where(open_[course][part], per_metre[course][part], 0.0)
-        i, j = np.nonzero(can)
-        begin = (i + row0) * cols + j + col0
-        end = begin - north * cols + east
-        rise = height.reshape(-1)[end] - height.reshape(-1)[begin]
-        parts.append((begin, end, mean[i, j] * length_m, np.full(i.size, length_m), rise))
-    return Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        merged[:, :, course] = np.where(open_[course], per_metre[course], np.inf)
+    crossed, shares = np.zeros((COURSES, 4, 2), np.int64), np.zeros((COURSES, 4))
+    for course in range(COURSES):
+        cells = find_crossed_cells(course)
+        cells = (*cells[:1],) * (4 - len(cells)) + cells
+        crossed[course] = [(cell.north, cell.east) for cell in cells]
+        shares[course] = [cell.share for cell in cells]
+        shares[course, : 4 - len(find_crossed_cells(course))] = 0.0
+    return Steps(
+        merged,
+        np.nan_to_num(costs.height_m.astype(np.float64), nan=float(np.median(known_m)) if known_m.size else 0.0),
+        np.full(costs.height_m.shape, np.inf, np.float32),
+        np.hypot(*MOVES.T) * costs.grid.pixel_size_m * metres,
+        crossed,
+        shares,
+    )
+
+
+@compile_kernel
+def compute_step(steps: Steps, k: float, course: int, row: int, col: int) -> float:
+    """Return the cost of a step without the grade ``k``, from a cell along a course; infinite where it cannot be made."""
+    rows, cols, _ = steps.per_metre.shape
+    row1, col1 = row - steps.crossed[course, 3, 0], col + steps.crossed[course, 3, 1]
+    if row1 < 0 or row1 >= rows or col1 < 0 or col1 >= cols:
+        return np.inf
+    mean = 0.0
+    for touch in range(4):
+        north, east = steps.crossed[course, touch]
+        cost = steps.per_metre[row - north, col + east, course]
+        if cost == np.inf:
+            return np.inf
+        share = steps.shares[course, touch]
+        if share > 0.0:
+            mean += share * cost
+    if mean != mean:  # not known  # noqa: PLR0124
+        return float(0.5 * (steps.bound_per_m[row, col] + steps.bound_per_m[row1, col1]) * steps.length_m[course])
+    return float(mean * steps.length_m[course] - k * (steps.height_m[row1, col1] - steps.height_m[row, col]))
+
+
+@compile_kernel
+def _bin_by_grade(steps: Steps, low: float, high: float, cheapest: Floats) -> tuple[float, float]:
+    """Write the cheapest metre of known steps of each bin of grade from ``low`` to ``high``; return the least and the greatest grade."""
+    rows, cols, courses = steps.per_metre.shape
+    least, greatest = np.inf, -np.inf
+    for row in range(rows):
+        for col in range(cols):
+            for course in range(courses):
+                cost = compute_step(steps, 0.0, course, row, col)
+                if cost < np.inf:
+                    north, east = steps.crossed[course, 3]
+                    rise = steps.height_m[row - north, col + east] - steps.height_m[row, col]
+                    grade = rise / steps.length_m[course]
+                    least, greatest = min(least, grade), max(greatest, grade)
+                    if cheapest.size:
+                        at = min(int((grade - low) / (high - low) * cheapest.size), cheapest.size - 1)
+                        cheapest[at] = min(cheapest[at], cost / steps.length_m[course])
+    return least, greatest
 
 
 def find_best_potential(steps: Steps) -> float:
-    """Return k, the potential a metre of height, that makes the cheapest metre of ``steps`` as dear as can be: a concave search.
+    """Return k, the potential a metre of height, that makes the cheapest metre of known steps as dear as can be: a concave search.
 
     Metres of about the same grade are taken as their cheapest at either end of the bin, so that a step is never dearer than it is.
     """
-    per_m, grade = steps.cost / steps.length_m, steps.rise_m / steps.length_m
-    if not grade.size or float(np.ptp(grade)) < _FLAT:
+    known = steps._replace(bound_per_m=np.full_like(steps.bound_per_m, np.inf))
+    low, high = _bin_by_grade(known, 0.0, 0.0, np.empty(0))
+    if not high - low >= _FLAT:
         return 0.0
-    edges = np.linspace(grade.min(), grade.max(), _BINS + 1)
-    cheapest = np.full(_BINS, np.inf)
-    np.minimum.at(cheapest, np.clip(np.searchsorted(edges, grade, side="right") - 1, 0, _BINS - 1), per_m)
+    edges, cheapest = np.linspace(low, high, _BINS + 1), np.full(_BINS, np.inf)
+    _bin_by_grade(known, low, high, cheapest)
     used = np.isfinite(cheapest)
     grades, costs = np.concatenate([edges[:-1][used], edges[1:][used]]), np.tile(cheapest[used], 2)
     low, high = -_STEEPEST_PER_M, _STEEPEST_PER_M
@@ -129,39 +177,56 @@ def find_best_potential(steps: Steps) -> float:
     return 0.5 * (low + high)
 
 
-def find_least_cost_path(steps: Steps, cells: int, start: int, goal: int) -> LeastCostPath | None:
-    """Return the least-cost path from a cell to another (flat indices of ``cells`` in all); None where there is none."""
-    if not steps.cost.size:
-        return None
-    k = find_best_potential(steps)
-    reduced = steps.cost - k * steps.rise_m
-    negative = int(np.count_nonzero(reduced < 0.0))
-    cost, before = dijkstra(_build_graph(steps, reduced, cells), indices=start, return_predecessors=True)
-    if not np.isfinite(cost[goal]):
-        return None
-    path = [goal]
-    while path[-1] != start:
-        path.append(int(before[path[-1]]))
-    order = np.array(path[::-1])
-    taken = np.isin(steps.begin * cells + steps.end, order[:-1] * cells + order[1:])
-    return LeastCostPath(order, float(steps.cost[taken].sum()), float(cost[goal]), k, negative)
+@compile_kernel
+def _fill_costs(steps: Steps, k: float, cell: int, limit: float, is_back: bool, out: Floats) -> int:  # noqa: FBT001, PLR0917
+    """Write the cost from a cell to each, or back from each to it, to ``out``, (cells,), where it is at most ``limit``; infinite before.
 
-
-def compute_least_costs(steps: Steps, reduced: Floats, cells: int, start: int, goal: int, *, limit: float) -> Floats:
-    """Return what the cheapest path over each cell costs, shape (cells,); infinite where that is more than ``limit``.
-
-    Parameters
-    ----------
-    steps, reduced : all steps, and what each is taken to cost without the grade, shape (M,).
+    Return the number of steps met that are taken as free.
     """
-    graph = _build_graph(steps, reduced, cells)
-    there = dijkstra(graph, indices=start, limit=limit)
-    back = dijkstra(graph.T.tocsr(), indices=goal, limit=limit)
-    return np.asarray(there + back)
+    rows, cols, courses = steps.per_metre.shape
+    negative, sign = 0, -1 if is_back else 1
+    out[cell] = 0.0
+    heap = [(0.0, cell)]
+    while heap:
+        cost, here = heappop(heap)
+        if cost > out[here]:
+            continue
+        if cost > limit:
+            break
+        row, col = here // cols, here % cols
+        for course in range(courses):
+            north, east = sign * steps.crossed[course, 3, 0], sign * steps.crossed[course, 3, 1]
+            row1, col1 = row - north, col + east
+            if row1 < 0 or row1 >= rows or col1 < 0 or col1 >= cols:
+                continue
+            step = compute_step(steps, k, course, row1, col1) if is_back else compute_step(steps, k, course, row, col)
+            negative += step < 0.0
+            there = cost + max(step, _LEAST)
+            if there < out[row1 * cols + col1]:
+                out[row1 * cols + col1] = there
+                heappush(heap, (there, row1 * cols + col1))
+    return negative
 
 
-def _build_graph(steps: Steps, reduced: Floats, cells: int) -> csr_array:
-    return csr_array((np.maximum(reduced, _LEAST), (steps.begin, steps.end)), shape=(cells, cells))
+@compile_kernel
+def _follow(steps: Steps, k: float, to_goal: Floats, start: int, goal: int, path: Ints) -> int:  # noqa: PLR0917
+    """Write the cells of the cheapest path from start to goal to ``path``, by what each cell costs to the goal; return their number."""
+    cols, count, here = steps.per_metre.shape[1], 1, start
+    path[0] = start
+    while here != goal:
+        best, following = np.inf, here
+        row, col = here // cols, here % cols
+        for course in range(steps.length_m.size):
+            step = compute_step(steps, k, course, row, col)
+            if step == np.inf:
+                continue
+            there = here - steps.crossed[course, 3, 0] * cols + steps.crossed[course, 3, 1]
+            if to_goal[there] < to_goal[here] and max(step, _LEAST) + to_goal[there] < best:
+                best, following = max(step, _LEAST) + to_goal[there], there
+        here = following
+        path[count] = here
+        count += 1
+    return count
 
 
 _CLASSES = 256
@@ -202,58 +267,128 @@ def compute_turns(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
     return np.asarray(0.5 * (np.append(change, 0.0) + np.insert(change, 0, 0.0)))
 
 
-Ints = NDArray[np.int64]
-
 _TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))
 """From each course to the next [rad], shape (16,)."""
 
+_STEP, _LEFT, _RIGHT, _START = 1, 2, 3, 4
+"""How a state of the search with turns is reached; 0: not yet."""
 
-def find_least_turning_path(
-    steps: Steps, cols: int, start: int, goal: int, joule_per_rad: Floats
-) -> LeastCostPath | None:
-    """Return the path of least energy with turns, None where there is none.
 
-    ``steps`` cost joules on a grid of ``cols`` columns; ``start`` and ``goal`` are flat indices; ``joule_per_rad`` has shape (cells,).
+@compile_kernel
+def _find_turning(  # noqa: PLR0917
+    steps: Steps, k: float, joule_per_rad: Floats, class_id: Classes, turns_rad: Floats,
+    to_goal: Floats, start: int, goal: int, labels: Floats, arrived: NDArray[np.int8],
+) -> int:  # fmt: skip
+    """Find the least cost with turns by A*; return the last state, a cell times 16 plus a course, or -1.
+
+    ``labels`` and ``arrived``, (16 · cells,), are the cost of each state that is reached, and how it was; both are zeros before: pages
+    that nothing writes to take no memory.
     """
-    cells, place = np.unique(np.concatenate([steps.begin, steps.end]), return_inverse=True)
-    if not np.isin([start, goal], cells).all():
-        return None
-    first, end = np.split(place, 2)
-    k = find_best_potential(steps)
-    reduced = steps.cost - k * steps.rise_m
-    course = _find_courses(steps, cols)
-    node, there = first * COURSES + course, end * COURSES + course
-    here = np.arange(len(cells) * COURSES)
-    following = here - here % COURSES + (here + 1) % COURSES
-    turn = np.tile(_TURNS_RAD, len(cells)) * np.repeat(joule_per_rad[cells], COURSES)
-    graph = csr_array(
-        (
-            np.maximum(np.concatenate([reduced, turn, turn]), _LEAST),
-            (np.concatenate([node, here, following]), np.concatenate([there, following, here])),
-        ),
-        shape=(len(here), len(here)),
+    cols, courses = steps.per_metre.shape[1:]
+    heap = [(to_goal[start], start * courses + course) for course in range(courses)]
+    for _, state in heap:
+        labels[state], arrived[state] = 0.0, _START
+    while heap:
+        key, state = heappop(heap)
+        cell, course = state // courses, state % courses
+        cost = labels[state]
+        if key > cost + to_goal[cell]:
+            continue
+        if cell == goal:
+            return int(state)
+        per_rad = joule_per_rad[class_id[cell]]
+        for way in (_STEP, _LEFT, _RIGHT):
+            if way == _STEP:
+                step = compute_step(steps, k, course, cell // cols, cell % cols)
+                if step == np.inf:
+                    continue
+                into = cell - steps.crossed[course, 3, 0] * cols + steps.crossed[course, 3, 1]
+                other = into * courses + course
+            else:
+                step = per_rad * (turns_rad[course] if way == _LEFT else turns_rad[course - 1])
+                into, other = cell, cell * courses + (course + (1 if way == _LEFT else -1)) % courses
+            there = cost + max(step, _LEAST)
+            if arrived[other] == 0 or there < labels[other]:
+                labels[other], arrived[other] = there, way
+                heappush(heap, (there + to_goal[into], other))
+    return -1
+
+
+@compile_kernel
+def _sum_steps(steps: Steps, k: float, cells: Ints) -> tuple[float, float]:
+    """Return the cost of the steps between cells, and what the search takes it to be without the grade."""
+    cols, total, reduced = steps.per_metre.shape[1], 0.0, 0.0
+    for at in range(cells.size - 1):
+        for course in range(steps.length_m.size):
+            if cells[at + 1] - cells[at] == steps.crossed[course, 3, 1] - steps.crossed[course, 3, 0] * cols:
+                row, col = cells[at] // cols, cells[at] % cols
+                total += compute_step(steps, 0.0, course, row, col)
+                reduced += max(compute_step(steps, k, course, row, col), _LEAST)
+                break
+    return total, reduced
+
+
+def find_least_cost_paths(  # noqa: PLR0917
+    steps: Steps, k: float, start: int, goal: int, turning: Turning | None = None, class_id: Classes | None = None
+) -> tuple[LeastCostPath, ...]:
+    """Return the least-cost path from a cell to another (flat indices); nothing where there is none.
+
+    ``k`` is the potential. With what turns cost, and the class of each cell, shape (rows, cols), the path of least energy with turns
+    comes first.
+    """
+    to_goal = np.full(steps.height_m.size, np.inf)
+    negative = _fill_costs(steps, k, goal, np.inf, True, to_goal)
+    if not np.isfinite(to_goal[start]):
+        return ()
+    cells = np.empty(to_goal.size, np.int64)
+    cells = cells[: _follow(steps, k, to_goal, start, goal, cells)].copy()
+    plain = LeastCostPath(cells, _sum_steps(steps, k, cells)[0], float(to_goal[start]), k, negative)
+    if turning is None or class_id is None:
+        return (plain,)
+    labels, arrived = np.zeros(COURSES * to_goal.size), np.zeros(COURSES * to_goal.size, np.int8)
+    joule_per_rad = turning.joule_per_rad
+    last = _find_turning(
+        steps, k, joule_per_rad, class_id.reshape(-1), _TURNS_RAD, to_goal, start, goal, labels, arrived
     )
-    ends = [int(np.searchsorted(cells, of)) * COURSES + np.arange(COURSES) for of in (start, goal)]
-    cost, before, _ = dijkstra(graph, indices=ends[0], return_predecessors=True, min_only=True)
-    last = int(ends[1][np.argmin(cost[ends[1]])])
-    if not np.isfinite(cost[last]):
-        return None
-    nodes = [last]
-    while before[nodes[-1]] >= 0:
-        nodes.append(int(before[nodes[-1]]))
-    visited = cells[np.array(nodes[::-1]) // COURSES]
-    order = visited[np.append(True, np.diff(visited) != 0)]
-    taken = np.isin(steps.begin * len(joule_per_rad) + steps.end, order[:-1] * len(joule_per_rad) + order[1:])
-    total = float(cost[last] + k * steps.rise_m[taken].sum())
-    return LeastCostPath(order, total, float(cost[last]), k, int(np.count_nonzero(reduced < 0.0)))
+    cells = _trace_back(last, arrived, steps)
+    total, reduced = _sum_steps(steps, k, cells)
+    cost = float(labels[last])
+    return LeastCostPath(cells, cost - reduced + total, cost, k, negative), plain
 
 
-def _find_courses(steps: Steps, cols: int) -> Ints:
-    """Return the course of each step, shape (M,); rows run south."""
-    (row0, col0), (row1, col1) = np.divmod(steps.begin, cols), np.divmod(steps.end, cols)
-    table = np.zeros((5, 5), np.int64)
-    table[MOVES[:, 0] + 2, MOVES[:, 1] + 2] = np.arange(COURSES)
-    return np.asarray(table[col1 - col0 + 2, row0 - row1 + 2])
+def _trace_back(state: int, arrived: NDArray[np.int8], steps: Steps) -> Ints:
+    """Return the cells of the path to a state of the search with turns."""
+    moves = (steps.crossed[:, 3, 1] - steps.crossed[:, 3, 0] * steps.shape[1]).tolist()
+    cells = [state // COURSES]
+    while (way := int(arrived[state])) != _START:
+        cell, course = divmod(state, COURSES)
+        if way == _STEP:
+            cells.append(cell - moves[course])
+            state = cells[-1] * COURSES + course
+        else:
+            state = cell * COURSES + (course + (-1 if way == _LEFT else 1)) % COURSES
+    return np.array(cells[::-1])
+
+
+def compute_least_costs(steps: Steps, k: float, start: int, goal: int, *, limit: float) -> Floats:
+    """Return what the cheapest path over each cell costs without the grade, shape (cells,); infinite where that is more than ``limit``."""
+    there, back = np.full((2, steps.height_m.size), np.inf)
+    _fill_costs(steps, k, start, limit, False, there)
+    _fill_costs(steps, k, goal, limit, True, back)
+    return np.asarray(there + back)
+
+
+@compile_kernel
+def compute_steps_within(steps: Steps, k: float, course: int, class_id: Classes, out: NDArray[np.float32]) -> None:
+    """Write the cost of a metre without the grade of each known step along a course that stays in one class; both (rows, cols)."""
+    rows, cols = out.shape
+    for row in range(rows):
+        for col in range(cols):
+            cost = compute_step(steps, k, course, row, col)
+            if cost < np.inf:
+                north, east = steps.crossed[course, 3]
+                if class_id[row, col] == class_id[row - north, col + east]:
+                    out[row, col] = cost / steps.length_m[course]
 
 
 SAMPLES_A_CELL = 4
@@ -261,26 +396,19 @@ SAMPLES_A_CELL = 4
 
 @compile_kernel
 def find_best_lines(  # noqa: PLR0917
-    per_metre: NDArray[np.float32],
-    open_: NDArray[np.bool_],
-    angles: NDArray[np.float64],
-    metres: NDArray[np.float64],
-    points: NDArray[np.float64],
-    window: int,
-    so_far: NDArray[np.float64],
-    before: NDArray[np.int64],
+    steps: Steps, angles: Floats, metres: Floats, points: Floats, window: int, so_far: Floats, before: Ints
 ) -> None:
     """Write the cost from the first point to each point of a path, and where its last line begins, to ``so_far`` and ``before``, (P,).
 
-    ``per_metre`` and ``open_`` have shape (16, rows, cols). ``angles``, (16,), are the courses [rad], counter-clockwise from the grid's
-    east, rising from 0; ``metres``, (16,), the ground metres a cell along each. ``points`` [cells] are as in `straighten_path`. A line
-    begins at most ``window`` points earlier; a line between neighbours is a step of the path and always allowed.
+    ``angles``, (16,), are the courses [rad], counter-clockwise from the grid's east, rising from 0; ``metres``, (16,), the ground metres
+    of a cell's side along each. ``points`` [cells] are as in `straighten_path`. A line begins at most ``window`` points earlier; a line
+    between neighbours is a step of the path and always allowed.
     """
     so_far[0], before[0] = 0.0, 0
     for j in range(1, points.shape[0]):
         so_far[j] = np.inf
         for i in range(max(j - window, 0), j):
-            cost = so_far[i] + _compute_line_cost(per_metre, open_, angles, metres, points[i], points[j], i == j - 1)
+            cost = so_far[i] + _compute_line_cost(steps.per_metre, angles, metres, points[i], points[j], i == j - 1)
             if cost < so_far[j] - 1e-9 * abs(so_far[j]) or (so_far[j] == np.inf and cost < np.inf):
                 so_far[j], before[j] = cost, i
 
@@ -288,11 +416,10 @@ def find_best_lines(  # noqa: PLR0917
 @compile_kernel
 def _compute_line_cost(  # noqa: PLR0917
     per_metre: NDArray[np.float32],
-    open_: NDArray[np.bool_],
-    angles: NDArray[np.float64],
-    metres: NDArray[np.float64],
-    begin: NDArray[np.float64],
-    end: NDArray[np.float64],
+    angles: Floats,
+    metres: Floats,
+    begin: Floats,
+    end: Floats,
     is_step: bool,  # noqa: FBT001
 ) -> float:
     """Return the cost of a straight line, of its course by interpolation between the two nearest; infinite where it may not be driven."""
@@ -306,62 +433,50 @@ def _compute_line_cost(  # noqa: PLR0917
     gap = (angles[high] - angles[low]) % (2.0 * np.pi)
     share = ((angle - angles[low]) % (2.0 * np.pi)) / gap
     count = int(np.ceil(length * SAMPLES_A_CELL))
-    total = 0.0
+    total, known = 0.0, 0
     for k in range(count):
         t = (k + 0.5) / count
         col = int(np.floor(begin[0] + t * east + 0.5))
         row = int(np.floor(begin[1] - t * north + 0.5))
-        if not is_step and (
-            (share < 0.999 and not open_[low, row, col]) or (share > 0.001 and not open_[high, row, col])
-        ):
+        a, b = per_metre[row, col, low], per_metre[row, col, high]
+        if not is_step and ((share < 0.999 and a == np.inf) or (share > 0.001 and b == np.inf)):
             return np.inf
-        a, b = per_metre[low, row, col], per_metre[high, row, col]
-        if a != a:  # not known  # noqa: PLR0124
+        if not np.isfinite(a):
             a = b
-        if b != b:  # noqa: PLR0124
+        if not np.isfinite(b):
             b = a
-        total += (1.0 - share) * a + share * b
-    if total != total:  # a step from ground of which nothing is known  # noqa: PLR0124
+        if np.isfinite(a):  # an end that is not in the middle of its cell may touch a cell that the step does not
+            total += (1.0 - share) * a + share * b
+            known += 1
+    if not known:
         return np.inf
     scale = (1.0 - share) * metres[low] + share * metres[high]
-    return float(total / count * length * scale)
+    return float(total / known * length * scale)
 
 
-_MOST_SAMPLES = 3e8
+_MOST_SAMPLES = 3e7
 _PASSES = 4
 
 
-def straighten_path(
-    costs: CostGrid,
-    objective: str,
-    open_: NDArray[np.bool_],
-    metres: NDArray[np.float64],
-    points_px: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
-    """Return the points that remain, and the cost of the path over them.
+def straighten_path(steps: Steps, points_px: Floats) -> Floats:
+    """Return the points of the cheapest path of straight lines between points of a path.
 
-    Parameters
-    ----------
-    costs, objective : what a metre costs.
-    open_ : where a course may be driven, shape (16, rows, cols).
-    metres : ground metres a map metre along each course, shape (16,).
-    points_px : the path's points [cells], centres are integers, shape (P, 2).
+    ``points_px`` are the path's points [cells], centres are integers, shape (P, 2).
     """
-    per_metre = costs.per_metre(objective).astype(np.float32, copy=False)
-    angles, scale = np.radians(ANGLES_DEG), metres * costs.grid.pixel_size_m
-    limit = np.array([costs.grid.cols, costs.grid.rows]) - 0.5 - 1e-9
-    points, cost = np.clip(points_px, -0.5, limit), np.inf
+    angles, metres = np.radians(ANGLES_DEG), steps.length_m / np.hypot(*MOVES.T)
+    limit = np.array(steps.shape[::-1]) - 0.5 - 1e-9
+    points = np.clip(points_px, -0.5, limit)
     for _ in range(_PASSES):
         so_far, before = np.empty(len(points)), np.zeros(len(points), np.int64)
-        find_best_lines(per_metre, open_, angles, scale, points, _choose_window(points), so_far, before)
+        find_best_lines(steps, angles, metres, points, _choose_window(points), so_far, before)
         kept = [len(points) - 1]
         while kept[-1]:
             kept.append(int(before[kept[-1]]))
         unchanged = len(kept) == len(points)
-        points, cost = points[kept[::-1]], float(so_far[-1])
+        points = points[kept[::-1]]
         if unchanged:
             break
-    return points, cost
+    return points
 
 
 def _choose_window(points: NDArray[np.float64]) -> int:

@@ -113,17 +113,6 @@ def test_a_plan_is_found_once_and_again_when_its_picture_is_gone(source, tmp_pat
     assert found["complete"]
 
 
-def test_a_plan_that_another_beats_says_so(source, tmp_path):
-    request = _request(source, cell_size_m=2.0)
-    found = plan(MODEL, source, request, out=tmp_path / "plan.geojson", picture=tmp_path / "plan.png")
-    assert "objective-missed" not in str(found)
-    energy = found.plans["energy"]
-    dear = replace(energy, energy_joule=1.1 * energy.energy_joule)
-    told = str(replace(found, plans={**found.plans, "energy": dear}))
-    assert "takes less energy" in told
-    assert "Choose a smaller --cell-size" in told
-
-
 def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(source, tmp_path):
     costs = tmp_path / "costs"
     make_cost_map(MODEL, source, costs, cell_size_m=2.0)

@@ -11,7 +11,8 @@ from planning_worlds import lonlat, plane
 from tcpipe.errors import PathError
 from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.picture import draw_plans
-from tcpipe.planning.plan import OBJECTIVES, plan_path
+from tcpipe.planning.plan import OBJECTIVES, plan_paths
+from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import ClassTable, TerrainClass
 
 MODEL = PhysicsModel()
@@ -19,7 +20,7 @@ MODEL = PhysicsModel()
 
 def _plan(source, start, goal, objective, *, model=MODEL, survey=None, **options):
     ends = lonlat(source, start, goal)
-    return plan_path(survey or make_survey(model, source, 1.0), ends[0], ends[1], objective, **options)
+    return plan_paths(survey or make_survey(model, source, 1.0), ends[0], ends[1], (objective,), **options)[objective]
 
 
 def _wall(east, north):
@@ -67,6 +68,26 @@ def test_the_fast_road_is_taken_for_time_and_the_ellipse_grows_to_find_it():
     )
 
 
+def test_no_other_plan_takes_less_of_what_a_plan_is_the_least_of():
+    """Also where the judge sees what the cells do not: borders of classes within a cell, and turns of one path segment."""
+    ground = lambda east, north: 4 + (np.sin(east * 0.9) + np.sin(north * 0.7 + 0.2 * east) > 0.5) * 2  # noqa: E731
+    source, rng = plane(40.0, classes=ground, rise_north=0.1, pixel_size_m=0.2), np.random.default_rng(1)
+    term = PhysicsTerm("turning", "all", 300.0, 5.0, "W s/rad")
+    fit = PhysicsFit(500, (term,), {}, 0.4, 8.0, {}, None, None, 0.05, None)
+    model = replace(MODEL, physics=fit, patch_px=8)
+    survey = make_survey(model, source, 2.0)
+    survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
+    for _ in range(4):
+        ends = lonlat(source, (4.0, rng.uniform(4.0, 36.0)), (36.0, rng.uniform(4.0, 36.0)))
+        plans = plan_paths(survey, *ends, OBJECTIVES)
+        alone = plan_paths(survey, *ends, ("time",))["time"].totals
+        taken = {name: (of.totals.energy_joule, of.totals.duration_s, of.totals.length_m) for name, of in plans.items()}
+        least = [min(column) for column in zip(*taken.values(), strict=True)]
+        assert [taken[name][at] for at, name in enumerate(OBJECTIVES)] == least
+        assert alone.duration_s == plans["time"].totals.duration_s
+        assert plans["energy"].totals.finalists >= 4
+
+
 def test_looking_at_less_of_the_map_finds_the_same_path():
     source = plane(36.0, classes=_road, rise_east=0.05)
     whole = make_survey(MODEL, source, 1.0)
@@ -108,7 +129,7 @@ def test_ends_that_cannot_be_used_are_named_together():
         _plan(source, (1.0, 4.0), (4.0, 4.0), "time", survey=make_survey(MODEL, source, 5.0))
     swapped = lonlat(source, (4.0, 4.0), (26.0, 4.0))[:, ::-1]
     with pytest.raises(PathError, match="axes look swapped") as error:
-        plan_path(make_survey(MODEL, source, 1.0), swapped[0], swapped[1], "time")
+        plan_paths(make_survey(MODEL, source, 1.0), swapped[0], swapped[1], ("time",))
     assert len(error.value.problems) == 2
 
 

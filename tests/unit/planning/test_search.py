@@ -20,14 +20,13 @@ from tcpipe.planning.cost_grid import (
     make_survey,
 )
 from tcpipe.planning.path_cost import compute_path_cost
-from tcpipe.planning.plan import find_possible_gain, plan_path, probe_cells
+from tcpipe.planning.plan import find_possible_gain, plan_paths, probe_cells
 from tcpipe.planning.search import (
-    Steps,
+    Turning,
     compute_least_costs,
     compute_turns,
     find_best_potential,
-    find_least_cost_path,
-    find_least_turning_path,
+    find_least_cost_paths,
     find_turning,
     make_steps,
 )
@@ -80,8 +79,12 @@ def _grid(power, velocity, height):
     )
 
 
-def _by_hand(costs, objective, open_, start):
-    """Bellman-Ford with every step written out."""
+def _steps(costs, objective, open_):
+    return make_steps(costs, costs.per_metre(objective), open_, METRES)
+
+
+def _list_steps(costs, objective, open_):
+    """Return begin, end, course and cost of every step, written out."""
     rows, cols = costs.grid.rows, costs.grid.cols
     per_metre, edges = costs.per_metre(objective).astype(float), []
     for course in range(COURSES):
@@ -91,45 +94,94 @@ def _by_hand(costs, objective, open_, start):
                 cells = [(row - t.north, col + t.east, t.share) for t in find_crossed_cells(course)]
                 if all(0 <= r < rows and 0 <= c < cols and open_[course, r, c] for r, c, _ in cells):
                     cost = np.hypot(east, north) * sum(s * per_metre[course, r, c] for r, c, s in cells if s)
-                    edges.append((row * cols + col, (row - north) * cols + col + east, cost))
-    best = np.full(rows * cols, np.inf)
-    best[start] = 0.0
-    for _ in range(rows * cols):
+                    edges.append((row * cols + col, (row - north) * cols + col + east, course, cost))
+    return edges
+
+
+def _bellman_ford(edges, count, starts):
+    """Return the least cost of each of ``count`` states; ``edges`` are begin, end and cost."""
+    begin, end, cost = (np.array(column) for column in zip(*edges, strict=True))
+    best = np.full(count, np.inf)
+    best[starts] = 0.0
+    for _ in range(count):
         before = best.copy()
-        for a, b, cost in edges:
-            best[b] = min(best[b], best[a] + cost)
+        np.minimum.at(best, end, best[begin] + cost)
         if np.array_equal(before, best):
             break
     return best
 
 
+def _by_hand(costs, objective, open_, start):
+    edges = _list_steps(costs, objective, open_)
+    return _bellman_ford([(0, 0, 0.0), *((a, b, cost) for a, b, _, cost in edges)], open_[0].size, [start])
+
+
+RANDOM_POWER = arrays.arrays(float, (COURSES, 5, 6), elements=st.floats(20.0, 300.0))
+SOME_FREE = arrays.arrays(bool, (5, 6), elements=st.sampled_from([True, True, True, False]))
+
+
 @settings(max_examples=25)
-@given(
-    arrays.arrays(float, (COURSES, 5, 6), elements=st.floats(20.0, 300.0)),
-    arrays.arrays(bool, (5, 6), elements=st.sampled_from([True, True, True, False])),
-)
+@given(RANDOM_POWER, SOME_FREE)
 def test_paths_are_as_cheap_as_can_be_round_any_obstacles(power, free):
     costs = _grid(power, 0.8, np.zeros((5, 6)))
     open_ = np.broadcast_to(free, (COURSES, 5, 6))
-    found = find_least_cost_path(make_steps(costs, "energy", open_, METRES), 30, 0, 29)
+    paths = find_least_cost_paths(_steps(costs, "energy", open_), 0.0, 0, 29)
     best = _by_hand(costs, "energy", open_, 0)[29]
-    if found is None:
+    if not paths:
         assert np.isinf(best)
     else:
-        assert found.cost == pytest.approx(best, rel=1e-6)
-        assert free.reshape(-1)[found.cells].all()
+        assert paths[0].cost == pytest.approx(best, rel=1e-9)
+        assert free.reshape(-1)[paths[0].cells].all()
+
+
+@settings(max_examples=25)
+@given(
+    RANDOM_POWER, SOME_FREE, arrays.arrays(np.uint8, (5, 6), elements=st.integers(4, 6)), st.sampled_from([0, 9, 400])
+)
+def test_paths_with_turns_are_as_cheap_as_those_of_a_full_search_of_cells_and_courses(power, free, class_id, dear):
+    joule_per_rad = np.zeros(256)
+    joule_per_rad[4:7] = dear * np.array([1.0, 0.5, 2.0])
+    costs, open_ = _grid(power, 0.8, np.zeros((5, 6))), np.broadcast_to(free, (COURSES, 5, 6))
+    angle = np.arctan2(MOVES[:, 1], MOVES[:, 0])
+    edges = [(a * 16 + course, b * 16 + course, cost) for a, b, course, cost in _list_steps(costs, "energy", open_)]
+    for cell in range(30):
+        for course in range(COURSES):
+            for other in ((course + 1) % COURSES, (course - 1) % COURSES):
+                turn = np.abs(np.angle(np.exp(1j * (angle[other] - angle[course]))))
+                edges.append((cell * 16 + course, cell * 16 + other, turn * joule_per_rad[class_id.flat[cell]]))
+    best = _bellman_ford(edges, 480, np.arange(16))[29 * 16 :].min()
+    paths = find_least_cost_paths(_steps(costs, "energy", open_), 0.0, 0, 29, Turning(joule_per_rad, 0.0), class_id)
+    if not paths:
+        assert np.isinf(best)
+    else:
+        assert paths[0].cost == pytest.approx(best, rel=1e-9, abs=1e-6)
+        assert paths[1].cost <= paths[0].cost + 1e-6
+        turned = np.abs(np.diff(np.unwrap([angle[course] for course in _find_courses(paths[0].cells, 6)])))
+        driven = _sum_edges(paths[0].cells, _list_steps(costs, "energy", open_))
+        where = joule_per_rad[class_id.flat[paths[0].cells[1:-1]]]
+        assert paths[0].cost == pytest.approx(driven + (turned * where).sum(), rel=1e-9, abs=1e-6)
+
+
+def _find_courses(cells, cols):
+    row, col = np.divmod(cells, cols)
+    moves = {tuple(move): course for course, move in enumerate(MOVES.tolist())}
+    return [moves[east, -south] for east, south in zip(np.diff(col).tolist(), np.diff(row).tolist(), strict=True)]
+
+
+def _sum_edges(cells, edges):
+    cost = {(a, b): cost for a, b, _, cost in edges}
+    return sum(cost[a, b] for a, b in zip(cells[:-1].tolist(), cells[1:].tolist(), strict=True))
 
 
 @settings(max_examples=15)
-@given(arrays.arrays(float, (COURSES, 5, 6), elements=st.floats(20.0, 300.0)))
+@given(RANDOM_POWER)
 def test_the_least_over_a_cell_is_the_way_there_and_on_from_there(power):
     costs, open_ = _grid(power, 0.8, np.zeros((5, 6))), np.ones((COURSES, 5, 6), bool)
-    steps = make_steps(costs, "energy", open_, METRES)
-    over = compute_least_costs(steps, steps.cost, 30, 0, 29, limit=np.inf)
+    over = compute_least_costs(_steps(costs, "energy", open_), 0.0, 0, 29, limit=np.inf)
     there = _by_hand(costs, "energy", open_, 0)
     for cell in (3, 14, 29):
-        assert over[cell] == pytest.approx(there[cell] + _by_hand(costs, "energy", open_, cell)[29], rel=1e-6)
-    assert over.min() == pytest.approx(there[29], rel=1e-6)
+        assert over[cell] == pytest.approx(there[cell] + _by_hand(costs, "energy", open_, cell)[29], rel=1e-9)
+    assert over.min() == pytest.approx(there[29], rel=1e-9)
 
 
 def test_no_cell_of_a_better_path_is_left_out_and_the_rest_need_not_be_asked_about():
@@ -138,14 +190,12 @@ def test_no_cell_of_a_better_path_is_left_out_and_the_rest_need_not_be_asked_abo
     class_id = np.where(rng.random((6, 5)) < 0.4, 5, 4).astype(np.uint8).repeat(4, axis=0).repeat(6, axis=1)
     power = np.where(class_id == 5, 150.0, 80.0) * rng.uniform(1.0, 1.02, (COURSES, *shape))
     open_, start, goal = np.ones((COURSES, *shape), bool), 10 * 30 + 4, 14 * 30 + 25
-    whole = make_steps(_grid(power, 1.0, np.zeros(shape)), "energy", open_, METRES)
-    best = find_least_cost_path(whole, class_id.size, start, goal)
+    whole = _grid(power, 1.0, np.zeros(shape))
+    best = find_least_cost_paths(_steps(whole, "energy", open_), 0.0, start, goal)[0]
     predicted = probe_cells(class_id, open_[0])
     predicted[9:16, 3:27] = True
-    steps = make_steps(_grid(np.where(predicted, power, np.nan), 1.0, np.zeros(shape)), "energy", open_, METRES)
-    found = find_least_cost_path(
-        make_steps(_grid(power, 1.0, np.zeros(shape)), "energy", open_ & predicted, METRES), class_id.size, start, goal
-    )
+    steps = _steps(_grid(np.where(predicted, power, np.nan), 1.0, np.zeros(shape)), "energy", open_)
+    found = find_least_cost_paths(_steps(whole, "energy", open_ & predicted), 0.0, start, goal)[0]
     over, better = find_possible_gain(steps, class_id, found, start, goal)
     assert found.cost > best.cost
     unknown = best.cells[~predicted.reshape(-1)[best.cells]]
@@ -166,27 +216,23 @@ def test_probes_meet_every_class_that_can_be_driven():
 def test_downhill_energy_that_comes_back_does_not_mislead_the_search():
     """Friction and the whole grade, which downhill is less than nothing: the potential takes it out, and the best path is found."""
     rng = np.random.default_rng(3)
-    height = np.cumsum(np.cumsum(rng.normal(0.0, 0.06, (7, 8)), axis=0), axis=1)
-    friction = rng.uniform(20.0, 60.0, (7, 8))
-    steps = make_steps(_grid(1.0, 1.0, height), "distance", np.ones((COURSES, 7, 8), bool), METRES)
-    middle = (friction.reshape(-1)[steps.begin] + friction.reshape(-1)[steps.end]) / 2.0
-    cost = middle * steps.length_m + 600.0 * steps.rise_m
-    assert cost.min() < 0.0
-    steps = type(steps)(steps.begin, steps.end, cost, steps.length_m, steps.rise_m)
-    found = find_least_cost_path(steps, 56, 0, 55)
-    best = np.full(56, np.inf)
-    best[0] = 0.0
-    for _ in range(56):
-        np.minimum.at(best, steps.end, best[steps.begin] + cost)
-    assert found.cost == pytest.approx(best[55], rel=1e-9)
+    row, col = np.mgrid[:7, :8]
+    friction, open_ = rng.uniform(20.0, 60.0, (7, 8)), np.ones((COURSES, 7, 8), bool)
+    grade = DIRECTIONS @ [0.1, -0.15]
+    costs = _grid(friction + 600.0 * grade[:, None, None], 1.0, 0.1 * col + 0.15 * row)
+    assert costs.power_watt.min() < 0.0
+    steps = _steps(costs, "energy", open_)
+    k = find_best_potential(steps)
+    found = find_least_cost_paths(steps, k, 0, 55)[0]
+    assert found.cost == pytest.approx(_by_hand(costs, "energy", open_, 0)[55], rel=1e-9)
     assert found.negative_steps == 0
-    assert find_best_potential(steps) == pytest.approx(600.0, rel=0.1)
+    assert k == pytest.approx(600.0, rel=0.1)
 
 
 def test_what_gives_back_more_than_it_was_lifted_for_is_counted():
-    steps = make_steps(_grid(-50.0, 1.0, np.zeros((4, 4))), "energy", np.ones((COURSES, 4, 4), bool), METRES)
-    found = find_least_cost_path(steps, 16, 0, 15)
-    assert found.negative_steps == steps.cost.size
+    costs, open_ = _grid(-50.0, 1.0, np.zeros((4, 4))), np.ones((COURSES, 4, 4), bool)
+    found = find_least_cost_paths(_steps(costs, "energy", open_), 0.0, 0, 15)[0]
+    assert found.negative_steps == len(_list_steps(costs, "energy", open_))
     assert found.cost < 0.0
 
 
@@ -245,53 +291,6 @@ def test_a_circle_turns_once_round_however_fine_it_is_cut():
         assert turned == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / count))
 
 
-def steps_on_open_ground(size, cost_per_cell=1.0):
-    """Every step of 16 courses on a square grid without slopes."""
-    from tcpipe.planning.cost_grid import MOVES
-
-    rows, cols = np.mgrid[:size, :size]
-    parts = []
-    for east, north in MOVES.tolist():
-        row, col = rows - north, cols + east
-        inside = (row >= 0) & (row < size) & (col >= 0) & (col < size)
-        begin, end = (rows * size + cols)[inside], (row * size + col)[inside]
-        parts.append((begin, end, np.full(begin.size, cost_per_cell * np.hypot(east, north))))
-    begin, end, costs = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Steps(begin, end, costs, costs / cost_per_cell, np.zeros(len(costs)))
-
-
-def test_free_turns_are_the_search_without_them():
-    steps = steps_on_open_ground(12)
-    plain = find_least_cost_path(steps, 144, 0, 12 * 9 + 7)
-    turning = find_least_turning_path(steps, 12, 0, 12 * 9 + 7, np.zeros(144))
-    assert turning.cost == pytest.approx(plain.cost, abs=1e-6)
-
-
-def test_turns_add_up_along_the_path():
-    """From corner to corner of a wall's end: by hand, the straight way is shut, and every way round turns."""
-    size = 9
-    steps = steps_on_open_ground(size)
-    wall = (
-        {row * size + 4 for row in range(6)}
-        | {row * size + 3 for row in range(6)}
-        | {row * size + 5 for row in range(6)}
-    )
-    open_ = np.array([b not in wall and e not in wall for b, e in zip(steps.begin, steps.end, strict=True)])
-    steps = Steps(*(getattr(steps, name)[open_] for name in Steps.__slots__))
-    start, goal = 0, size - 1
-    cheap = find_least_turning_path(steps, size, start, goal, np.full(size * size, 0.01))
-    dear = find_least_turning_path(steps, size, start, goal, np.full(size * size, 50.0))
-
-    def turned(found):
-        row, col = np.divmod(found.cells, size)
-        course = np.unwrap(np.arctan2(-np.diff(row), np.diff(col)))
-        return np.abs(np.diff(course)).sum()
-
-    assert turned(dear) <= turned(cheap) + 1e-9
-    length = np.hypot(*np.array([np.diff(of) for of in np.divmod(dear.cells, size)])).sum()
-    assert dear.cost == pytest.approx(length + 50.0 * turned(dear), rel=1e-6)
-
-
 def slalom(east, north):
     """Cheap grass in a zigzag through paved ground that costs more."""
     return np.where(np.abs(north - 12.0 - 5.0 * np.sign(np.sin(east * 0.7)) * 0.5) < 2.0, 4, 5)
@@ -303,7 +302,7 @@ def test_a_plan_that_pays_for_turns_turns_less():
     for name, fit in (("free", None), ("dear", physics(all=2000.0))):
         model = replace(PhysicsModel(), physics=fit)
         ends = lonlat(source, (2.0, 12.0), (28.0, 12.0))
-        found[name] = plan_path(make_survey(model, source, 1.0), ends[0], ends[1], "energy")
+        found[name] = plan_paths(make_survey(model, source, 1.0), ends[0], ends[1], ("energy",))["energy"]
     assert found["dear"].totals.turn_rad <= found["free"].totals.turn_rad
     # Judged alike, turns included, the plan that knew of them is no dearer.
     lines = {name: plan.lonlat_deg for name, plan in found.items()}
