@@ -1,6 +1,6 @@
 """What a layer of the user's own is worth: RMSE of E and T on drives that were not fitted, with it, with noise, and without.
 
-    python benchmarks/own_layers.py OUT [--drives 8] [--hidden-variance 4] [--bands 8] [--kinds boosting]
+    python benchmarks/own_layers.py OUT [--drives 12] [--hidden-variance 4] [--bands 8] [--kinds boosting]
 
 The small simulated site has a rolling resistance that no raster shows. `informed` has bands that are mixtures of it and of two fields that
 cost nothing; `noise` has as many random bands. Both are rasters of 0.5 m, added with ``add-map --layer``; whole drives are held out.
@@ -62,7 +62,7 @@ def build(out: Path, drives: int, variance: float, bands: int) -> Path:
             rasters[name], lambda first, last, of=values: of[:, first:last], rows=values.shape[1], cols=values.shape[2],
             affine=affine, crs=f"EPSG:{world.epsg}", dtype="float32", bands=bands,
         )  # fmt: skip
-    recipe = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="run"))
+    recipe = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="run", test_fraction=0.34))
     store = out / "store"
     ingest(site.logs, store=store, recipe=recipe)
     paper = {name: site.rasters[name] for name in (*PAPER, "classes")}
@@ -73,9 +73,13 @@ def build(out: Path, drives: int, variance: float, bands: int) -> Path:
 
 def measure(dataset: Path, out: Path, kind: str, more: tuple[str, ...]) -> str:
     """Train with some layers and return the errors on the held-out drives."""
-    config = FitConfig(model=kind, layers=(*PAPER, *more), epochs=40, patience=8, learning_rate=1e-3, width=16)
+    data = open_dataset(dataset)
+    fold = int(data["train"].column("fold").min())
+    config = FitConfig(
+        model=kind, layers=(*PAPER, *more), fold=fold, epochs=40, patience=8, learning_rate=1e-3, width=16
+    )
     train(dataset, out, config=config)
-    model, held = load_model(out), open_dataset(dataset)["test"]
+    model, held = load_model(out), data["test"]
     said = model.predict(held.with_layout(model.card.layout).patches, read_extra_features(held))
     told, true = (compute_costs(*of.astype(float).T, 1.0) for of in (said, held.labels))
     energy, time = (float(np.sqrt(np.mean((told[name] - true[name]) ** 2))) for name in ("E", "T"))
@@ -87,7 +91,7 @@ def measure(dataset: Path, out: Path, kind: str, more: tuple[str, ...]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--drives", type=int, default=8)
+    parser.add_argument("--drives", type=int, default=12)
     parser.add_argument("--hidden-variance", type=float, default=4.0)
     parser.add_argument("--bands", type=int, default=8)
     parser.add_argument("--kinds", nargs="*", default=["boosting"])

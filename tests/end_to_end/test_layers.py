@@ -1,6 +1,11 @@
 """Rasters of a user's own, from add-map to a tensor: against closed forms, in both formats, with their classes."""
 
 import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -174,8 +179,6 @@ def test_all_that_describes_a_dataset_tells_of_them(datasets):
 
 
 def test_a_changed_pixel_of_an_own_layer_is_found(datasets, tmp_path):
-    import shutil
-
     shutil.copytree(datasets / "zarr", tmp_path / "changed")
     shard = next(path for path in (tmp_path / "changed/patches.zarr/moisture/c").rglob("*") if path.is_file())
     data = bytearray(shard.read_bytes())
@@ -297,6 +300,19 @@ def test_costs_need_the_layers_of_the_model(models):
     )
 
 
+def test_a_network_takes_a_channel_for_each_band(datasets, tmp_path):
+    pytest.importorskip("torch")
+    options = ["--model", "resnet18", "--width", "16", "--epochs", "1", "--layers", "height,embedding,canopy_one_hot"]
+    trained = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "model"), *options])
+    assert trained.exit_code == 0, trained.output
+    model, test = load_model(tmp_path / "model"), tcpipe.open_dataset(datasets / "zarr")["test"]
+    assert model.card.architecture.depth == 1 + 9 + 2
+    patches = test.with_layout(model.card.layout).patches[:20]
+    other = patches.copy()
+    other[..., 5] = 1.0 - other[..., 5]  # one band alone
+    assert np.abs(model.predict(patches) - model.predict(other)).max() > 0.0
+
+
 def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
     result = CliRunner().invoke(
         cli, ["evaluate", *map(str, (models / "model-bands", models / "zarr", tmp_path / "e")), "--no-baselines"]
@@ -304,3 +320,26 @@ def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
     assert result.exit_code in {0, 3}, result.output
     found = json.loads((tmp_path / "e" / "evaluation.json").read_text())
     assert found
+
+
+def test_the_page_on_embeddings_runs_as_it_stands(site, tmp_path, monkeypatch):
+    """Its script and its commands, in order; one run is there, so that samples are held out instead of drives."""
+    page = (Path(__file__).parents[2] / "docs/how-to/own-layers.md").read_text()
+    script, commands = re.findall(r"^```(?:python)?\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    (tmp_path / "embed.py").write_text(script)
+    for name in ("height", "ortho", "terrain"):
+        shutil.copy(site / f"{name}.tif", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TCPIPE_STORE", str(site / "store"))
+    for command in commands.replace("--holdout run", "--holdout sample").splitlines():
+        program, *arguments = command.split()
+        if program == "python":
+            subprocess.run([sys.executable, *arguments], check=True)
+        else:
+            result = CliRunner().invoke(cli, arguments)
+            assert result.exit_code in {0, 3}, result.output
+    with rasterio.open("embedding.tif") as raster:
+        assert (raster.count, raster.res) == (12, (0.5, 0.5))
+    assert tcpipe.open_dataset("dataset", layers=["embedding"])["train"].patches.shape[3] == 12
+    for name in ("with", "without"):
+        assert Path(f"evaluation-{name}/evaluation.json").is_file()
