@@ -34,7 +34,9 @@ def run_train(options: TrainOptions) -> TrainResult:
 
     names = [of.name for of in fields(FitConfig) if of.name != "predictor"]
     given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
-    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
+    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features", "layers"})
+    if isinstance(layers := given.get("layers"), str):
+        given["layers"] = [name.strip() for name in layers.split(",")]
     if options.predictor is None:
         given["model"] = options.model or ("resnet18" if is_network else "auto")
     config = from_values(FitConfig, {**asdict(resolve_recipe(options.recipe).train), **given}, where="train")

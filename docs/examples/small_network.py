@@ -8,7 +8,13 @@ from torch import nn
 class SmallNetwork:
     def __init__(self, inputs):
         self.scale = np.array(inputs.scale, np.float32)  # largest labels
-        layers = nn.Conv2d(inputs.depth, 16, 5, 3), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(16, 2)
+        layers = (
+            nn.Conv2d(len(inputs.planes), 16, 5, 3),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool2d(1),
+            nn.Flatten(),
+            nn.Linear(16, 2),
+        )
         self.network = nn.Sequential(*layers)
 
     def run(self, patches):

@@ -38,6 +38,7 @@ from tcpipe.learning.predictor import Predictor, ask, find_kind
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.layers import Layer
 
 logger = logging.getLogger("tcpipe")
 
@@ -97,6 +98,11 @@ class Model:
     def channels(self) -> tuple[str, ...]:
         """Channels of a patch, in order."""
         return self.card.channels
+
+    @property
+    def layers(self) -> Mapping[str, Layer]:
+        """Layers by name, scaled as those of the dataset that it was trained on."""
+        return self.card.layout.known
 
     @property
     def patch_m(self) -> float:

@@ -79,7 +79,7 @@ def export_network(predictor: Predictor, name: str) -> bytes:
         def forward(self, patches: Any) -> Any:
             return self.network(patches.permute(0, 3, 1, 2)) * scale
 
-    stream, example = io.BytesIO(), torch.zeros(1, inputs.patch_px, inputs.patch_px, inputs.depth)
+    stream, example = io.BytesIO(), torch.zeros(1, inputs.patch_px, inputs.patch_px, len(inputs.planes))
     network.cpu().eval()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the newer exporter needs one package more

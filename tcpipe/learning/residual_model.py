@@ -68,7 +68,7 @@ class ResidualModel(Predictor):
             batches, labels=(residuals / scale).astype(np.float32), weights=samples.weights.astype(np.float32)
         )
         steps = int(np.clip(config.residual_passes * len(samples) / _BATCH, _FEWEST_STEPS, _MOST_STEPS))
-        network = SmallNetwork(inputs.depth + len(inputs.extra_features), len(inputs.outputs), seed=config.seed)
+        network = SmallNetwork(len(inputs.planes) + len(inputs.extra_features), len(inputs.outputs), seed=config.seed)
         network.fit((_add_planes(inputs, *batch) for batch in batches.forever()), steps, config)
         return cls(fit_curves("linear", *ground, samples.labels), network, scale, inputs)
 
@@ -83,7 +83,7 @@ class ResidualModel(Predictor):
         from tcpipe.learning.network import SmallNetwork  # noqa: PLC0415
 
         outputs = len(inputs.outputs)
-        network = SmallNetwork(inputs.depth + len(inputs.extra_features), outputs, seed=0)
+        network = SmallNetwork(len(inputs.planes) + len(inputs.extra_features), outputs, seed=0)
         weights = {name: ("float32", array.shape) for name, array in network.arrays().items()}
         check_arrays(arrays, {**list_curve_arrays(outputs), "scale": ("float64", (outputs,)), **weights})
         curves, rest = read_curves("linear", arrays)
