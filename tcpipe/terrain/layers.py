@@ -121,16 +121,12 @@ class Layer:
         """Return which pixels of the map have data."""
         return np.isfinite(pixels) if self.mapped.kind == "f" else np.asarray(pixels != 0)
 
-    def channel(self, pixels: Pixels) -> NDArray[np.float32]:
-        """Return pixels of patches as a channel of the tensor, in [0, 1]."""
+    @property
+    def channel_of_bytes(self) -> NDArray[np.float32]:
+        """Return what each byte of a layer of bytes becomes in the tensor, in [0, 1], shape (256,)."""
         one = np.float32
-        if self.stored == np.uint8:
-            above = np.maximum(pixels.astype(one) - one(self.low / self.step), one(0.0))
-            return np.asarray(np.minimum(above / one(max((self.high - self.low) / self.step, 1.0)), one(1.0)))
-        scale, offset = self.scaling
-        there = np.equal(pixels, pixels) & (pixels != self.nodata)
-        scaled = np.where(there, pixels, 0).astype(one) * one(scale) + one(offset)
-        return np.where(there, np.clip(scaled, one(0.0), one(1.0)), one(0.0))
+        above = np.maximum(np.arange(256, dtype=one) - one(self.low / self.step), one(0.0))
+        return np.asarray(np.minimum(above / one(max((self.high - self.low) / self.step, 1.0)), one(1.0)))
 
     @property
     def scaling(self) -> tuple[float, float]:

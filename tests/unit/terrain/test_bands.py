@@ -1,6 +1,6 @@
 """Patches of layers with several bands, on a grid of their own: against interpolation point by point."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -96,6 +96,18 @@ def test_a_patch_without_data_in_one_band_is_not_valid():
     assert (holes.any(axis=(1, 2, 3)) == (where.centre_xy_m[:, 0] < middle + 1.0))[
         np.abs(where.centre_xy_m[:, 0] - middle) > 1.3
     ].all()
+
+
+def test_patches_far_off_the_map_have_no_data():
+    source = random_map()
+    source.banded["e"] = bands_on(source, 0.5)
+    near = frames(source)
+    away = replace(near, centre_xy_m=near.centre_xy_m + np.where(np.arange(40) % 2, 0.0, 3e7)[:, None])
+    found = sample_patches(source, away, np.ones(40), patch_m=1.0, patch_px=40).pixels["e"]
+    assert np.isnan(found[::2]).all()
+    np.testing.assert_array_equal(
+        found[1::2], sample_patches(source, near, np.ones(40), patch_m=1.0, patch_px=40).pixels["e"][1::2]
+    )
 
 
 def test_maps_together_have_the_range_of_both_in_each_band():
