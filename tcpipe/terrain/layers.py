@@ -99,9 +99,17 @@ class Layer:
 
     def at_patch(self, patch_m: float, patch_px: int) -> Layer:
         """Return a layer of several bands with the coarsest patches that keep its resolution; another one as it is."""
-        wanted = min(patch_m / self.pixel_size_m, patch_px) if self.bands else 0.0
-        own_px = next(n for n in range(1, patch_px + 1) if patch_px % n == 0 and n >= wanted - _ROUNDING)
-        return replace(self, own_px=own_px) if self.bands else self
+        if not self.bands:
+            return self
+        wanted = FINE_ENOUGH * min(patch_m / self.pixel_size_m, patch_px)
+        return replace(self, own_px=next(n for n in range(1, patch_px + 1) if patch_px % n == 0 and n >= wanted))
+
+    @property
+    def signature(self) -> str:
+        """What layers of one name have in common wherever patches of them go together, but for classes."""
+        return f"{self.kind} [{self.unit}]" + (
+            f", {len(self.bands)} bands, {self.own_px} px a patch" * bool(self.bands)
+        )
 
     @property
     def nodata(self) -> float:
@@ -150,8 +158,8 @@ def find_no_data_value(dtype: np.dtype[np.generic]) -> float:
     return float("nan") if dtype.kind == "f" else 0
 
 
-_ROUNDING = 1e-6
-"""Pixels by which a patch of whole pixels may seem wider."""
+FINE_ENOUGH = 0.95
+"""Share of a layer's resolution that patches keep at least: rounded pixel sizes count as one."""
 
 _BYTE, _STEPS, _FLOAT = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
 

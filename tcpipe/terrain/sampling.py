@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
-from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, group_stacks
+from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import BandReader, MapReader, TilePool, choose_level, group_by_tile, read_window
@@ -37,8 +37,6 @@ def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
 
 _BAND_VALUES = 2_000_000
 """Values of a layer of several bands that are interpolated at once: 8 MB each."""
-
-_WIDER = 1e-6
 
 _MOVED_ROWS = 128
 """Patches moved at once: they stay in the processor's cache on the way."""
@@ -149,7 +147,7 @@ def sample_bands(source: BandReader, frames: PatchFrames, *, patch_m: float, pat
     A patch whose pixels are wider than the layer's is averaged over so many points that none of these is skipped.
     """
     layer, count = source.layer.at_patch(patch_m, patch_px), len(frames.centre_xy_m)
-    parts = max(math.ceil(patch_m / layer.own_px / layer.pixel_size_m - _WIDER), 1)
+    parts = math.ceil(FINE_ENOUGH * patch_m / layer.own_px / layer.pixel_size_m)
     side = layer.own_px * parts
     pixels = map_px_from_patch(frames, source.grid, patch_m=patch_m, patch_px=side)
     out = np.empty((count, *layer.patch_shape(patch_px)), layer.stored)
