@@ -68,6 +68,18 @@ class PlanPathOptions:
             ("--allow-extrapolation",), earlier="--allow-unseen",
         ),
     )  # fmt: skip
+    risk: float | None = option(
+        None,
+        Option(
+            "Minimise what the path does not exceed with this probability (default with --budget: 0.95).",
+            (), Range(0.5, 0.999), "PROBABILITY",
+        ),
+    )  # fmt: skip
+    budget_joule: float | None = option(
+        None,
+        Option("Print the probability that this energy suffices: 300Wh, 500kJ.", ("--budget",), "energy", "ENERGY"),
+    )
+    round_trip: bool = option(False, Option("Plan the way back, too; a budget is for both.", ("--return",)))
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
     store: str | Path = option("tcpipe-store", STORE)

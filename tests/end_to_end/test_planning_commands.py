@@ -74,12 +74,31 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
     assert "energy.pgm: has 0 bytes, expected" in _run("verify", "costs", cwd=place, code=1)
 
 
+def test_a_budget_is_for_both_ways_and_comes_with_its_probability(place: Path):
+    plan = ("plan-path", "model", "--from", _FROM, "--to", _TO, "--out", "there.geojson", "--cell-size", "2", "--json")
+    said = json.loads(_run(*plan, "--budget", "1kWh", "--return", "--risk", "0.9", "--quiet", cwd=place))
+    there, together = said["plans"]["energy"], said["together"]
+    assert together["budget_joule"] == 3.6e6
+    assert together["budget_probability"] == pytest.approx(1.0)
+    assert there["risk_cost"] >= there["energy_joule"]
+    assert together["energy_joule"] >= there["energy_joule"] + together["back"]["energy_joule"] - 1e-6
+    ways = [of["geometry"]["coordinates"] for of in json.loads((place / "there.geojson").read_text())["features"]]
+    assert (ways[0][0], ways[0][-1]) == (ways[1][-1], ways[1][0])
+    little = json.loads(_run(*plan, "--budget", f"{0.5 * there['energy_joule']:.0f}J", "--quiet", cwd=place, code=3))
+    assert little["together"]["budget_probability"] < 0.05
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
         (("predict-path", "none", "--path", "path.geojson"), 2, "no such directory"),
         (("predict-path", "model", "--path", "none.geojson"), 2, "no such file"),
         (("predict-path", "model", "--path", "path.geojson", "--out", "pieces.txt"), 2, "ends in .csv"),
+        (
+            ("plan-path", "model", "--from", _FROM, "--to", _TO, "--budget", "300"),
+            2,
+            "expected an energy with its unit",
+        ),
         (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "expected LON,LAT"),
         (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
