@@ -53,7 +53,7 @@ from tcpipe.planning.cost_grid import (
     read_classes,
 )
 from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, predict_segments
-from tcpipe.planning.path_cost import find_projection
+from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
 
@@ -200,7 +200,7 @@ def make_cost_map(
         return replace(made, path=url)
     out = Path(out)
     clear_beside(out)
-    grid, origin_m = make_grid(source, cell_size_m), _find_origin_m(source, origin_deg)
+    grid, origin_m = make_grid(source, cell_size_m), find_origin_m(source, origin_deg)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claim_spool(out) as place:
@@ -378,25 +378,6 @@ def _predict_missing(  # noqa: PLR0917
             spool.keep(np.concatenate(ready))
             ready = []
         step(number, len(todo))
-
-
-_FARTHEST_ORIGIN_M = 100_000.0
-"""From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
-
-
-def _find_origin_m(source: MapFile, origin_deg: tuple[float, float] | None) -> tuple[float, float]:
-    """Return a place in the plane of the map's CRS, (0, 0) without one; `UsageError` where it is not near the map."""
-    if origin_deg is None:
-        return 0.0, 0.0
-    x_m, y_m = find_projection(source).forward(np.array([origin_deg]))[0].tolist()
-    x_min, y_min, x_max, y_max = source.grid.bounds_m
-    off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
-    if not off_m <= _FARTHEST_ORIGIN_M:
-        raise UsageError(
-            f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: is {off_m / 1000.0:.0f} km from map {source.name}, expected at most "
-            f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of the origin of the robot's map frame"
-        )
-    return x_m, y_m
 
 
 def _write_files(

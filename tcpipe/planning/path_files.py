@@ -278,7 +278,8 @@ class PlanResult:
 
     @property
     def _is_budget_too_small(self) -> bool:
-        probability, risk = self.together and self.together.budget_probability, self.plans[self.objective].risk
+        probability = None if self.together is None else self.together.budget_probability
+        risk = self.plans[self.objective].risk
         return probability is not None and risk is not None and probability < risk
 
     def __str__(self) -> str:

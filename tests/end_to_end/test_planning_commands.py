@@ -88,6 +88,28 @@ def test_a_budget_is_for_both_ways_and_comes_with_its_probability(place: Path):
     assert little["together"]["budget_probability"] < 0.05
 
 
+def test_a_route_graph_gets_the_costs_of_its_edges(place: Path):
+    points = [
+        {"type": "Feature", "properties": {"id": number}, "geometry": {"type": "Point", "coordinates": at}}
+        for number, at in enumerate(([0.0, 0.0], [8.0, 6.0]))
+    ]
+    edge = {"id": 5, "startid": 0, "endid": 1}
+    line = {"type": "LineString", "coordinates": [[0.0, 0.0], [8.0, 6.0]]}
+    features = [*points, {"type": "Feature", "properties": edge, "geometry": line}]
+    (place / "graph.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    command = ("route-graph", "model", "--graph", "graph.geojson", "--out", "costs.geojson", "--origin", _FROM)
+    options = ("--two-way", "--map", "site", "--store", "tcpipe-store", "--json", "--quiet")
+    said = json.loads(_run(*command, *options, cwd=place))
+    assert (said["nodes"], said["edges"], said["one_way_edges"]) == (2, 2, 0)
+    found = json.loads((place / "costs.geojson").read_text())["features"]
+    there, back = (of["properties"]["metadata"] for of in found[2:])
+    assert there["length_m"] == back["length_m"] == pytest.approx(10.0, rel=1e-3)
+    assert there["energy_joule"] != back["energy_joule"]
+    assert there["energy_std_joule"] > 0.0
+    assert "no run with segments on map site" in tcpipe("route-graph", "model", cwd=place, env=_ONE_THREAD).stderr
+    assert "no input for the commanded speed" in tcpipe(*command, "--speed", "1", cwd=place, env=_ONE_THREAD).stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
