@@ -48,7 +48,7 @@ def make_track(
         **{f"{axis}_std_m": np.broadcast_to(np.asarray(std_m, float), n) for axis in "xyz"},
         yaw_std_rad=np.full(n, 0.01),
         forward_velocity_std_mps=np.broadcast_to(np.asarray(velocity_std_mps, float), n),
-        **{f"displacement_std_{lag}_m": nothing for lag in ("500ms", "1s", "2s", "4s")},
+        **{f"displacement_std_{lag}_m": nothing for lag in ("500ms", "1s", "2s", "4s", "8s", "16s")},
         wheel_velocity_mps=nothing if wheel_mps is None else wheel_mps,
         commanded_velocity_mps=nothing if commanded_mps is None else commanded_mps,
         commanded_yaw_rate_radps=nothing,

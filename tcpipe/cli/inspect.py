@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tcpipe.cli.options import LOG, add_path_or_store, json_option, msgdef_option, recipe_option, robot_option
-from tcpipe.cli.output import print_json, print_line, resolve_recipe_with_source
+from tcpipe.cli.output import print_json, print_line, print_lines, resolve_recipe_with_source
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore, InspectedTables
@@ -63,7 +63,6 @@ def _print_log(log: InspectedLog) -> None:
         return
     duration = "" if log.duration_s is None else f", {log.duration_s:.1f} s"
     print_line(f"{log.path}: {log.container}, {(log.size_bytes or 0) / 1e6:.1f} MB{duration}")
-    print_line(f"robot {log.robot}: {log.robot_why}")
     print_line("")
     full = any(topic.stamps for topic in log.topics)
     header = ["topic", "type", "messages", "Hz", "role", "why", *(_READ_HEADER if full else [])]
@@ -89,6 +88,8 @@ def _print_log(log: InspectedLog) -> None:
     _print_findings(log.findings or ())
     _print_damage("damage", log.damage or ())
     _print_damage("note", log.notes or ())
+    print_line("")
+    print_lines((log.recipe or "").rstrip())
 
 
 def _print_findings(findings: Iterable[Finding]) -> None:
@@ -227,19 +228,11 @@ def _print_run(found: InspectedRun) -> None:
 
 
 def _print_tables(found: InspectedTables) -> None:
-    print_line(f"{found.path}: {len(found.columns) + len(found.problems)} tables without a mapping in the recipe")
+    print_line(f"{found.path}: {len(found.columns)} tables without a mapping in the recipe")
     print_line("")
     _print_table(["table", "columns"], [[file, _format_list(names)] for file, names in found.columns.items()])
-    for line in found.problems.values():
-        print_line(line)
     print_line("")
-    print_line(
-        "proposed recipe ('tcpipe init --from PATH' writes it):"
-        if found.recipe
-        else "no table has stamps and columns of known names"
-    )
-    for line in found.recipe.splitlines():
-        print_line(line)
+    print_lines(found.recipe.rstrip())
 
 
 def _format_list(names: Sequence[str]) -> str:

@@ -144,6 +144,7 @@ def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
         "",
         f"Licence: {_escape_markdown(card.licence) or 'not stated; ask before you use it'}.",
         "",
+        *(f"Open data in the layers {_escape_markdown(line)}\n" for line in card.attributions),
     )
     yield from ("```bibtex", *_format_bibtex(card), "```", "")
     yield f"Made with tcpipe {card.tcpipe_version}, data model {card.data_model_version}. `tcpipe verify` checks every file."
@@ -217,6 +218,7 @@ def format_croissant(
     description: str,
     licence: str,
     creator: str,
+    attributions: Sequence[str],
     files: Mapping[str, Checksum],
     samples_file: str,
     samples: pa.Schema,
@@ -229,6 +231,7 @@ def format_croissant(
     Parameters
     ----------
     name, description, licence, creator : as the recipe says; an empty one is left out.
+    attributions : licences of others' data that it contains.
     files : size [byte] and sha256 (hex) of every file by its path inside the dataset.
     samples_file : which of them holds the samples.
     samples : its Arrow schema; the fields' metadata give their meanings.
@@ -272,6 +275,7 @@ def format_croissant(
         "description": description,
         "license": licence,
         "creator": {"@type": "sc:Person", "name": creator} if creator else None,
+        "creditText": "; ".join(attributions),
         "version": version,
         "distribution": [*(_describe_file_object(path, files[path]) for path in sorted(files)), *sets],
         "recordSet": records,

@@ -70,18 +70,25 @@ def _add_windows(recipe: Recipe, path: Path) -> Recipe:
     file = path.parent / recipe.mask.windows_csv
     windows = list(recipe.mask.windows)
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise RecipeError(f"{path}: mask.windows_csv: {file} cannot be read ({error.strerror})") from None
-    rows = csv.DictReader(text.splitlines())
-    for number, row in enumerate(rows, 2):
-        if None in row or any(";" in name for name in rows.fieldnames or ()):
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path}: mask.windows_csv: {file} is not UTF-8 at byte {error.start}") from None
+    lines = text.splitlines()
+    separator = next((mark for mark in ";\t" if lines and mark in lines[0]), ",")
+    for number, row in enumerate(csv.DictReader(lines, delimiter=separator), 2):
+        if None in row:
             raise RecipeError(
-                f"{file}, line {number}: expected cells separated by commas below the first line run,action,start,end, "
-                "and numbers with a decimal point"
+                f"{file}, line {number}: it has more cells than the first line, {lines[0]}; got {lines[number - 1]}"
             )
         cells = {str(name).strip(): str(value).strip() for name, value in row.items() if value}
-        given = {name: value if name == "run" else _read_cell(value) for name, value in cells.items() if value}
+        decimal = "," if separator == ";" else "."
+        given = {
+            name: value if name == "run" else _read_cell(value.replace(decimal, "."))
+            for name, value in cells.items()
+            if value
+        }
         windows.append(from_values(TimeWindow, given, where=f"{file}, line {number}"))
     return replace(recipe, mask=replace(recipe.mask, windows=windows, windows_csv=None))
 

@@ -59,7 +59,7 @@ from tcpipe.fusion.process import (
     is_length_observable,
     is_turned_by_course,
 )
-from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smooth_ticks
+from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed, make_adjoint, smooth_ticks
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
@@ -111,10 +111,7 @@ def smooth_section(made: Pass) -> Smoothed:
     """Return the smoothed estimate of a forward pass."""
     size, n = made.states.shape[0], made.model.active.size
     lags = np.array([round(lag_s / made.ticks.inputs.period_s) for lag_s in DISPLACEMENT_LAGS_S])
-    ahead = int(lags.max()) // EVERY + 1
-    adjoint = Adjoint(
-        np.zeros((n, n)), np.zeros((1 + 2 * ahead, n)), np.full(ahead, -1, np.int64), np.zeros((ahead, 5))
-    )
+    adjoint = make_adjoint(n, int(lags.max()))
     out = Smoothed(
         np.zeros_like(made.states),
         np.zeros((size, 5)),
@@ -351,7 +348,7 @@ def _make_skew(v: Floats) -> Floats:
 
 
 def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
-    """Return the variance of displacements at each wanted stamp [m²], shape (N, 4); NaN where none stands at the other end."""
+    """Return the variance of displacements at each wanted stamp [m²], shape (N, 6); NaN where none stands at the other end."""
     found = np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan)
     for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
         known = np.flatnonzero(np.isfinite(smoothed.links[:, column]))
@@ -365,7 +362,7 @@ def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
 
 
 def _compute_arm_variance(std: Floats, rotation: Floats, yaw: Floats, made: Pass) -> tuple[Floats, Floats]:
-    """Return the variance that an antenna whose place nothing shows adds to positions, (N, 3), and to displacements, (N, 4) [m²]."""
+    """Return the variance that an antenna whose place nothing shows adds to positions, (N, 3), and to displacements, (N, 6) [m²]."""
     moved = np.zeros((yaw.size, len(DISPLACEMENT_LAGS_S)))
     for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
         rows = round(lag_s / made.ticks.inputs.period_s)

@@ -29,7 +29,7 @@ class Smoothed(NamedTuple):
     states : x, (K, 51).
     variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
     links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later [m²], (K, l); NaN
-        where it was not computed: it is at every `EVERY` ticks.
+        where it was not computed: it is at every `NEAR_EVERY` ticks, for lags beyond `NEAR` at every `FAR_EVERY`.
     spreads : standard deviation of every active error every `SELDOM` ticks, (K / SELDOM, n).
     """
 
@@ -39,7 +39,7 @@ class Smoothed(NamedTuple):
     spreads: Matrix
 
 
-EVERY, SELDOM = 4, 100
+NEAR, NEAR_EVERY, FAR_EVERY, SELDOM = 80, 4, 40, 100
 _SHORT_M = 0.01
 
 
@@ -50,14 +50,24 @@ class Adjoint(NamedTuple):
     ----------
     information : Λ, (n, n).
     rows : l, and for each of Q ticks ahead the columns of I - Λ P that belong to its position east and north, (1 + 2 Q, n).
-    ticks : of those ticks, (Q,); -1: none.
+    ticks : of those ticks, (Q,); -1: none. Every `NEAR_EVERY` as far as `NEAR`, then every `FAR_EVERY` as far as the longest lag.
     ends : of those ticks, position east and north, and their smoothed covariance (ee, en, nn), (Q, 5).
+    near : so many of Q are those up to `NEAR`.
     """
 
     information: Matrix
     rows: Matrix
     ticks: Indices
     ends: Matrix
+    near: int
+
+
+def make_adjoint(size: int, longest: int) -> Adjoint:
+    """Return the adjoint at the last tick, of ``size`` errors, for lags up to ``longest`` ticks."""
+    near = NEAR // NEAR_EVERY + 1
+    ahead = near + longest // FAR_EVERY + 1
+    rows = np.zeros((1 + 2 * ahead, size))
+    return Adjoint(np.zeros((size, size)), rows, np.full(ahead, -1, np.int64), np.zeros((ahead, 5)), near)
 
 
 @compile_kernel
@@ -156,7 +166,7 @@ def _smooth_tick(
     k: int, P: Matrix, x: Vector, model: Model, adjoint: Adjoint, lags: Indices, out: Smoothed, A: Matrix, room: Any
 ) -> None:
     """Fill the smoothed estimate at tick k."""
-    information, rows, ticks, ends = adjoint
+    information, rows, ticks, ends, near = adjoint
     d, turn, c, after = room
     n = P.shape[0]
     for e in range(N):
@@ -231,8 +241,10 @@ def _smooth_tick(
                     s += share[axis + other] * v
             s /= east * east + north * north + 2.0 * short
             out.links[k, column] = max(s, 0.0)
-    if k % EVERY == 0:
-        q = (k // EVERY) % ticks.size
+    if k % NEAR_EVERY == 0:
+        q = (k // NEAR_EVERY) % near
+        if k % FAR_EVERY == 0:
+            q = near + (k // FAR_EVERY) % (ticks.size - near)
         ticks[q] = k
         ends[q, 0], ends[q, 1] = out.states[k, 9], out.states[k, 10]
         for axis in range(2):

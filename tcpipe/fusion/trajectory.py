@@ -23,7 +23,7 @@ from tcpipe.fusion.measurements import IMU, Measurements, select_measurements
 from tcpipe.fusion.signals import compute_median_period_ns, is_in_gap
 from tcpipe.tables.facts import StretchFacts
 
-DISPLACEMENT_LAGS_S = (0.5, 1.0, 2.0, 4.0)
+DISPLACEMENT_LAGS_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Durations over which a smoother states the uncertainty of a displacement [s]."""
 
 
@@ -61,7 +61,7 @@ class Trajectory:
     yaw_std_rad : [rad], shape (N,).
     forward_velocity_std_mps : [m/s], shape (N,), of the velocity along base_link's x axis.
     rejections : what the gate refused.
-    displacement_std_m : [m], shape (N, 4), of the horizontal displacement from each row to the one `DISPLACEMENT_LAGS_S` later, along
+    displacement_std_m : [m], shape (N, 6), of the horizontal displacement from each row to the one `DISPLACEMENT_LAGS_S` later, along
         its direction, the correlation of both ends counted exactly; NaN where no row stands there, and throughout in a forward filter,
         which does not know it. In between the variance may be interpolated in time, from zero at no time.
     facts : what the filter counted and settled on.

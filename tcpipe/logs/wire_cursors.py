@@ -1,40 +1,118 @@
-"""Where the fields of irregular messages lie: all messages are walked side by side, one cursor each, field after field.
+"""Where the fields of messages lie: all messages are walked side by side, one cursor each, field after field.
 
-`tcpipe.logs.wire_layout` serves messages of which many have one shape. Where nearly every message has a shape of its own (diagnostics,
-lists of texts) each step here reads one field of all messages at once: the cursors read the length where they stand and move on, each by
-its own distance. The n-th elements of all lists are one step too. What comes out says where each value lies; nothing is copied here.
+Each step reads one field of all messages at once. While the lengths that it meets agree, one cursor stands for all messages, and a field
+of all of them is one strided view. From the first length in which they differ each message has its own cursor, which moves on by its own
+distance. The n-th elements of all lists are one step too. What comes out says where each value lies; nothing is copied here.
+
+Serialisations: ROS 1 (no alignment, little-endian) and CDR as ROS 2 writes it (4 bytes of header, then fields aligned to their
+size from there; plain XCDR2 aligns 8-byte fields to 4; both byte orders).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.logs.wire_layout import Dialect, RaggedError
 from tcpipe.logs.wire_types import Array, Record, Scalar, Text, WireType
 
 Int64Array = NDArray[np.int64]
 
 _MAX_STEPS = 20_000
 """A walk of more steps is given up: a few endless lists among short ones are cheaper to read one by one."""
+_CDR_BYTE_ORDER = {0: ">", 1: "<", 6: ">", 7: "<"}
+_PLAIN_XCDR2 = (6, 7)
+_XCDR2_ALIGNMENT = 4
+_CDR_HEADER = 4
+_CDR_PADDING = 3
+
+
+class LayoutError(ValueError):
+    """Messages do not fit their definition: a length runs past their end, or bytes are left over."""
+
+
+class RaggedError(ValueError):
+    """Messages are too irregular to be read by columns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How messages are serialised.
+
+    Fields begin ``origin`` bytes into a message, are aligned from there to at most ``max_alignment``; texts end in ``terminator`` bytes
+    that are no text; a message without fields takes ``empty_record_bytes``; up to ``padding`` bytes may follow the last field.
+    """
+
+    byte_order: str
+    origin: int
+    max_alignment: int
+    terminator: int
+    empty_record_bytes: int
+    padding: int
+
+    @property
+    def known_to_rosbags(self) -> bool:
+        """Whether rosbags reads it, too (all but XCDR2)."""
+        return self.max_alignment != _XCDR2_ALIGNMENT
+
+
+ROS1 = Dialect("<", 0, 1, 0, 0, 0)
+
+
+def find_dialect(payload: bytes, encoding: str) -> Dialect:
+    """Return the dialect of a message, in CDR by its first bytes; `LayoutError` where these are none of CDR's plain ones."""
+    if encoding == "ros1":
+        return ROS1
+    if len(payload) < _CDR_HEADER or payload[0] != 0 or payload[1] not in _CDR_BYTE_ORDER:
+        raise LayoutError(f"CDR header {payload[:_CDR_HEADER].hex(' ')} is invalid in ROS 2")
+    max_alignment = _XCDR2_ALIGNMENT if payload[1] in _PLAIN_XCDR2 else 8
+    return Dialect(_CDR_BYTE_ORDER[payload[1]], _CDR_HEADER, max_alignment, 1, 1, _CDR_PADDING)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Places at equal distances: the first, and of each axis how many there are and how far apart."""
+
+    first: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def view(self, data: NDArray[np.uint8], dtype: np.dtype[np.generic], count: int = 1) -> NDArray[np.generic]:
+        """Return a copy of the values there, ``count`` of them side by side at each place, in the order of `list_offsets`."""
+        together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # many at once are copied faster
+        if not count:
+            return np.zeros(0, dtype)
+        found: NDArray[np.generic] = np.ndarray(self.shape, together, data, self.first, self.strides)
+        return found.copy().reshape(-1).view(dtype)
+
+    def list_offsets(self) -> Int64Array:
+        """Return all of them, the last axis first."""
+        offsets = np.full(1, self.first, np.int64)
+        for count, stride in zip(self.shape, self.strides, strict=True):
+            offsets = (offsets[:, None] + stride * np.arange(count)).ravel()
+        return offsets
+
+
+Places = Int64Array | Grid
+"""Where the M values of a field lie, as an array (M,) or a grid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scalars:
-    """Scalars at ``offsets``, shape (M,)."""
+    """Scalars at their places."""
 
-    offsets: Int64Array
+    places: Places
     dtype: np.dtype[np.generic]
 
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """``lengths`` bytes each at ``offsets``, shape (M,), rising: scalars side by side (numpy's type), or a text (Python's encoding)."""
+    """``lengths`` bytes each, shape (M,), equal in a grid: scalars side by side (numpy's type), or a text (Python's encoding)."""
 
-    offsets: Int64Array
+    places: Places
     lengths: Int64Array
     kind: np.dtype[np.generic] | str
 
@@ -73,34 +151,54 @@ def walk(
 
     Parameters
     ----------
-    data : bytes that hold all messages. In CDR the byte behind each message's header lies at a multiple of 8.
+    data : bytes that hold all messages.
     starts, ends : where each message begins and ends, shape (N,), rising.
     """
     fits = np.ones(len(starts), np.bool_)
     while fits.any():
-        cursors = _Cursors(data, starts[fits], ends[fits], dialect)
-        root = cursors.record(message, np.arange(int(fits.sum())))
-        left = cursors.ends - cursors.positions
-        good = cursors.good & (left >= 0) & (left <= dialect.padding)
+        bases, sizes = starts[fits] + dialect.origin, ends[fits] - starts[fits] - dialect.origin
+        cursors = _Cursors(data, _find_grid(bases, sizes), sizes, dialect)
+        try:
+            root = cursors.record(message, np.arange(len(sizes)))
+        except LayoutError:  # which stands for all of them
+            break
+        good = cursors.find_finished()
         if good.all():
             return WalkResult(root, fits)
         fits[fits] = good
-    return WalkResult(None, fits)
+    return WalkResult(None, np.zeros(len(starts), np.bool_))
+
+
+def _find_grid(bases: Int64Array, sizes: Int64Array) -> Places:
+    """Return bases as a grid where messages of one size lie at equal distances."""
+    steps = np.diff(bases)
+    if (sizes != sizes[0]).any() or (steps != steps[:1]).any():
+        return bases
+    return Grid(int(bases[0]), (len(bases),), (int(steps[0]) if len(steps) else 1,))
 
 
 class _Cursors:
-    """One position in each message; a message that does not fit is marked, and stands still."""
+    """A position in each message, counted from where its fields begin; a message that does not fit is marked, and stands still.
 
-    def __init__(self, data: NDArray[np.uint8], starts: Int64Array, ends: Int64Array, dialect: Dialect) -> None:
-        self.positions, self.ends = starts + dialect.origin, ends
-        self.good = self.positions <= ends
-        self._data, self._dialect, self._steps = data, dialect, 0
+    While ``_bases`` is a grid, messages have one size, ``_at`` is the position in all of them, and one that does not fit is an error.
+    """
+
+    def __init__(self, data: NDArray[np.uint8], bases: Places, sizes: Int64Array, dialect: Dialect) -> None:
+        self._data, self._bases, self._sizes, self._dialect = data, bases, sizes, dialect
+        self._at, self._steps = 0, 0
+        self._positions, self._good = np.zeros(len(sizes), np.int64), sizes >= 0
         self._counts: NDArray[np.void] = np.ndarray(
             (max(len(data) - 3, 0),), "V4", data if len(data) > 3 else b"", 0, (1,)
         )
 
+    def find_finished(self) -> NDArray[np.bool_]:
+        """Return which messages fit, and have no more bytes left than may follow the last field."""
+        left = self._sizes - (self._at if isinstance(self._bases, Grid) else self._positions)
+        finished: NDArray[np.bool_] = self._good & (left >= 0) & (left <= self._dialect.padding)
+        return finished
+
     def values(self, of: WireType, rows: Int64Array) -> Values:
-        """Step over one value in each of the ``rows``."""
+        """Step over one value in each of the ``rows``: all messages, none, or some of those without a grid."""
         self._steps += 1
         if self._steps > _MAX_STEPS:
             raise RaggedError(f"more than {_MAX_STEPS} steps")
@@ -109,33 +207,36 @@ class _Cursors:
                 dtype = np.dtype(self._dialect.byte_order + of.code)
                 return Scalars(self.take(rows, dtype.itemsize, dtype.itemsize), dtype)
             case Text():
-                lengths = self.count(rows)
-                if of.wide:
-                    lengths *= of.wide.step
-                    return Runs(self.take(rows, lengths, 1), lengths, of.wide.codec(self._dialect.byte_order))
-                offsets = self.take(rows, lengths, 1)
-                return Runs(offsets, np.maximum(lengths - self._dialect.terminator, 0), "utf-8")
+                lengths = self.count(rows) * (of.wide.step if of.wide else 1)
+                kept = lengths if of.wide else np.maximum(lengths - self._dialect.terminator, 0)
+                codec = of.wide.codec(self._dialect.byte_order) if of.wide else "utf-8"
+                return Runs(self.take(rows, lengths, 1), np.broadcast_to(kept, len(rows)), codec)
             case Record():
                 return self.record(of, rows)
             case Array():
                 return self.array(of, rows)
 
     def record(self, of: Record, rows: Int64Array) -> Fields:
-        if not of.fields:
+        if not of.fields:  # CDR has no empty structures: rosidl puts one byte there
             self.take(rows, self._dialect.empty_record_bytes, 1)
         return Fields(len(rows), tuple(self.values(field, rows) for _, field in of.fields))
 
     def array(self, of: Array, rows: Int64Array) -> Values:
-        counts = self.count(rows) if of.length is None else np.full(len(rows), of.length, np.int64)
-        endless = counts > self.ends[rows] - self.positions[rows]  # an element takes a byte at least
-        if endless.any():
-            self.good[rows[endless]] = False
+        counts = self.count(rows) if of.length is None else of.length
+        if isinstance(self._bases, Grid) and len(rows):
+            if counts > self._sizes[0] - self._at:  # an element takes a byte at least
+                raise LayoutError(f"{counts} elements")
+        else:
+            endless = counts > self._sizes[rows] - self._positions[rows]
+            self._good[rows[endless]] = False
             counts = np.where(endless, 0, counts)
         if isinstance(of.element, Scalar):
             dtype = np.dtype(self._dialect.byte_order + of.element.code)
             sizes = counts * dtype.itemsize
-            return Runs(self.take(rows, sizes, np.where(counts > 0, dtype.itemsize, 1)), sizes, dtype)
-        return Lists(counts, self.regular(of.element, rows, counts) or self.elements(of.element, rows, counts))
+            places = self.take(rows, sizes, np.where(counts > 0, dtype.itemsize, 1))
+            return Runs(places, np.broadcast_to(sizes, len(rows)), dtype)
+        each = np.broadcast_to(counts, len(rows))
+        return Lists(each, self.regular(of.element, rows, each) or self.elements(of.element, rows, each))
 
     def elements(self, of: Text | Record, rows: Int64Array, counts: Int64Array) -> Values:
         """Step over the first elements of all lists, then over the second ones, and so on."""
@@ -153,47 +254,72 @@ class _Cursors:
 
     def regular(self, of: Text | Record, rows: Int64Array, counts: Int64Array) -> Values | None:
         """Step over all elements at once where each takes the same room wherever it stands; None where they do not."""
-        size, alignment = _find_regular_size(of, self._dialect.max_alignment)
+        size, stride, alignment = _find_regular_size(of, self._dialect.max_alignment)
         if not size or counts.max(initial=0) < 2:
             return None
-        first = self.take(rows, counts * size, np.where(counts > 0, alignment, 1))
-        owners = np.repeat(np.arange(len(rows)), counts)
-        offsets = first[owners] + size * (np.arange(len(owners)) - (np.cumsum(counts) - counts)[owners])
-        inside = _Cursors(self._data, offsets - self._dialect.origin, offsets + size, self._dialect)
-        return inside.values(of, np.arange(len(owners)))
+        sizes = np.where(counts > 0, stride * (counts - 1) + size, 0)
+        is_grid = isinstance(self._bases, Grid)
+        begin = self.take(
+            rows, int(sizes[0]) if is_grid else sizes, alignment if is_grid else np.where(counts > 0, alignment, 1)
+        )
+        places: Places
+        if isinstance(begin, Grid):
+            places = Grid(begin.first, (*begin.shape, int(counts[0])), (*begin.strides, stride))
+        else:
+            owners = np.repeat(np.arange(len(rows)), counts)
+            places = begin[owners] + stride * (np.arange(len(owners)) - (np.cumsum(counts) - counts)[owners])
+        total = int(counts.sum())
+        return _Cursors(self._data, places, np.full(total, size), self._dialect).values(of, np.arange(total))
 
-    def count(self, rows: Int64Array) -> Int64Array:
-        offsets = self.take(rows, 4, 4)
-        good = self.good[rows]
-        if good.all():
-            return self._counts[offsets].view(self._dialect.byte_order + "u4").astype(np.int64)
+    def count(self, rows: Int64Array) -> int | Int64Array:
+        """Step over a length in each row; return them, as one number where all messages have the same."""
+        places, dtype = self.take(rows, 4, 4), np.dtype(self._dialect.byte_order + "u4")
+        if isinstance(places, Grid):
+            told = places.view(self._data, dtype).astype(np.int64)
+            if (told == told[0]).all():
+                return int(told[0])
+            self._positions[:] = self._at  # from here on each has its own
+            self._bases = _list_offsets(self._bases)
+            return told
+        good = self._good[rows]
         found = np.zeros(len(rows), np.int64)
-        found[good] = self._counts[offsets[good]].view(self._dialect.byte_order + "u4")
+        found[good] = self._counts[places[good]].view(dtype)
         return found
 
-    def take(self, rows: Int64Array, sizes: int | Int64Array, alignment: int | Int64Array) -> Int64Array:
+    def take(self, rows: Int64Array, sizes: int | Int64Array, alignment: int | Int64Array) -> Places:
         """Move over ``sizes`` bytes after alignment; return where they begin."""
+        if not len(rows):
+            return rows
         mask = np.minimum(alignment, self._dialect.max_alignment) - 1
-        offsets: Int64Array = (self.positions[rows] + mask) & ~mask
+        if isinstance(self._bases, Grid):
+            begin = int((self._at + mask) & ~mask)
+            if begin + sizes > self._sizes[0]:
+                raise LayoutError(f"byte {begin + sizes}")
+            self._at = int(begin + sizes)
+            return Grid(self._bases.first + begin, self._bases.shape, self._bases.strides)
+        offsets: Int64Array = (self._positions[rows] + mask) & ~mask
         after = offsets + sizes
-        past = after > self.ends[rows]
+        past = after > self._sizes[rows]
         if past.any():
-            self.good[rows[past]] = False
-            after = np.where(past, self.positions[rows], after)
-        self.positions[rows] = after
-        return offsets
+            self._good[rows[past]] = False
+            after = np.where(past, self._positions[rows], after)
+        self._positions[rows] = after
+        return offsets + self._bases[rows]
+
+
+def _list_offsets(places: Places) -> Int64Array:
+    return places.list_offsets() if isinstance(places, Grid) else places
 
 
 def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
     """Concatenate values and put them in order: the n-th is number ``order[n]`` of the concatenation."""
     match pieces[0]:
         case Scalars(dtype=dtype):
-            return Scalars(np.concatenate([p.offsets for p in pieces if isinstance(p, Scalars)])[order], dtype)
+            scalars = [_list_offsets(p.places) for p in pieces if isinstance(p, Scalars)]
+            return Scalars(np.concatenate(scalars)[order], dtype)
         case Runs(kind=kind):
-            runs = [p for p in pieces if isinstance(p, Runs)]
-            offsets, lengths = (
-                np.concatenate(of)[order] for of in zip(*((r.offsets, r.lengths) for r in runs), strict=True)
-            )
+            runs = [(_list_offsets(p.places), p.lengths) for p in pieces if isinstance(p, Runs)]
+            offsets, lengths = (np.concatenate(of)[order] for of in zip(*runs, strict=True))
             return Runs(offsets, lengths, kind)
         case Fields():
             columns = zip(*(p.fields for p in pieces if isinstance(p, Fields)), strict=True)
@@ -206,23 +332,27 @@ def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
             return Lists(chosen, _join_values([p.elements for p in lists], np.repeat(starts[order], chosen) + within))
 
 
-def _find_regular_size(of: WireType, max_alignment: int) -> tuple[int, int]:
-    """Return size and alignment of a type whose values follow one another without padding between them; (0, 1) for others."""
+@cache
+def _find_regular_size(of: WireType, max_alignment: int) -> tuple[int, int, int]:
+    """Return size, distance and alignment of values that follow one another, where these are the same wherever they stand; (0, 0, 1) else.
+
+    They are where the first field has the largest alignment.
+    """
     match of:
         case Scalar():
             size = np.dtype(of.code).itemsize
-            return size, min(size, max_alignment)
+            return size, size, min(size, max_alignment)
         case Record() if of.fields:
             parts = [_find_regular_size(field, max_alignment) for _, field in of.fields]
-            alignment = parts[0][1]
+            alignment = parts[0][2]
             position = 0
-            for size, own in parts:
-                if not size or own > alignment or position % own:
-                    return 0, 1
-                position += size
-            return (position, alignment) if position % alignment == 0 else (0, 1)
+            for size, _, own in parts:
+                if not size or own > alignment:
+                    return 0, 0, 1
+                position += -position % own + size
+            return position, position + -position % alignment, alignment
         case Array() if of.length:
-            size, alignment = _find_regular_size(of.element, max_alignment)
-            return size * of.length, alignment
+            size, stride, alignment = _find_regular_size(of.element, max_alignment)
+            return (stride * (of.length - 1) + size if size else 0), 0, alignment
         case _:
-            return 0, 1
+            return 0, 0, 1

@@ -9,8 +9,9 @@ tau = sigma_position / sigma_velocity as both variances demand, gives in between
 
     1 / variance = 1 / (sigma_v T)² + 1 / (sigma_1² + sigma_2²)
 
-It is no less than the change of the position error itself, |sigma_2 - sigma_1| (triangle inequality); and in a forward filter a fix that
-shrinks the error moves the estimate, by sqrt(sigma_1² - sigma_2²).
+It grows at most linearly from what the smoother states for a shorter duration, and is no less than the change of the position error
+itself, |sigma_2 - sigma_1| (both by the triangle inequality); and in a forward filter a fix that shrinks the error moves the estimate, by
+sqrt(sigma_1² - sigma_2²).
 """
 
 from __future__ import annotations
@@ -24,20 +25,30 @@ from tcpipe.tables.facts import FuseFacts
 
 
 def compute_displacement_std_m(
-    *, velocity_std_mps: Floats, duration_s: Floats, start_std_m: Floats, end_std_m: Floats, smoothed: bool
+    *,
+    velocity_std_mps: Floats,
+    duration_s: Floats,
+    start_std_m: Floats,
+    end_std_m: Floats,
+    smoothed: bool,
+    told_s: Sequence[float],
+    told_std_m: Floats,
 ) -> Floats:
     """Return the standard deviation of the displacement between two estimated positions [m], shape (M,).
 
-    ``velocity_std_mps`` and ``start_std_m``, ``end_std_m`` are along the displacement; ``smoothed`` positions come from a fixed-interval
-    smoother rather than a forward filter.
+    It is the smoother's (`interpolate_durations_m`), elsewhere as the other deviations allow: ``velocity_std_mps`` and ``start_std_m``,
+    ``end_std_m`` along the displacement; ``smoothed`` positions come from a fixed-interval smoother rather than a forward filter.
     """
     change = np.abs(end_std_m - start_std_m)
     if not smoothed:
         change = np.maximum(change, np.sqrt(np.maximum(start_std_m**2 - end_std_m**2, 0.0)))
     short, long = velocity_std_mps * duration_s, np.hypot(start_std_m, end_std_m)
     drift = np.divide(short * long, np.hypot(short, long), out=np.zeros_like(short), where=long > 0.0)
-    result: Floats = np.maximum(drift, change)
-    return result
+    known_s = np.array(told_s)
+    linear = np.where(known_s <= duration_s[:, None], told_std_m * duration_s[:, None] / known_s, np.nan)
+    told = interpolate_durations_m(duration_s, told_s=told_s, told_std_m=told_std_m)
+    modelled = np.maximum(np.fmin(drift, np.fmin.reduce(linear, axis=1)), change)
+    return np.where(np.isnan(told), modelled, told)
 
 
 def interpolate_durations_m(duration_s: Floats, *, told_s: Sequence[float], told_std_m: Floats) -> Floats:
@@ -78,22 +89,22 @@ def compute_chord_ahead_std_m(
 ) -> Floats:
     """Return for each row the displacement error over the next chord at the row's speed [m], shape (N,).
 
-    It is the smoother's (`interpolate_durations_m`), elsewhere as the row's deviations allow (`compute_displacement_std_m`): of the forward
-    velocity, and of the position along the direction of travel. Rows slower than ``slowest_mps`` [m/s] are taken as this fast.
+    See `compute_displacement_std_m`; the deviations are those of the forward velocity and of the position along the direction of travel.
+    Rows slower than ``slowest_mps`` [m/s] are taken as this fast.
     """
     _, high = find_piece_bounds(rows.piece)
     duration_s = chord_m / np.maximum(np.abs(rows.velocity_mps), slowest_mps)
     row = np.arange(len(duration_s))
     end = np.minimum(row + np.ceil(duration_s / rows.period_s).astype(np.int64), high)
-    told = interpolate_durations_m(duration_s, told_s=told_s, told_std_m=told_std_m)
-    modelled = compute_displacement_std_m(
+    return compute_displacement_std_m(
         velocity_std_mps=velocity_std_mps,
         duration_s=duration_s,
         start_std_m=position_std_m,
         end_std_m=position_std_m[end],
         smoothed=smoothed,
+        told_s=told_s,
+        told_std_m=told_std_m,
     )
-    return np.where(np.isnan(told), modelled, told)
 
 
 def find_common_scale_std(facts: FuseFacts | None, stamp_ns: Ints, clock_epoch: Ints) -> Floats:

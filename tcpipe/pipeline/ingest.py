@@ -53,6 +53,7 @@ from tcpipe.pipeline.log_sources import (
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
+from tcpipe.recipe import TimeWindow
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_problems
 from tcpipe.tables.options import as_function
@@ -122,8 +123,12 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
         tasks = [IngestTask(source, *how) for source in found.sources]
         own = range(len(tasks)) if shard is None else select_shard(found.sources, shard)
         if options.on_found:
-            sizes = {tasks[at].source.name: tasks[at].source.size_bytes for at in own}
-            options.on_found({**dict.fromkeys(map(clean_line, found.problems), 0), **sizes})
+            options.on_found(
+                {
+                    **dict.fromkeys(map(clean_line, found.problems), 0),
+                    **{tasks[at].source.name: tasks[at].source.size_bytes for at in own},
+                }
+            )
         results: dict[int, IngestResult] = {}
 
         def tell(ended: Iterable[tuple[int, IngestResult]]) -> IngestSummary:
@@ -152,11 +157,28 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
             queue.remove_expired_claims()
         if log.state.number != before.number and log.state.runs:
             opened.write_index(log.state, before=before)
+        _warn_of_unmatched_windows(ruling.mask.windows, log.state)
         return summary
 
 
 ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
+
+
+_MOST_RUNS = 5
+"""So many runs are named."""
+
+
+def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> None:
+    """Log a line for each pattern of time windows that fits no run of the store."""
+    run_ids = sorted({row.run_id for row in state.runs.values()})
+    more = f" and {len(run_ids) - _MOST_RUNS} more" if len(run_ids) > _MOST_RUNS else ""
+    for pattern, window in {of.run: of for of in windows}.items():
+        if run_ids and not any(map(window.is_for, run_ids)):
+            text = (
+                "recipe mask.windows (or its CSV file): run = %r fits no run, so its windows have no effect; runs: %s%s"
+            )
+            logger.warning(text, pattern, ", ".join(run_ids[:_MOST_RUNS]), more)
 
 
 def find_broken(store: Store, state: State, sources: Iterable[LogSource]) -> set[tuple[str, str]]:

@@ -15,7 +15,7 @@ from tcpipe.formats.bucket_directories import fetch_directory_by_range, has_card
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.logs.log_file import is_log_file, list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
-from tcpipe.formats.logs.table_folders import find_table_logs, list_table_files
+from tcpipe.formats.logs.table_folders import find_table_logs, is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
@@ -170,12 +170,16 @@ def _inspect_in_store(path: Path | str) -> InspectedStore | InspectedRun | None:
 def _inspect_logs_or_tables(
     path: Path, recipe: Recipe, ask: Callable[[Path | str], InspectedLog]
 ) -> InspectedLog | InspectedLogs | InspectedTables:
-    if not path.is_dir():
+    is_alone = is_table(path.name) and not recipe.tables
+    if not path.is_dir() and not is_alone:
         return ask(path)
     logs = [*list_logs_below(path), *(files[0] for files in find_table_logs(path, recipe.tables))]
-    if logs or not (tables := list_table_files(path)):
+    if logs or not (is_alone or list_table_files(path)):
         return _inspect_logs_at(logs, path, ask)
-    return _inspect_tables(path, tables)
+    from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
+
+    found, columns = propose_tables(path)
+    return InspectedTables(path=str(path), columns=columns, recipe=found.toml())
 
 
 def _inspect_logs_at(
@@ -244,17 +248,5 @@ class InspectedTables:
     path: str
     columns: Mapping[str, tuple[str, ...]]
     """By file, what its columns are called."""
-    problems: Mapping[str, str]
-    """By file, why it cannot be read."""
     recipe: str
-    """TOML; "" where no column has a known name."""
-
-
-def _inspect_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
-    from tcpipe.pipeline.table_proposals import propose_tables, read_columns  # noqa: PLC0415  polars only where a table is read
-
-    columns, problems = read_columns(folder, files)
-    found = propose_tables(folder, columns, problems.values())
-    return InspectedTables(
-        path=str(folder), columns=columns, problems=problems, recipe=found.toml() if found.lines else ""
-    )
+    """What ``tcpipe init --from`` would write [TOML]."""

@@ -19,6 +19,7 @@ from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SECOND_NS, SIMULATED_NS, Timeli
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic, split_notes
 from tcpipe.pipeline.log_sources import find_damaged_log, find_total_loss
+from tcpipe.pipeline.proposals import propose_for_log
 from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
 from tcpipe.robots import Profiles
@@ -103,14 +104,19 @@ class InspectedLog:
     findings: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
     damage: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
     notes: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
+    recipe: str | None = field(default=None, metadata=ABSENT)
+    """What ``tcpipe init --from`` would write, less what the recipe settles [TOML]."""
 
 
-def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full: bool) -> InspectedLog:
+def inspect_log(
+    log: Log | TableLog, recipe: Recipe, robot: str | None, *, full: bool, reads_roles: bool = False
+) -> InspectedLog:
     """Return what a log holds.
 
     Parameters
     ----------
     full : read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
+    reads_roles : read all messages of the used topics for the proposed recipe, not the first ones.
     """
     known = load_profiles(recipe)
     config = find_read_config(recipe, log.topics)
@@ -123,9 +129,11 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
         topics, steps = _read(log, topics)
     damage, notes = split_notes(log.findings)
     lost = find_total_loss(log.topics.values(), damage)
+    proposals = find_proposals(log, cast, config, known)
+    proposed = propose_for_log(log, cast, recipe, proposals, is_complete=reads_roles)
     findings = (
         *(() if lost else cast.findings),
-        *find_proposals(log, cast, config, known),
+        *(replace(finding, remedies=()) for finding in proposals),  # they are in the proposed recipe
         *_find_simulated_time(log.topics.values()),
         *_find_slow_power(log, cast, recipe, known),
         *find_damaged_log(damage, Subject("log", str(log.path))),
@@ -147,6 +155,7 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
         findings=tuple(sort_findings(findings)),
         damage=damage,
         notes=notes,
+        recipe=proposed.toml(),
     )
 
 

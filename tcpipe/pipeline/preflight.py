@@ -140,6 +140,8 @@ class Preflight:
     """The command that records all that may be of use; "" where the log is no recording of ROS."""
     large: Mapping[str, float | None]
     """Images and point clouds, which it leaves out, with the messages that come of each a second."""
+    recipe: str
+    """What ``tcpipe init --from`` would write, less what the recipe settles [TOML]."""
     exit_code: int
     """0 ready; 3 there are warnings, errors or no segments; 1 ingest would fail."""
 
@@ -158,7 +160,7 @@ class Preflight:
         rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())
         said += [f"large     images and point clouds, which this command does not record: {rates}"] if rates else []
         said += ["ready: no problems found"] if self.exit_code == 0 else []
-        return clean_lines(said)
+        return clean_lines([*said, "", *self.recipe.splitlines()])
 
 
 def _rate(of: RoleTopic) -> str:
@@ -185,7 +187,7 @@ def preflight(
     if isinstance(path, Path) and path.is_dir():
         path = find_logs_at(path, recipe.tables)[0][0]
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as found:
-        seen = replace(inspect_log(found, recipe, robot, full=False), path=format_path(log))
+        seen = replace(inspect_log(found, recipe, robot, full=False, reads_roles=True), path=format_path(log))
         topics = tuple(found.topics.values())
         read = find_read_config(recipe, found.topics)
         cast = decide_roles(read, topics, robot, known=load_profiles(recipe))
@@ -216,7 +218,7 @@ def _summarize(
     expected_yield = _estimate_yield(labelled) if labelled else None
     topics = tuple(_iterate_topics(report.facts, seen.duration_s or 0.0))
     findings = [*missing, *find_slow(topics, expected_yield, seen.duration_s or 0.0)]
-    for more in (report.findings, seen.findings or ()):
+    for more in (seen.findings or (), report.findings):
         made = {(of.code, of.subject) for of in findings}
         findings += [of for of in more if (of.code, of.subject) not in made]
     ready = expected_yield is not None and expected_yield.segments and all(of.severity == "note" for of in findings)
@@ -231,6 +233,7 @@ def _summarize(
         losses=_find_largest_losses(expected_yield),
         record=record,
         large=large,
+        recipe=seen.recipe or "",
         exit_code=0 if ready else 3 if expected_yield else 1,
     )
 

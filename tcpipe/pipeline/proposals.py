@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -19,10 +19,11 @@ from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.field_mapping import MAPPED, MAPPED_TYPES, Columns, list_number_fields
 from tcpipe.logs.fix_quality import find_quality
-from tcpipe.logs.messages import LOG_TIME, count_frames
+from tcpipe.logs.messages import count_frames
 from tcpipe.logs.roles import TWIST, TWIST_STAMPED, RoleAssignment
+from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import find_sources, list_power_lists, read_rails
-from tcpipe.recipe import ReadConfig, Recipe, Role
+from tcpipe.recipe import Recipe, Role
 from tcpipe.recipe.suggestions import (
     ProposedLine,
     ProposedRecipe,
@@ -34,7 +35,7 @@ from tcpipe.recipe.suggestions import (
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.proposals import find_proposals
-from tcpipe.stages.read_roles import decide_roles
+from tcpipe.stages.read_roles import decide_roles, find_read_config
 from tcpipe.stages.read_sources import place_frames
 from tcpipe.store import is_store
 from tcpipe.tables.findings import Finding
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 def propose_recipe(
     path: Path | str, *, robot: str | None = None, message_definitions: Path | None = None
 ) -> ProposedRecipe:
-    """Return the recipe that a log proposes, or the first of a folder's, or the tables in a folder.
+    """Return the recipe for a log, or the first of a folder's, or the tables in a folder, whatever recipe there is.
 
     Raises
     ------
@@ -59,11 +60,9 @@ def propose_recipe(
     if isinstance(path, Path) and (is_table(path.name) or (path.is_dir() and not is_one_bag(path))):
         logs = list_logs_below(path) if path.is_dir() else []
         if not logs:
-            from tcpipe.pipeline.table_proposals import propose_tables, read_columns  # noqa: PLC0415  polars only where a table is read
+            from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
 
-            folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
-            columns, problems = read_columns(folder, files)
-            found = propose_tables(folder, columns, problems.values())
+            found, _ = propose_tables(path)
             if not found.lines:
                 raise UsageError(
                     f"{path}: it contains no log, and no table with stamps and columns of known names", *found.head
@@ -75,20 +74,38 @@ def propose_recipe(
         path = logs[0]
     else:
         others = []
+    recipe = Recipe()
     with open_single_log(path, message_definitions=message_definitions, tables=None) as log:
-        found = _propose_for_log(log, robot, format_path(path))
-        return replace(found, head=[*others, *found.head])
+        config, known = recipe.read, load_profiles(recipe)
+        assigned = decide_roles(config, log.topics.values(), robot, known=known)
+        proposals = find_proposals(log, assigned, config, known)
+        found = propose_for_log(log, assigned, recipe, proposals, is_complete=True)
+        return replace(found, head=[*others, *found.head], log=format_path(path))
 
 
-def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> ProposedRecipe:
-    config, known = ReadConfig(), load_profiles(Recipe())
-    assigned = decide_roles(config, log.topics.values(), robot, known=known)
-    proposals = find_proposals(log, assigned, config, known)
+def propose_for_log(
+    log: Log | TableLog, assigned: RoleAssignment, recipe: Recipe, proposals: Iterable[Finding], *, is_complete: bool
+) -> ProposedRecipe:
+    """Return the recipe for a log as ``init --from`` writes it: what a recipe does not settle yet.
+
+    Parameters
+    ----------
+    proposals : what `find_proposals` finds in it.
+    is_complete : read all messages of the used topics. If not, values are those of the first messages, and what only moving transforms
+        could tell of a sensor's place is left out.
+    """
+    config, known = find_read_config(recipe, log.topics), load_profiles(recipe)
     used = {name: role for role, names in assigned.choices.items() for name in names}
     used |= {name: role.name for role in assigned.roles.values() for name in role.topics}
     used |= {of.subject.name: of.names["role"] for of in proposals if of.code == "role-proposed"}
     types = {name: log.topics[name].type_name for name in used}
-    tables = log.tables(list(dict.fromkeys([*used, *assigned.static_transforms])))
+    unread = set[str]()
+    if is_complete:
+        tables = log.tables(list(dict.fromkeys([*used, *assigned.static_transforms])))
+    else:
+        tables = {**log.first_rows(used), **log.tables(assigned.static_transforms)}
+        unread = {*assigned.transforms} - {*assigned.static_transforms}
+        assigned = replace(assigned, transforms=assigned.static_transforms)
     lists = {name: list_power_lists(kind, known.power_sources) for name, kind in types.items()}
     columns = {name: make_message_arrays(tables[name], lists[name]) for name in used if name in tables}
     frames: dict[Role, str] = {}
@@ -98,13 +115,11 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
     head = ["", f"robot: {assigned.robot}, {assigned.robot_why}"]
     for role in assigned.roles.values():
         pose, by = places.get(cast("Role", role.name), (None, ""))
-        place = f"; at {np.round(pose.xyz_m, 3).tolist()} m ({by})" if pose and by == "tf_static" else ""
-        samples = {
-            name: _describe_sample(columns.get(name, {}), types[name], name, role.name, (assigned, known))
-            for name in role.topics
-        }
-        head += [f"{role.name}: {name}{sample}{place}" for name, sample in samples.items()]
-    decided = {*assigned.roles, *assigned.choices}
+        place = f"; at {np.round(pose.xyz_m, 3).tolist()} m ({by})" if pose and by in ("tf_static", "recipe") else ""
+        for name in role.topics:
+            sample = _describe_sample(columns.get(name, {}), log.topics[name], role.name, (assigned, known))
+            head.append(f"{role.name}: {name}{sample}{place}")
+    decided = {*assigned.roles, *assigned.choices, *config.topics}
     lacking = [role for role in ("gnss", "imu", "wheel_odometry", "power", "command") if role not in decided]
     head += [f"not found: {', '.join(lacking)}"] if lacking else []
     lines = [*_iterate_questions(assigned, log)]
@@ -116,11 +131,12 @@ def _propose_for_log(log: Log | TableLog, robot: str | None, path: str) -> Propo
             fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
             lines += [propose_quality("read.fields", "gnss.quality", of) for of in fields]
     unplaced = [
-        (role, frames[role]) for role, (_, by) in places.items() if by == "assumed" and role != "wheel_odometry"
+        (role, frames[role])
+        for role, (_, by) in places.items()
+        if by == "assumed" and role != "wheel_odometry" and not unread
     ]
-    return ProposedRecipe(
-        [*head, "", "These need no line."], [*lines, *propose_decisions(unplaced, [*decided, *used.values()])], path
-    )
+    lines += propose_decisions(unplaced, {*used.values()}, keeps_reversing=recipe.mask.keep_reversing)
+    return ProposedRecipe([*head, "", "These need no line."], lines, str(log.path))
 
 
 def _format_ranges(numbers: Mapping[str, float]) -> str:
@@ -140,14 +156,14 @@ def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterato
         yield ProposedLine("read.topics", "command", twists[:1], "if it commands the velocity", is_certain=False)
 
 
-def _describe_sample(columns: Columns, kind: str, topic: str, role: str, by: tuple[RoleAssignment, Profiles]) -> str:
+def _describe_sample(columns: Columns, topic: Topic, role: str, by: tuple[RoleAssignment, Profiles]) -> str:
     """Return how many messages a topic has, and values by what its role needs."""
-    assigned, known = by
-    count = f", {len(columns[LOG_TIME])} messages" if columns else ""
+    (assigned, known), kind = by, topic.type_name
+    count = "" if topic.message_count is None else f", {topic.message_count} messages"
     if role == "power":
         platform = known.robots[assigned.robot].platform
-        choices = find_sources(kind, topic, known.power_sources, platform=platform, husky_power="battery")
-        rails = [] if isinstance(choices, Finding) else read_rails(columns, choices[0], topic)
+        choices = find_sources(kind, topic.name, known.power_sources, platform=platform, husky_power="battery")
+        rails = [] if isinstance(choices, Finding) else read_rails(columns, choices[0], topic.name)
         read = [] if isinstance(rails, Finding) else rails
         return count + "".join(f", {format_first(of.voltage_volt)} V, {format_first(of.current_amp)} A" for of in read)
     needed = [(name, of.message) for name, of in MAPPED[role].items() if of.needed and of.message in columns]

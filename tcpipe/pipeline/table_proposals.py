@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
+from tcpipe.formats.logs.table_folders import list_table_files
 from tcpipe.formats.logs.table_log import describe_duplicate, read_cells, read_column_names, read_values
 from tcpipe.formats.object_storage import format_path
 from tcpipe.logs.expressions import UNITS, parse_expression, split_unit
@@ -69,29 +70,23 @@ class _Table:
         return max(min(self.span_ns[1], other.span_ns[1]) - max(self.span_ns[0], other.span_ns[0]), 0)
 
 
-def read_columns(folder: Path, files: Sequence[Path]) -> tuple[dict[str, tuple[str, ...]], dict[str, str]]:
-    """Return by file what its columns are called, and why some cannot be read."""
-    columns: dict[str, tuple[str, ...]] = {}
-    problems: dict[str, str] = {}
-    for file in files:
-        name = file.relative_to(folder).as_posix()
-        try:
-            columns[name] = tuple(read_column_names(file))
-        except LogError as error:
-            problems[name] = str(error)
-    return columns, problems
+def propose_tables(path: Path) -> tuple[ProposedRecipe, dict[str, tuple[str, ...]]]:
+    """Return the recipe for a table, or those in a folder, that have known names, and by file what its columns are called.
 
-
-def propose_tables(folder: Path, columns: Mapping[str, Sequence[str]], problems: Iterable[str] = ()) -> ProposedRecipe:
-    """Return the recipe for the tables that have known names: of several for a role, that which covers the drive of the others best.
-
-    ``columns`` and ``problems`` are what `read_columns` returns of the folder's files.
+    Of several tables for a role, that is used which covers the drive of the others best. The recipe's head names what cannot be read.
     """
+    folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
+    columns: dict[str, tuple[str, ...]] = {}
+    head = list[str]()
+    for file in files:
+        try:
+            columns[file.relative_to(folder).as_posix()] = tuple(read_column_names(file))
+        except LogError as error:
+            head.append(str(error))
     roles: dict[str, list[tuple[_Table, list[ProposedLine]]]] = {}
-    head = [*problems]
-    for name, path in _group_files(folder, [folder / file for file in columns]).items():
-        names = columns[path.relative_to(folder).as_posix()]
-        table = _read_table(name, path, names)
+    for name, largest in _group_files(folder, [folder / file for file in columns]).items():
+        names = columns[largest.relative_to(folder).as_posix()]
+        table = _read_table(name, largest, names)
         found = [(role, (table, lines)) for role, lines in _iterate_roles(table)] if table else []
         for role, candidate in found:
             roles.setdefault(role, []).append(candidate)
@@ -99,7 +94,7 @@ def propose_tables(folder: Path, columns: Mapping[str, Sequence[str]], problems:
             why = "no known fields" if table else "no stamps"
             head.append(f"{name} is not used, {why} in its columns {', '.join(names)}")
     ranked = [of for candidates in roles.values() for of in sorted(candidates, key=lambda of: -of[0].rows)[:1]]
-    lines, log = list[ProposedLine](), folder
+    lines, log = list[ProposedLine](), path
     for role, candidates in roles.items():
         first = ranked[0][0]
         candidates.sort(key=lambda of: (-of[0].overlap_ns(first), -of[0].rows))
@@ -111,7 +106,7 @@ def propose_tables(folder: Path, columns: Mapping[str, Sequence[str]], problems:
     with_voltage = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
     lines = [line for line in lines if line.note != NO_VOLTAGE or make_rail_name(line.table) not in with_voltage]
     lines += propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)
-    return ProposedRecipe(head, lines, format_path(log))
+    return ProposedRecipe(head, lines, format_path(log)), columns
 
 
 def _group_files(folder: Path, files: Sequence[Path]) -> dict[str, Path]:

@@ -18,10 +18,13 @@ from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import require_card
+from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, format_verdict
 from tcpipe.formats.json_files import write_json
+from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import (
     CostModel,
@@ -36,6 +39,7 @@ from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
 from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
@@ -131,7 +135,9 @@ def find_drive(store: Store, log: str) -> RunDirectory:
     return found[0]
 
 
-def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str) -> DriveCost:
+def compute_drive_cost(
+    model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
+) -> DriveCost:
     """Return what a drive took beside what a model says of it.
 
     Parameters
@@ -140,6 +146,7 @@ def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, d
     run : the drive, ingested.
     data : the dataset that the model was trained on: what of the drive it has seen.
     log : what the user calls it.
+    shifts : of runs on the map.
 
     Raises
     ------
@@ -153,8 +160,9 @@ def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, d
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
     segments = segments.sort_by("start_ns")
-    said = _predict_drive(model, source, segments, data)
-    reasons, energy = _list_reasons(model, segments, said, data), ENERGIES[model.label_energy].energy
+    shift_m = np.array((shifts or {}).get(run.run_id, (0.0, 0.0, 0.0)))
+    said = _predict_drive(model, source, segments, data, shift_m[:2])
+    reasons, energy = _list_reasons(model, segments, said, data, shift_m[2]), ENERGIES[model.label_energy].energy
     length_m, good = to_floats(segments, "arc_length_m"), np.array([not why for why in reasons])
     named = sorted({name for why in reasons for name in why})
     trained = data["train"]
@@ -180,10 +188,12 @@ def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, d
     )  # fmt: skip
 
 
-def _predict_drive(model: CostModel, source: MapReader, segments: pa.Table, data: Dataset) -> SegmentPredictions:
-    """Return what the model says of each segment, where it was driven."""
+def _predict_drive(
+    model: CostModel, source: MapReader, segments: pa.Table, data: Dataset, shift_m: Floats
+) -> SegmentPredictions:
+    """Return what the model says of each segment, on its ground by the map: where it was driven, moved by a shift (x, y)."""
     projection = find_map_projection(source, data.card.recipe.read.gnss_crs)
-    start, end = (projection.forward(read_lonlat_deg(segments, name)) for name in ("start", "end"))
+    start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m for name in ("start", "end"))
     turn_radpm = (
         to_floats(segments, "mean_abs_yaw_rate_radps")
         * to_floats(segments, "duration_s")
@@ -193,9 +203,12 @@ def _predict_drive(model: CostModel, source: MapReader, segments: pa.Table, data
     return join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
 
 
-def _list_reasons(model: CostModel, segments: pa.Table, said: SegmentPredictions, data: Dataset) -> list[list[str]]:
+def _list_reasons(
+    model: CostModel, segments: pa.Table, said: SegmentPredictions, data: Dataset, shift_std_m: float
+) -> list[list[str]]:
     """Return why each segment is not compared; nothing where it is."""
-    uncertain = to_floats(segments, "position_std_m") > data.card.recipe.sample.max_position_std_m
+    std_m = np.hypot(to_floats(segments, "position_std_m"), shift_std_m)
+    uncertain = std_m > data.card.recipe.sample.max_position_std_m
     unlabelled = ~np.isfinite(
         to_floats(segments, ENERGIES[model.label_energy].energy) + to_floats(segments, "duration_s")
     )
@@ -295,9 +308,11 @@ class DrivesResult:
 
 
 def evaluate_drives(
-    model: CostModel, data: Dataset, source: MapReader, logs: Sequence[str], *, store: str | Path, out: str | Path
+    model: CostModel, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
 ) -> DrivesResult:
     """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``, or to a URL.
+
+    Where the dataset's runs were moved onto their map (``sample.align``), drives are moved by the same method, or a finding says why not.
 
     Raises
     ------
@@ -312,11 +327,16 @@ def evaluate_drives(
     clear(place)
     if place.exists() and not place.is_dir():
         raise UsageError(f"{place}: is a file, expected a directory to write {JSON} and {PAGE} into")
-    found = tuple(compute_drive_cost(model, source, run, data, log=log) for run, log in zip(runs, logs, strict=True))
-    held, findings = (
-        [drive for drive in found if drive.held_back],
-        tuple(_find_doubts(found, Subject("model", model.name))),
+    recipe, shifts, moved = data.card.recipe, dict[str, tuple[float, float, float]](), list[Finding]()
+    if recipe.sample.align:
+        registrations, moved = register_runs(runs, source, recipe)
+        shifts = list_shifts(registrations)
+    found = tuple(
+        compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
+        for run, log in zip(runs, logs, strict=True)
     )
+    held = [drive for drive in found if drive.held_back]
+    findings = (*_find_doubts(found, Subject("model", model.name)), *moved)
     values = Drives(
         model=model.name, model_checksum=model.checksum, drives=found,
         duration_s=_sum([drive.duration_s for drive in held]), energy_joule=_sum([drive.energy_joule for drive in held]),

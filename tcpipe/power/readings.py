@@ -261,7 +261,7 @@ def _find_incomplete(rails: Rails) -> list[Finding]:
 
 
 def _find_too_small(rails: Rails) -> list[Finding]:
-    """Return why rails together are no power: no robot drives with so little, their unit is another one."""
+    """Return why rails together are no power: the smallest motors take more without load, their unit is another one."""
     parts = [(topic, rail) for topic, found in rails.items() for rail in found]
     volts = {rail.name: np.nanmedian(rail.voltage_volt) for _, rail in parts if np.isfinite(rail.voltage_volt).any()}
     amps = {

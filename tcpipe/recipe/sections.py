@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
 from tcpipe.recipe.checking import parse_utc_ns, validate_fields
@@ -163,6 +164,10 @@ class TimeWindow:
             start_ns, end_ns = self.find_bounds_ns(0)
             if start_ns >= end_ns:
                 yield "end", "a time after start"
+
+    def is_for(self, run_id: str) -> bool:
+        """Return whether it is for a run: the pattern fits its id, or the name of its log."""
+        return any(fnmatchcase(name, self.run) for name in (run_id, run_id.rpartition("-")[0]))
 
     def find_bounds_ns(self, first_ns: int) -> tuple[int, int]:
         """Return start and end [ns] in a track that starts at ``first_ns``."""

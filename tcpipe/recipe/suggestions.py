@@ -9,7 +9,7 @@ from functools import cache
 from math import isfinite
 from typing import Any, TypeAlias
 
-from tcpipe.errors import RecipeError
+from tcpipe.errors import RecipeError, clean_line
 from tcpipe.recipe.checking import as_toml, from_values, read_annotations
 from tcpipe.recipe.sections import Recipe
 from tcpipe.tables.findings import Remedy
@@ -91,13 +91,14 @@ class ProposedRecipe:
 
     def toml(self) -> str:
         """Return the file. The head of a table of decisions alone is a comment too; those of ``read`` and ``mask`` may be empty."""
-        what = "Comments below it need a decision: remove the # and correct the value."
-        text = ["# Proposed by tcpipe init --from. " + what, *(f"# {line}".rstrip() for line in self.head)]
+        is_open = any(not line.is_certain for line in self.lines)
+        what = " Comments below it need a decision: remove the # and correct the value." if is_open else ""
+        text = [f"# Proposed by tcpipe init --from.{what}", *(f"# {clean_line(line)}".rstrip() for line in self.head)]
         tables = dict.fromkeys(line.table for line in sorted(self.lines, key=lambda line: bool(line.table)))
         for table in tables:
             mine = [line for line in self.lines if line.table == table]
-            is_open = any(line.is_certain for line in mine) or table.startswith(("read.", "mask"))
-            text += ["", *([f"{'' if is_open else '# '}[{table}]"] if table else [])]
+            is_head = any(line.is_certain for line in mine) or table.startswith(("read.", "mask"))
+            text += ["", *([f"{'' if is_head else '# '}[{table}]"] if table else [])]
             for line in mine:
                 note = f"  # {' '.join(line.note.split())}" if line.note else ""
                 text.append(f"{'' if line.is_certain else '# '}{line.key} = {as_toml(line.value)}{note}")
@@ -120,13 +121,15 @@ def propose_lines(
                 yield ProposedLine(table, name, text, notes.get(name.rpartition(".")[2], doubt), not doubt)
 
 
-def propose_decisions(frames: Iterable[tuple[str, str]], roles: Collection[str]) -> Iterator[ProposedLine]:
+def propose_decisions(
+    frames: Iterable[tuple[str, str]], roles: Collection[str], *, keeps_reversing: bool = False
+) -> Iterator[ProposedLine]:
     """Yield what only a person knows: where sensors are mounted, by role and frame, and whether a robot with fixes alone reversed."""
     for role, frame in frames:
         turn = {} if role == "gnss" else {"rpy_rad": [0.0, 0.0, 0.0]}
         note = f"measure it from base_link: nothing places {frame or 'it'}"
         yield ProposedLine("read.extrinsics", role, {"xyz_m": [0.0, 0.0, 0.0], **turn}, note, is_certain=False)
-    if "gnss" in roles and not {"wheel_odometry", "visual_odometry"} & {*roles}:
+    if not keeps_reversing and "gnss" in roles and not {"wheel_odometry", "visual_odometry"} & {*roles}:
         note = "if it never reversed: fixes alone do not tell forward from backward"
         yield ProposedLine("mask", "keep_reversing", True, note, is_certain=False)
 

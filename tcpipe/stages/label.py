@@ -22,7 +22,7 @@ from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_p
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
-from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, interpolate_durations_m
+from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m
 from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import (
     IdlePower,
@@ -192,7 +192,6 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     duration_s = (end_ns - start_ns).astype(np.float64) * 1e-9
     told_m = np.column_stack([interpolate(stamp_ns, to_floats(rows, name), start_ns) for name in _DISPLACEMENTS])
-    told = interpolate_durations_m(duration_s, told_s=DISPLACEMENT_LAGS_S, told_std_m=told_m)
     start_std_m, end_std_m = (
         compute_along_std_m(
             interpolate(stamp_ns, to_floats(rows, "x_std_m"), at_ns),
@@ -201,14 +200,15 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
         )
         for at_ns in (start_ns, end_ns)
     )
-    modelled = compute_displacement_std_m(
+    return compute_displacement_std_m(
         velocity_std_mps=mean_between(stamp_ns, to_floats(rows, "forward_velocity_std_mps"), start_ns, end_ns),
         duration_s=duration_s,
         start_std_m=start_std_m,
         end_std_m=end_std_m,
         smoothed=smoothed,
+        told_s=DISPLACEMENT_LAGS_S,
+        told_std_m=told_m,
     )
-    return np.where(np.isnan(told), modelled, told)
 
 
 _EDGE_S = 0.3

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 
 import numpy as np
 
@@ -89,8 +88,7 @@ def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[M
     """
     stamp_ns, run_id = to_integers(track.table, "stamp_ns"), track.info.run_id
     dropped, kept, empty = np.zeros(len(stamp_ns), np.bool_), np.zeros(len(stamp_ns), np.bool_), 0
-    names = (run_id, run_id.rpartition("-")[0])
-    mine = [of for of in windows if len(stamp_ns) and any(fnmatchcase(name, of.run) for name in names)]
+    mine = [of for of in windows if len(stamp_ns) and of.is_for(run_id)]
     for window in mine:
         start_ns, end_ns = window.find_bounds_ns(int(stamp_ns[0]))
         inside = (stamp_ns >= start_ns) & (stamp_ns < end_ns)

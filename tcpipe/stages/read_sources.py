@@ -190,7 +190,7 @@ def place_sensors(
             names = {"frame": frame, "frames": ", ".join(several)}
             findings.append(make_finding("several-frames", subject, names=names, frames_count=len(several)))
         if placed_by == "assumed":
-            names = {"frame": frame or "an unnamed frame", "topic": of_role[role][0].topic}
+            names = {"frame": frame or "the sensor", "topic": of_role[role][0].topic}
             remedies = suggest("place", {"read.extrinsics": {role: asdict(Extrinsics())}})
             findings.append(make_finding("sensor-not-placed", subject, names=names, remedies=remedies))
         sensors[role] = Sensor(

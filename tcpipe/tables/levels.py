@@ -211,8 +211,9 @@ _TRACK_COLUMNS = (
             f"standard deviation of the horizontal displacement over the next {name}, along it, including the correlation of both ends; "
             "null where the track does not go on, and without a smoother",
             "enu",
+            since,
         )
-        for name in ("500ms", "1s", "2s", "4s")
+        for name, since in (("500ms", ""), ("1s", ""), ("2s", ""), ("4s", ""), ("8s", "3.0"), ("16s", "3.0"))
     ),
     _make_nullable(
         "wheel_velocity_mps", "m/s", "forward velocity by the wheels, interpolated; null without", "base_link"

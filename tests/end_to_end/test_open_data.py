@@ -161,6 +161,25 @@ def test_a_map_is_of_the_newest_heights_around_the_track(site):
     assert "licence: CC0" in inspected.stdout
 
 
+@pytest.mark.parametrize("is_redacted", [False, True])
+def test_the_licence_goes_with_every_card_of_a_dataset(site, is_redacted):
+    assert site.run().returncode == 0
+    done = tcpipe(
+        "build-dataset", "built", "--store", site.store, *(["--redact"] if is_redacted else []), cwd=site.path
+    )
+    assert done.returncode == 0, done.stderr
+    credit = "CC0: https://example.org/licence"
+    hub, croissant, card = (
+        (site.path / "built" / name).read_text() for name in ("README.md", "croissant.json", "dataset.json")
+    )
+    assert f"Open data in the layers height, ortho: {credit}" in hub
+    assert json.loads(croissant)["creditText"] == f"height, ortho: {credit}"
+    (made_of,) = json.loads(card)["maps"]
+    urls = {of.get("url", "").rpartition("/")[2] for of in made_of["origins"]}
+    assert urls == ({""} if is_redacted else {"old_east.tif", "new_west.tif", "photo.tif"})
+    assert (site.server.url in hub + croissant + card) is not is_redacted
+
+
 def test_the_same_call_again_reads_no_pixel_and_a_newer_survey_needs_force(site):
     assert site.run().returncode == 0
     site.server.requests.clear()

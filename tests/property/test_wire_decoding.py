@@ -12,7 +12,7 @@ from rosbags.typesys import get_types_from_msg
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_part import MessageBlock
 from tcpipe.formats.logs.ros_types import MessageType
-from tcpipe.logs.wire_layout import LayoutError, walk_layout
+from tcpipe.logs.wire_cursors import find_dialect, walk
 from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, Scalar, Text, convert_wide_texts, record
 
 CODES = ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
@@ -149,14 +149,10 @@ def _ambiguous(of, payloads, form):
     """Whether another form of wide strings fits as many messages, so that nothing can tell."""
 
     def fitting(of):
-        count = 0
-        for payload in payloads[:32]:
-            try:
-                walk_layout(of, payload, encoding="cdr")
-                count += 1
-            except LayoutError:
-                pass
-        return count
+        some = [np.frombuffer(payload, np.uint8) for payload in payloads[:32]]
+        start = np.zeros(1, np.int64)
+        walks = (walk(of, one, start, start + len(one), find_dialect(one.tobytes(), "cdr")) for one in some)
+        return sum(bool(walked.fits[0]) for walked in walks)
 
     others = [fitting(convert_wide_texts(of, other)) for other in WIDE_FORMS if other != form]
     return convert_wide_texts(of, WIDE_FORMS[0]) != convert_wide_texts(of, WIDE_FORMS[1]) and max(others) >= fitting(

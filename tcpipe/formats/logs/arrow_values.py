@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.logs.wire_cursors import Fields, Int64Array, Lists, Runs, Scalars, Values
+from tcpipe.logs.wire_cursors import Fields, Grid, Int64Array, Lists, Runs, Scalars, Values
 from tcpipe.logs.wire_types import Array, Record, Scalar, Text, WireType
 from tcpipe.tables.arrays import number_column
 
@@ -85,10 +85,12 @@ class IrregularColumns:
                 elements = number_column(np.frombuffer(self._compact(values)[1], dtype))
                 return make_lists(elements, values.lengths // dtype.itemsize, of.length)
             case Runs(kind=str() as codec), Text():
-                found, replaced = make_texts(len(values.offsets), *self._compact(values), codec)
+                found, replaced = make_texts(len(values.lengths), *self._compact(values), codec)
                 self.replaced_texts += replaced
                 return found
-            case Scalars(offsets=offsets, dtype=dtype), Scalar():
+            case Scalars(places=Grid() as grid, dtype=dtype), Scalar():
+                return number_column(grid.view(self._data, dtype))
+            case Scalars(places=np.ndarray() as offsets, dtype=dtype), Scalar():
                 shape = (max(len(self._data) - dtype.itemsize + 1, 0),)
                 windows: NDArray[np.void] = np.ndarray(
                     shape, f"V{dtype.itemsize}", self._data if shape[0] else b"", 0, (1,)
@@ -101,9 +103,13 @@ class IrregularColumns:
 
         As runs rise, their bounds are those of an Arrow array in which every other element is a gap: `take` leaves the gaps out.
         """
-        count = len(runs.offsets)
+        count = len(runs.lengths)
+        if isinstance(runs.places, Grid):
+            length = int(runs.lengths[0])
+            copied = runs.places.view(self._data, np.dtype(np.uint8), length)
+            return pa.py_buffer((np.arange(count + 1) * length).astype(np.int32)), pa.py_buffer(copied)
         bounds = np.empty(2 * count, np.int32)
-        bounds[0::2], bounds[1::2] = runs.offsets, runs.offsets + runs.lengths
+        bounds[0::2], bounds[1::2] = runs.places, runs.places + runs.lengths
         if not count:
             return pa.py_buffer(np.zeros(1, np.int32)), pa.py_buffer(b"")
         buffers = [None, pa.py_buffer(bounds), pa.py_buffer(self._data)]

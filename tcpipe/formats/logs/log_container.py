@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
+from shlex import quote
 
 from tcpipe.errors import LogError
 from tcpipe.formats.atomic import make_scratch_directory
@@ -13,6 +14,7 @@ from tcpipe.formats.logs.log_part import FetchedFile, LogPart
 from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompress_file
 from tcpipe.formats.logs.sqlite_file import SqlitePart
+from tcpipe.formats.logs.table_folders import is_table
 from tcpipe.logs.topics import AutopilotKind
 
 WANTED = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg, ArduPilot's .bin or tables that the recipe maps"
@@ -48,7 +50,10 @@ def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | No
         part = SqlitePart(path, name)
     else:
         held = "" if path == given else "what it holds, decompressed: "
-        raise LogError(f"{given}: not a log: {held}{_describe_other_file(path, magic)}; {WANTED}")
+        wanted = (
+            f"'tcpipe init --from {quote(str(given))}' writes a recipe for a table" if is_table(given.name) else WANTED
+        )
+        raise LogError(f"{given}: not a log: {held}{_describe_other_file(path, magic)}; {wanted}")
     stack.callback(part.close)
     return part
 

@@ -275,6 +275,17 @@ class Log(OpenLog):
         (tables,) = self.batches(topics, batch_bytes=None, threads=threads)
         return tables
 
+    def first_rows(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+        """Return the first rows of several topics, as `tables`; the log is read until each has some."""
+        found: dict[str, pa.Table] = {}
+        wanted = [name for name in topics if self.topics[name].message_count != 0]
+        if wanted:
+            for tables in self.batches(wanted, batch_bytes=0):
+                found = {**{name: table for name, table in tables.items() if table.num_rows}, **found}
+                if len(found) == len(wanted):
+                    break
+        return found
+
     def batches(
         self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES, threads: int = 1
     ) -> Iterator[dict[str, pa.Table]]:
@@ -284,7 +295,7 @@ class Log(OpenLog):
         log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time; `findings`
         counts those that do. Some is yielded when more than ``batch_bytes`` are gathered over all topics; None yields everything at once.
         """
-        collected = self._collectors(topics, in_pieces=batch_bytes is not None)
+        collected = self._collectors(topics)
         most = math.inf if batch_bytes is None else batch_bytes
         given = dict.fromkeys(collected, 0)
         held, size = 0, self.size_bytes
@@ -307,7 +318,7 @@ class Log(OpenLog):
             self._note_losses(name, of, given[name] + tables[name].num_rows)
         yield tables
 
-    def _collectors(self, topics: Iterable[str], *, in_pieces: bool) -> dict[str, TopicTable]:
+    def _collectors(self, topics: Iterable[str]) -> dict[str, TopicTable]:
         """Return an empty table for each topic that can be decoded."""
         wanted = list(dict.fromkeys(topics))
         unknown = [name for name in wanted if name not in self.topics]
@@ -327,15 +338,7 @@ class Log(OpenLog):
                 raise LogError(
                     f"{self.path}: its topics unfold to more than {MAX_COLUMNS} columns; read fewer of them at once"
                 )
-        return {
-            name: TopicTable(
-                of,
-                self.topics[name].encoding,
-                expected_rows=self.topics[name].message_count or 0,
-                in_pieces=in_pieces,
-            )
-            for name, of in types.items()
-        }
+        return {name: TopicTable(of, self.topics[name].encoding) for name, of in types.items()}
 
     def _blocks(
         self, index: int, collected: Mapping[str, TopicTable], threads: int

@@ -67,6 +67,8 @@ class TableLog(OpenLog):
         """Return the messages of several topics; `LogError` where one is not in the log."""
         return {name: table for tables in self.batches(topics) for name, table in tables.items()}
 
+    first_rows = tables
+
     def batches(self, topics: Iterable[str]) -> Iterator[dict[str, pa.Table]]:
         """Yield the messages of several topics, one topic after the other."""
         wanted = list(topics)

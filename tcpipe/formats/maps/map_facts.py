@@ -43,17 +43,17 @@ class RasterOrigin:
     """Where a raster of a map was taken from, of open data; the checksum of what was taken is among `MapInputs`."""
 
     layer: str
-    url: str
+    url: str = ""
     """Without a query."""
-    item: str
-    date: str
+    item: str = ""
+    date: str = ""
     """When it was surveyed, as the catalogue has it; empty where it does not."""
-    resolution: str
+    resolution: str = ""
     """Of a pixel, with the unit of its CRS."""
     vertical_datum: str | None = None
     """What heights refer to; None where the catalogue's entry does not say."""
     licence: str
-    to_read_bytes: int
+    to_read_bytes: int = 0
     """Of the part that was taken, as it is stored there."""
     version: str = ""
     """Of the whole raster as its server names it: ETag or time of change."""

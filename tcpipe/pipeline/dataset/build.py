@@ -390,6 +390,7 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         description=card.description,
         licence=card.licence,
         creator=card.creator,
+        attributions=card.attributions,
         files=files,
         samples_file=SAMPLES,
         samples=schema,

@@ -12,7 +12,7 @@ from tcpipe.motion.uncertainty import (
 )
 
 
-def std(velocity_std, duration, start, end, *, smoothed):
+def std(velocity_std, duration, start, end, *, smoothed, told=(np.nan, np.nan)):
     one = np.atleast_1d
     return compute_displacement_std_m(
         velocity_std_mps=one(velocity_std),
@@ -20,6 +20,8 @@ def std(velocity_std, duration, start, end, *, smoothed):
         start_std_m=one(start),
         end_std_m=one(end),
         smoothed=smoothed,
+        told_s=(1.0, 2.0),
+        told_std_m=np.array([told]),
     )[0]
 
 
@@ -91,6 +93,14 @@ def test_the_chord_ahead_sees_a_jump_before_it_comes():
     )
     assert np.flatnonzero(got > 0.1).tolist() == [*range(80, 100), 120]
     assert got[120] == pytest.approx(0.4)  # a power of time between what is told of half and of two seconds
+
+
+@pytest.mark.parametrize("told", [(0.012, 0.020), (0.010, np.nan)])
+def test_beyond_the_durations_told_the_error_grows_at_most_linearly(told):
+    # A slow robot of which positions are known to 0.5 m: the velocity's error, of 50 mm/s, does not last.
+    assert std(0.05, 7.0, 0.5, 0.5, smoothed=True, told=told) == pytest.approx(0.070)
+    assert std(0.05, 7.0, 0.5, 0.9, smoothed=True, told=told) == pytest.approx(0.4)  # the position error itself grew
+    assert std(0.005, 7.0, 0.5, 0.5, smoothed=True, told=told) == pytest.approx(0.035, rel=1e-2)
 
 
 def test_nothing_unknown_is_nothing_wrong():

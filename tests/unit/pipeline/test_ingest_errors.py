@@ -9,6 +9,7 @@ from simulated_streams import log_of
 
 from tcpipe.pipeline import ingest_run as module
 from tcpipe.pipeline.ingest import ingest
+from tcpipe.recipe import MaskConfig, Recipe, TimeWindow
 from tcpipe.simulation import make_tiny
 
 
@@ -28,6 +29,17 @@ def test_a_disk_that_fails_in_mid_write_is_told_with_the_output(tmp_path, monkey
         line,
     )
     assert not store.exists()
+
+
+def test_a_time_window_that_fits_no_run_is_told_with_the_runs(tmp_path, caplog):
+    scenario = make_tiny(seconds=16.0)
+    log = log_of(scenario, scenario.drives[0], tmp_path / "site")
+    patterns = (f"{log.stem[:3]}*", "feild_*")
+    recipe = Recipe(mask=MaskConfig(windows=[TimeWindow(pattern, "drop", 0.0, 1.0) for pattern in patterns]))
+    (result,) = ingest([log], store=tmp_path / "store", recipe=recipe).results
+    (line,) = (record.getMessage() for record in caplog.records if "fits no run" in record.getMessage())
+    assert "'feild_*'" in line
+    assert line.endswith(f"runs: {result.run.run_id}")
 
 
 def test_a_file_that_cannot_be_opened_is_named(tmp_path, monkeypatch):

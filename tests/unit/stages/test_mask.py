@@ -269,13 +269,14 @@ def test_windows_of_a_csv_file_are_those_of_the_recipe(tmp_path):
     (tmp_path / "windows.csv").write_text("run,action,start,end\nb,drop,soon,1\n")
     with pytest.raises(RecipeError, match="seconds, or UTC"):
         load_recipe(tmp_path / "tcpipe.toml")
-    for text in (
-        "run;action;start;end\nb;drop;0,5;1\n",
-        "run;action;start;end\nb;drop;0;1\n",
-        "run,action\nb,drop,0,1\n",
+    (tmp_path / "windows.csv").write_text("\ufeffrun;action;start;end\nb,c;keep;0,5;1\n", encoding="utf-8")
+    assert load_recipe(tmp_path / "tcpipe.toml").mask.windows[1:] == [TimeWindow("b,c", "keep", 0.5, 1.0)]
+    for content, said in (
+        (b"run,action\nb,drop,0,1\n", "line 2: it has more cells"),
+        (b"run\n\xe9\n", "not UTF-8 at byte 4"),
     ):
-        (tmp_path / "windows.csv").write_text(text)
-        with pytest.raises(RecipeError, match="line 2: expected cells separated by commas"):
+        (tmp_path / "windows.csv").write_bytes(content)
+        with pytest.raises(RecipeError, match=said):
             load_recipe(tmp_path / "tcpipe.toml")
     (tmp_path / "windows.csv").unlink()
     with pytest.raises(RecipeError, match="cannot be read"):

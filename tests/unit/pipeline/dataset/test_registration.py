@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from physics_model import PhysicsModel
 from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, segments
 
 from tcpipe import open_dataset
@@ -12,6 +13,8 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.pipeline.dataset import map_checks
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.explain import explain
+from tcpipe.planning.drives import compute_drive_cost, evaluate_drives, find_drive
+from tcpipe.planning.path_files import choose_map
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, select_findings
@@ -118,6 +121,39 @@ def test_an_aligned_sample_is_explained_by_the_same_shift(moved):
     for run_id in ("off", "short"):
         sample_id = next(iter(read_run(directory / "out", run_id)))
         assert explain(sample_id, dataset=directory / "out", store=directory / "store").differences == ()
+
+
+def test_whole_drives_are_moved_as_the_runs_of_the_dataset(moved, tmp_path):
+    directory, _ = moved
+    data, out = open_dataset(directory / "out"), tmp_path / "out"
+    source = choose_map(directory / "store", None)
+    found = evaluate_drives(PhysicsModel(), data, source, ["off", "short"], store=directory / "store", out=out)
+    there = open_store(directory / "there")
+    truth = compute_drive_cost(PhysicsModel(), source, find_drive(there, "off"), data, log="off")
+    off = compute_drive_cost(
+        PhysicsModel(), source, find_drive(open_store(directory / "store"), "off"), data, log="off"
+    )
+    moved_drive = found.values.drives[0]
+    error, unmoved = (
+        np.abs(
+            [a.predicted - b.predicted for a, b in zip(of.along.energy_joule, truth.along.energy_joule, strict=True)]
+        )
+        for of in (moved_drive, off)
+    )
+    assert error.max() < 0.1 * unmoved.max()
+    (said,) = select_findings(found.values.findings, "map-aligned")
+    (refused,) = select_findings(found.values.findings, "map-not-aligned")
+    assert (said.subject.name, refused.subject.name) == ("off", "short")
+    assert "not moved onto map site: too few points" in str(found)
+
+
+def test_the_deviation_of_a_shift_counts_in_whole_drives(moved):
+    directory, _ = moved
+    data, source = open_dataset(directory / "out"), choose_map(directory / "store", None)
+    run = find_drive(open_store(directory / "store"), "off")
+    vague = compute_drive_cost(PhysicsModel(), source, run, data, log="off", shifts={"off": (0.0, 0.0, 0.2)})
+    assert vague.compared_m == 0.0
+    assert vague.rest_m["position_uncertain"] == vague.segments_m
 
 
 @pytest.mark.parametrize(
