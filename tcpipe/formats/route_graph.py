@@ -8,18 +8,34 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import PathError
 from tcpipe.formats.geojson import shorten_problems, shorten_value
+from tcpipe.formats.json_files import Json
 
 _EDGES = ("LineString", "MultiLineString")
+
+
+@dataclass(frozen=True, slots=True)
+class RouteEdge:
+    """A directed edge: ids of it, its start and its end, and its feature as it stands in the file."""
+
+    edge_id: int
+    start: int
+    end: int
+    feature: Mapping[str, Json]
+
+    def add_metadata(self, values: Mapping[str, Json]) -> Mapping[str, Json]:
+        """Return the feature with more metadata."""
+        properties = _get(self.feature, "properties")
+        return {**self.feature, "properties": {**properties, "metadata": {**_get(properties, "metadata"), **values}}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,52 +44,44 @@ class RouteGraph:
 
     Attributes
     ----------
-    document : all of the file but its edges.
-    node_ids, xy_m : of the nodes, and where they are [m], shape (N, 2).
-    edges : features, as they stand in the file.
+    document, others : the file without its features, and its features but the edges.
+    nodes : x and y [m] by id.
+    edges : in the order of the file.
     """
 
-    document: Mapping[str, Any]
-    node_ids: tuple[int, ...]
-    xy_m: NDArray[np.float64]
-    edges: tuple[Mapping[str, Any], ...]
+    document: Mapping[str, Json]
+    others: Sequence[Json]
+    nodes: Mapping[int, tuple[float, float]]
+    edges: tuple[RouteEdge, ...]
 
-    def find_ends(self) -> NDArray[np.float64]:
-        """Return the start and the end of each edge [m], shape (M, 2, 2)."""
-        row = {node_id: number for number, node_id in enumerate(self.node_ids)}
-        ends = [[row[edge["properties"][name]] for name in ("startid", "endid")] for edge in self.edges]
-        return self.xy_m[np.array(ends, np.int64).reshape(-1, 2)]
-
-    def list_missing_reverses(self) -> list[Mapping[str, Any]]:
+    def list_missing_reverses(self) -> list[RouteEdge]:
         """Return an edge back for each that has none, with new ids."""
-        ways = [(edge["properties"]["startid"], edge["properties"]["endid"]) for edge in self.edges]
-        back = [(b, a) for a, b in dict.fromkeys(ways) if (b, a) not in set(ways)]
-        first = 1 + max([*self.node_ids, *(edge["properties"]["id"] for edge in self.edges)], default=-1)
-        xy_m = dict(zip(self.node_ids, self.xy_m.tolist(), strict=True))
-        return [make_edge(first + number, a, b, [xy_m[a], xy_m[b]]) for number, (a, b) in enumerate(back)]
+        ways = dict.fromkeys((edge.start, edge.end) for edge in self.edges)
+        back = [(b, a) for a, b in ways if (b, a) not in ways]
+        first = 1 + max([*self.nodes, *(edge.edge_id for edge in self.edges)], default=-1)
+        return [_make_edge(first + number, a, b, self.nodes) for number, (a, b) in enumerate(back)]
 
-    def make_document(self, edges: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def make_document(self, edges: Sequence[Mapping[str, Json]]) -> dict[str, Json]:
         """Return the file with other edges."""
-        return {**self.document, "features": [*self.document["features"], *edges]}
+        return {**self.document, "features": [*self.others, *edges]}
 
 
-def make_edge(edge_id: int, start: int, end: int, xy_m: Sequence[Sequence[float]]) -> dict[str, Any]:
-    """Return the feature of an edge between two nodes."""
-    properties = {"id": edge_id, "startid": start, "endid": end}
-    return {"type": "Feature", "properties": properties, "geometry": {"type": "LineString", "coordinates": xy_m}}
+def _make_edge(edge_id: int, start: int, end: int, nodes: Mapping[int, tuple[float, float]]) -> RouteEdge:
+    geometry: Json = {"type": "LineString", "coordinates": [nodes[start], nodes[end]]}
+    properties: Json = {"id": edge_id, "startid": start, "endid": end}
+    return RouteEdge(edge_id, start, end, {"type": "Feature", "properties": properties, "geometry": geometry})
 
 
 def make_route_graph(xy_m: NDArray[np.float64], pairs: Sequence[tuple[int, int]]) -> RouteGraph:
     """Return a graph of nodes at these places, shape (N, 2), and of an edge in both directions for each pair of them."""
-    points = [[round(x, 3), round(y, 3)] for x, y in xy_m.tolist()]
-    nodes = [
-        {"type": "Feature", "properties": {"id": number}, "geometry": {"type": "Point", "coordinates": point}}
-        for number, point in enumerate(points)
+    nodes = {number: (round(x, 3), round(y, 3)) for number, (x, y) in enumerate(xy_m.tolist())}
+    points: list[Json] = [
+        {"type": "Feature", "properties": {"id": node}, "geometry": {"type": "Point", "coordinates": place}}
+        for node, place in nodes.items()
     ]
     ways = [way for a, b in pairs for way in ((a, b), (b, a))]
-    edges = tuple(make_edge(len(points) + number, a, b, [points[a], points[b]]) for number, (a, b) in enumerate(ways))
-    document = {"type": "FeatureCollection", "name": "tcpipe", "features": nodes}
-    return RouteGraph(document, tuple(range(len(points))), np.array(points, np.float64).reshape(-1, 2), edges)
+    edges = tuple(_make_edge(len(nodes) + number, a, b, nodes) for number, (a, b) in enumerate(ways))
+    return RouteGraph({"type": "FeatureCollection", "name": "tcpipe"}, points, nodes, edges)
 
 
 def read_route_graph(path: Path) -> RouteGraph:
@@ -84,60 +92,58 @@ def read_route_graph(path: Path) -> RouteGraph:
         raise PathError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:
         raise PathError(f"{path}: not GeoJSON: not JSON ({error})") from None
-    document = document if isinstance(document, dict) else {}
-    features = document.get("features")
+    features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(features, list):
         raise PathError(f"{path}: not a route graph: expected a FeatureCollection of points and lines")
-    kinds = [_get(feature, "geometry").get("type") for feature in features]
-    is_edge = [kind in _EDGES for kind in kinds]
-    edges = [feature for feature, is_one in zip(features, is_edge, strict=True) if is_one]
-    others = [feature for feature, is_one in zip(features, is_edge, strict=True) if not is_one]
-    points = [feature for feature, kind in zip(features, kinds, strict=True) if kind == "Point"]
-    problems = [f"{path}: node {problem}" for node in points for problem in _find_node_problems(node)]
-    nodes = {} if problems else {node["properties"]["id"]: node["geometry"]["coordinates"][:2] for node in points}
-    frames = sorted({str(_get(node, "properties").get("frame", "map")) for node in points})
-    problems += [
-        f"{path}: edge {problem}"
-        for edge in edges
-        for problem in _find_edge_problems(edge, None if problems else nodes)
-    ]
-    problems += [f"{path}: nodes are in the frames {', '.join(frames)}; expected one"] if len(frames) > 1 else []
-    problems += [f"{path}: several nodes have the same id"] if not problems and len(nodes) < len(points) else []
-    if not problems and not (nodes and edges):
-        problems.append(f"{path}: has {len(nodes)} nodes and {len(edges)} edges; expected both")
+    lines = [feature for feature in features if _get(feature, "geometry").get("type") in _EDGES]
+    others = [feature for feature in features if _get(feature, "geometry").get("type") not in _EDGES]
+    points = [feature for feature in others if _get(feature, "geometry").get("type") == "Point"]
+    problems = list[str]()
+    nodes = {node: place for feature in points for node, place in _read_node(feature, problems)}
+    edges = tuple(edge for feature in lines for edge in _read_edge(feature, nodes, problems))
+    frames = sorted({str(_get(feature, "properties").get("frame", "map")) for feature in points})
+    problems += [f"nodes are in the frames {', '.join(frames)}; expected one"] if len(frames) > 1 else []
+    if not problems and len(nodes) < len(points):
+        problems.append("several nodes have the same id")
+    elif not problems and not (nodes and edges):
+        problems.append(f"has {len(nodes)} nodes and {len(edges)} edges; expected both")
     if problems:
-        raise PathError(*shorten_problems(problems))
-    return RouteGraph(
-        {**document, "features": others}, tuple(nodes), np.array(list(nodes.values()), np.float64), tuple(edges)
-    )
+        raise PathError(*shorten_problems([f"{path}: {problem}" for problem in problems]))
+    return RouteGraph(document, others, nodes, edges)
 
 
-def _find_node_problems(node: Mapping[str, Any]) -> Iterator[str]:
-    node_id, place = _get(node, "properties").get("id"), node["geometry"].get("coordinates")
-    if not _is_id(node_id):
-        yield f"{shorten_value(node_id)}: its id is not a whole number from 0"
-    if not (isinstance(place, list) and len(place) > 1 and all(map(_is_finite, place[:2]))):
-        yield f"{shorten_value(node_id)}: coordinates are {shorten_value(place)}, expected x and y in metres"
+def _read_node(feature: Json, problems: list[str]) -> Iterator[tuple[int, tuple[float, float]]]:
+    """Yield id and place of a node, or add what is wrong with it to ``problems``."""
+    node, place = _get(feature, "properties").get("id"), _get(feature, "geometry").get("coordinates")
+    numbers = [value for value in place[:2] if _is_finite(value)] if isinstance(place, list) else []
+    if not _is_id(node):
+        problems.append(f"node {shorten_value(node)}: its id is not a whole number from 0")
+    elif len(numbers) < 2:
+        problems.append(f"node {node}: coordinates are {shorten_value(place)}, expected x and y in metres")
+    else:
+        yield node, (numbers[0], numbers[1])
 
 
-def _find_edge_problems(edge: Mapping[str, Any], nodes: Mapping[int, object] | None) -> Iterator[str]:
-    properties = _get(edge, "properties")
-    for name in ("id", "startid", "endid"):
-        value = properties.get(name)
-        if not _is_id(value):
-            yield f"{shorten_value(properties.get('id'))}: {name} is {shorten_value(value)}, expected a whole number from 0"
-        elif name != "id" and nodes is not None and value not in nodes:
-            yield f"{properties.get('id')!r}: there is no node {value}"
+def _read_edge(feature: Mapping[str, Json], nodes: Container[int], problems: list[str]) -> Iterator[RouteEdge]:
+    """Yield an edge, or add what is wrong with it to ``problems``."""
+    properties = _get(feature, "properties")
+    ids = [value for name in ("id", "startid", "endid") if _is_id(value := properties.get(name))]
+    if len(ids) < 3:
+        shown = shorten_value({name: properties.get(name) for name in ("id", "startid", "endid")})
+        problems.append(f"edge {shorten_value(properties.get('id'))}: has {shown}, expected whole numbers from 0")
+        return
+    problems += [f"edge {ids[0]}: there is no node {node}" for node in ids[1:] if node not in nodes]
+    yield RouteEdge(ids[0], ids[1], ids[2], feature)
 
 
-def _get(feature: object, name: str) -> Mapping[str, Any]:
+def _get(feature: Json, name: str) -> Mapping[str, Json]:
     value = feature.get(name) if isinstance(feature, dict) else None
     return value if isinstance(value, dict) else {}
 
 
-def _is_id(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**32
+def _is_id(value: Json) -> TypeGuard[int]:
+    return type(value) is int and 0 <= value < 2**32
 
 
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _is_finite(value: Json) -> TypeGuard[float]:
+    return (type(value) is int or type(value) is float) and math.isfinite(value)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,9 @@ from shapely import LineString
 
 from tcpipe.errors import PathError, UsageError, clean_lines
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.json_files import write_json
+from tcpipe.formats.json_files import Json, write_json
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.route_graph import RouteGraph, make_route_graph, read_route_graph
+from tcpipe.formats.route_graph import RouteEdge, RouteGraph, make_route_graph, read_route_graph
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_cost import PathCost, compute_path_cost, find_origin_m, find_projection
 from tcpipe.store import Store
@@ -43,7 +43,7 @@ class RouteGraphResult:
     nodes: int
     edges: int
     """With costs, each for its own direction."""
-    edges_without_cost: tuple[str, ...]
+    edges_without_cost: tuple[int, ...]
     """Ids, left out of the file: without a number Nav2's scorers take an edge for free."""
     unreliable_edges: int
     """Of ``edges``: partly on ground outside the training range."""
@@ -67,7 +67,9 @@ class RouteGraphResult:
         parts = "".join(f"; {count} of them {name}" for name, count in counts.items() if count)
         lines = [f"{self.out}: {self.nodes} nodes, {self.edges} edges with time, energy and their σ{parts}"]
         if self.edges_without_cost:
-            shown = ", ".join(self.edges_without_cost[:5]) + (" …" if len(self.edges_without_cost) > 5 else "")
+            shown = ", ".join(map(str, self.edges_without_cost[:5])) + (
+                " …" if len(self.edges_without_cost) > 5 else ""
+            )
             count, path = len(self.edges_without_cost), Subject("file", self.out.name)
             lines += format_findings(
                 [make_finding("edges-without-cost", path, names={"edges": shown}, edge_count=count)]
@@ -107,39 +109,33 @@ def write_route_graph(
     origin_m = np.array(find_origin_m(source, origin_deg))
     found = propose_graph(source, store, origin_m) if graph is None else read_route_graph(graph)
     where = str(graph or "the proposed graph")
-    if two_way:
-        found = RouteGraph(found.document, found.node_ids, found.xy_m, (*found.edges, *found.list_missing_reverses()))
-    edges, without_cost, unreliable, gaining = list[Mapping[str, Any]](), list[str](), 0, 0
-    for edge, ends_m in zip(found.edges, found.find_ends(), strict=True):
-        properties, numbers = edge["properties"], None
-        lonlat = find_projection(source).inverse(ends_m + origin_m)
-        try:
+    edges = (*found.edges, *(found.list_missing_reverses() if two_way else ()))
+    done, without_cost = list[tuple[RouteEdge, Mapping[str, Json]]](), list[int]()
+    unreliable = gaining = 0
+    for edge in edges:
+        ends_m = np.array([found.nodes[edge.start], found.nodes[edge.end]]) + origin_m
+        lonlat, cost = find_projection(source).inverse(ends_m), None
+        with suppress(PathError):  # off the map, or from a place to the same
             cost = compute_path_cost(
-                model, source, lonlat, where=f"{where}: edge {properties['id']}", shortest_m=_SHORTEST_M
+                model, source, lonlat, where=f"{where}: edge {edge.edge_id}", shortest_m=_SHORTEST_M
             )
-            numbers = _list_numbers(cost) if cost.totals.complete else None
-        except PathError:  # off the map, or from a place to the same
-            pass
-        if numbers is None:
-            without_cost.append(str(properties["id"]))
+        if cost is None or not cost.totals.complete:
+            without_cost.append(edge.edge_id)
             continue
-        unreliable += "unreliable" in numbers
-        gaining += numbers["energy_joule"] < 0.0
-        metadata = {**(properties.get("metadata") or {}), **numbers}
-        edges.append({**edge, "properties": {**properties, "metadata": metadata}})
-    if not edges:
+        unreliable += bool(cost.totals.reasons)
+        gaining += cost.totals.energy_joule < 0.0
+        done.append((edge, edge.add_metadata(_list_numbers(cost))))
+    if not done:
         raise PathError(f"{where}: no edge has a cost on map {source.name}; check the frame of the graph and --origin")
-    write_json(out, found.make_document(edges))
-    ways = {(edge["properties"]["startid"], edge["properties"]["endid"]) for edge in edges}
+    write_json(out, found.make_document([feature for _, feature in done]))
+    ways = {(edge.start, edge.end) for edge, _ in done}
     one_way = sum((end, start) not in ways for start, end in ways)
-    return RouteGraphResult(
-        graph, out, len(found.node_ids), len(edges), tuple(without_cost), unreliable, one_way, gaining
-    )
+    return RouteGraphResult(graph, out, len(found.nodes), len(done), tuple(without_cost), unreliable, one_way, gaining)
 
 
-def _list_numbers(cost: PathCost) -> dict[str, float | str]:
+def _list_numbers(cost: PathCost) -> dict[str, Json]:
     """Return the metadata of an edge: the time under the name that Nav2's TimeScorer reads."""
-    numbers: dict[str, float | str] = {
+    numbers: dict[str, Json] = {
         "abs_time_taken": cost.totals.duration_s,
         "energy_joule": cost.totals.energy_joule,
         "length_m": cost.totals.length_m,

@@ -78,7 +78,10 @@ def test_every_course_of_every_cell_costs_what_physics_says(made):
 def test_every_tile_is_decoded_once(made):
     source, _ = made
     assert set(source.reads.values()) == {1}
-    assert len(source.reads) == 3 * 16
+    tiles = [
+        of for of in source.reads if of[1] % 64 == 0 and of[2] % 64 == 0
+    ]  # the others are single classes, of cells
+    assert len(tiles) == 3 * 16
 
 
 @pytest.mark.parametrize("strip", [1, 2, 29])
