@@ -141,9 +141,9 @@ def _get(feature: Json, name: str) -> Mapping[str, Json]:
     return value if isinstance(value, dict) else {}
 
 
-def _is_id(value: Json) -> TypeGuard[int]:
-    return type(value) is int and 0 <= value < 2**32
+def _is_id(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**32
 
 
-def _is_finite(value: Json) -> TypeGuard[float]:
-    return (type(value) is int or type(value) is float) and math.isfinite(value)
+def _is_finite(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -106,6 +106,13 @@ class EvaluateOptions:
         ),
     )  # fmt: skip
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
+    adapt: Sequence[float] | None = option(
+        None,
+        Option(
+            "Adapt MODEL to each run of DATASET (or --drive), whose robot may be another, by so many first metres; evaluate the rest.",
+            kind="lengths", metavar="0,10,50",
+        ),
+    )  # fmt: skip
     drives: Sequence[str | Path] = option(
         (),
         Option(

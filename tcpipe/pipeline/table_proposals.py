@@ -19,6 +19,7 @@ from tcpipe.logs.field_mapping import (
     CALLED,
     MAPPED,
     STAMP_UNITS,
+    FieldSource,
     find_other_unit,
     match_field_names,
     parse_stamps_ns,
@@ -168,13 +169,13 @@ def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     measured = [name for name in table.names if name not in commands]
     found = {"gnss": match_field_names("gnss", measured), "imu": match_field_names("imu", measured)}
     found["command"] = match_field_names("command", commands)
-    if not found["gnss"]:
-        sided = match_sided_velocities([_quote(name) for name in measured])
-        if sided and (other := find_other_unit(parse_expression(sided["angular_z"]), "rad/s")):
-            to_mps = f"* {UNITS['m/s'][other]:.9g} {_OVER_TRACK}"
-            sided["angular_z"] = sided["angular_z"].removesuffix(_OVER_TRACK) + to_mps
-        found["wheel_odometry"] = match_field_names("wheel_odometry", measured) or sided
-        found["pose"] = {} if found["wheel_odometry"] else match_field_names("pose", measured)
+    sided = match_sided_velocities([_quote(name) for name in measured])
+    if sided and (other := find_other_unit(parse_expression(sided["angular_z"]), "rad/s")):
+        to_mps = f"* {UNITS['m/s'][other]:.9g} {_OVER_TRACK}"
+        sided["angular_z"] = sided["angular_z"].removesuffix(_OVER_TRACK) + to_mps
+    found["wheel_odometry"] = (not found["gnss"] and match_field_names("wheel_odometry", measured)) or sided
+    is_moving = found["gnss"] or found["wheel_odometry"]
+    found["pose"] = {} if is_moving else match_field_names("pose", measured)
     for role, columns in found.items():
         if columns and (lines := _make_lines(table, role, role, columns)):
             yield role, lines
@@ -255,9 +256,10 @@ def _find_units(table: _Table, role: str, columns: Mapping[str, str]) -> dict[st
 
 def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[str, Floats]:
     """Return the values of columns by field, in its unit; without those that hold no number."""
-    fields = read_fields("", role, columns, _find_units(table, role, columns), table.names)
-    if isinstance(fields, list):
-        return {}
+    units, fields = _find_units(table, role, columns), dict[str, FieldSource]()
+    for name, text in columns.items():  # one that cannot be read takes no other with it
+        read = read_fields("", role, {name: text}, {of: unit for of, unit in units.items() if of == name}, table.names)
+        fields |= read if isinstance(read, dict) else {}
     _, found = read_values(table.path, table.stamp, fields)
     return {name: values for name, values in found.items() if np.isfinite(values).any()}
 

@@ -206,6 +206,16 @@ def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_pat
     }
 
 
+def test_a_store_inside_the_folder_of_tables_is_no_part_of_the_log(tmp_path):
+    folder = folder_with(tmp_path, odom=odometry())
+    recipe = Recipe(tables={"wheel_odometry": WHEELS})
+    (beside,) = ingest([folder], store=tmp_path / "store", recipe=recipe).results
+    (inside,) = ingest([folder], store=folder / "tcpipe-store", recipe=recipe).results
+    assert (inside.status, inside.run.run_id) == (beside.status, beside.run.run_id)
+    (again,) = ingest([folder], store=folder / "tcpipe-store", recipe=recipe).results
+    assert again.status == "unchanged"
+
+
 def test_a_folder_of_tables_is_ingested_as_one_log_and_what_is_in_the_way_is_said(tmp_path):
     folder = folder_with(tmp_path, odom=odometry())
     with pytest.raises(UsageError) as caught:
