@@ -122,7 +122,7 @@ def test_a_route_graph_gets_the_costs_of_its_edges(place: Path):
             "expected an energy with its unit",
         ),
         (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "expected LON,LAT"),
-        (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
+        (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon/lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
         (("cost-map", "model", "--cell-size", "0"), 2, "--cell-size"),
         (("cost-map", "model", "--speed", "0.5"), 2, "has no input for the commanded speed"),
