@@ -137,4 +137,5 @@ class RouteGraphOptions:
     two_way: bool = option(False, Option("Add an edge back for each that has none."))
     map_name: str | None = option(None, MAP)
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     store: str = option("tcpipe-store", STORE)
