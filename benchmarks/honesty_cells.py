@@ -476,6 +476,8 @@ def honest_cells() -> Iterator[HonestCell]:
     """Yield every cell, the clean ones first; none twice."""
     for sensors in _CLEAN_SETS:
         yield HonestCell(sensors, _clean("valley"))
+    for sensors in (*_CLEAN_SETS, "wheels alone"):
+        yield HonestCell(sensors, _clean("slow"), wide=True)
     for fault, gate in FAULTS:
         yield from (HonestCell(sensors, fault) for sensors in gate)
         beyond = [sensors for sensors in _IN_BOTH if not fault.calibrated and not {*fault.at_fault} & SETS[sensors]]
