@@ -15,7 +15,7 @@ from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
 
 if TYPE_CHECKING:
-    from tcpipe.learning.evaluation_files import EvaluationResult
+    from tcpipe.learning.evaluation_files import AdaptationResult, EvaluationResult
     from tcpipe.learning.training import TrainResult
     from tcpipe.planning.drives import DrivesResult
     from tcpipe.planning.path_files import PathResult, PlanResult
@@ -33,7 +33,9 @@ def run_train(options: TrainOptions) -> TrainResult:
     from tcpipe.recipe.checking import from_values
 
     given = {of.name: value for of in fields(FitConfig) if (value := getattr(options, of.name)) is not None}
-    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
+    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features", "layers"})
+    if isinstance(layers := given.get("layers"), str):
+        given["layers"] = [name.strip() for name in layers.split(",")]
     given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
     return run(
         options.dataset, options.out, config=from_values(FitConfig, given, where="train"), no_resume=options.no_resume
@@ -71,7 +73,7 @@ class Evaluate(Protocol):
     ) -> DrivesResult: ...
 
 
-def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
+def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | AdaptationResult:
     """Measure a model on a dataset's test samples and unseen area, or on whole drives, and write the evaluation to ``out``.
 
     ``values`` of the result are those of the written JSON; ``str`` of it is what the command prints. Raises `UsageError` where an option
@@ -79,6 +81,22 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     `StoreError` where an input cannot be used.
     """
     model, dataset, out = options.model, options.dataset, options.out
+    if options.adapt is not None:
+        from tcpipe.learning.evaluation_files import evaluate_adaptation
+        from tcpipe.learning.models import load_model
+        from tcpipe.planning.drives import collect_run, find_drive
+        from tcpipe.planning.path_files import choose_map
+        from tcpipe.store import open_store
+
+        runs = None
+        if options.drives:
+            loaded, source, store = (
+                load_model(model),
+                choose_map(options.store, options.map_name),
+                open_store(options.store),
+            )
+            runs = [collect_run(loaded, source, find_drive(store, str(log))) for log in options.drives]
+        return evaluate_adaptation(model, dataset, out, options.adapt, runs=runs)
     if options.drives:
         from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
@@ -113,7 +131,13 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
 
     source = choose_map(options.store, options.map_name)
     asked = choose_model(options.model, physics=options.physics_from, speed_mps=options.speed_mps)
-    return run(asked, source, Path(options.path), None if options.out is None else Path(options.out))
+    known = None
+    if options.adapt is not None:
+        from tcpipe.planning.drives import collect_run, find_drive
+        from tcpipe.store import open_store
+
+        known = collect_run(asked, source, find_drive(open_store(options.store), str(options.adapt)))
+    return run(asked, source, Path(options.path), None if options.out is None else Path(options.out), adapted_by=known)
 
 
 predict_path = as_function(PredictPathOptions, run_predict_path)

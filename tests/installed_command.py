@@ -132,7 +132,8 @@ def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.Completed
         for text in done.stdout.splitlines() if command == "ingest" else [done.stdout]:
             said = json.loads(text)
             name = "evaluation" if command == "evaluate" else f"{command}.answer"  # it prints its file
-            cls = known.get(f"{command}-{said.get('kind')}.answer") or known.get(name)
+            kind = str(said.get("kind")).removeprefix("tcpipe ")
+            cls = known.get(f"{command}-{kind}.answer") or known.get(name)
             assert cls is not None, f"{command} --json has no contract"
             assert to_plain(parse_typed(said, cls, Path(command))) == said
     return done

@@ -127,6 +127,7 @@ _ANSWERS = {
     "build-dataset.answer": "pipeline.dataset.build.BuildResult",
     "cost-map.answer": "planning.cost_map.CostMapResult",
     "diff.answer": "pipeline.diff.Difference",
+    "evaluate-adaptation.answer": "learning.evaluation_files.AdaptationFacts",
     "evaluate-drives.answer": "planning.drives.Drives",
     "explain.answer": "pipeline.explain.Explained",
     "export.answer": "pipeline.export.Exported",

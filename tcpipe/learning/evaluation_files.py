@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from tcpipe import __version__
+from tcpipe.cost.adaptation import AdaptedErrors, Run, compare_adaptations, format_adaptations
+from tcpipe.cost.prediction_errors import fit_errors
 from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import StoreError, UsageError, clean_lines
+from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, find_newest, require_card
 from tcpipe.formats.dataset_files import is_shard, read_card
@@ -23,7 +28,8 @@ from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, select_evaluated_samples
 from tcpipe.learning.evaluation_page import format_leakage, render_evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES
-from tcpipe.learning.models import read_model_card
+from tcpipe.learning.models import load_model, read_model_card
+from tcpipe.learning.predictions import check_fit, collect_runs
 from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.tables.findings import PREDICTED
@@ -87,7 +93,7 @@ def run_evaluation(
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)
     clear(place)
-    ours = {JSON, PAGE, SAMPLES, NETWORKS, "drives.json", "drives.html"}
+    ours = {JSON, PAGE, SAMPLES, NETWORKS, ADAPTATION, "drives.json", "drives.html"}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
@@ -143,3 +149,78 @@ def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *,
         __version__,
     ]
     return digest(told)
+
+
+ADAPTATION = "adaptation.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdaptationFacts:
+    """All of adaptation.json: errors on the rest of runs, after the first metres of each are known."""
+
+    kind: str = "tcpipe adaptation"
+    tcpipe_version: str = __version__
+    model: str
+    dataset: str
+    robots: tuple[str, ...]
+    """Of the model, then of the dataset."""
+    known_m: tuple[float, ...]
+    errors: tuple[AdaptedErrors, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptationResult:
+    """What was found and where it lies; ``str`` of it is what the command prints."""
+
+    path: Path
+    values: AdaptationFacts
+
+    def __str__(self) -> str:
+        """Return the errors by known metres, as plain lines."""
+        return clean_lines((*format_adaptations(self.values.errors), f"wrote {self.path / ADAPTATION}"))
+
+
+def evaluate_adaptation(
+    model: str | Path,
+    dataset: str | Path,
+    out: str | Path,
+    known_m: Sequence[float],
+    *,
+    runs: Sequence[Run] | None = None,
+) -> AdaptationResult:
+    """Predict the rest of each run after its first metres are known, and write adaptation.json into the directory ``out``.
+
+    ``runs`` are whole drives; without them those of the dataset whose samples did not train the model.
+
+    Raises
+    ------
+    UsageError : the metres are none.
+    ModelError, DatasetError : they do not fit, the model states no errors, or no run is long enough.
+    """
+    if not known_m or not all(0.0 <= metres < np.inf for metres in known_m):
+        raise UsageError(f"adapt: {known_m} are no metres of a run; expected some, as 0, 10, 50")
+    ours = load_model(model)
+    data = open_dataset(dataset, label=ours.label_energy)
+    errors = fit_errors(ours.residuals)
+    if errors is None:
+        raise ModelError(
+            f"{model}: has too few held-out samples to state errors, which an adaptation weighs; train on more"
+        )
+    if runs is None:
+        check_fit(ours.card, data, str(model), any_robot=True)
+        runs = collect_runs(ours, data)
+    stated = {quantity: errors[quantity] for quantity in ("energy", "duration")}
+    found = tuple(compare_adaptations(stated, runs, sorted(set(known_m))))
+    if not found:
+        longest_m = max((float(run.metres["energy"].length_m.sum()) for run in runs), default=0.0)
+        raise DatasetError(
+            f"{dataset}: no run has {max(known_m):g} m of labelled samples and more to predict, the longest has {longest_m:.0f} m; "
+            "give smaller values to --adapt"
+        )
+    place, robots = Path(out), (ours.robot, ", ".join(data.card.robots))
+    place.mkdir(parents=True, exist_ok=True)
+    values = AdaptationFacts(
+        model=ours.name, dataset=data.card.name, robots=robots, known_m=tuple(sorted(set(known_m))), errors=found
+    )
+    write_json(place / ADAPTATION, values)
+    return AdaptationResult(place, values)

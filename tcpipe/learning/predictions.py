@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from tcpipe.cost.adaptation import Run, make_metres
 from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, fit_errors
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
@@ -22,7 +24,6 @@ from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.columns import Column, to_floats
 from tcpipe.terrain.classes import ClassTable
 
-_TOGETHER = 1024
 CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
 """What columns of tables call the quantities."""
 
@@ -124,12 +125,12 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
 
 
 def _predict_outputs(model: Model, split: Split, noise: Sequence[str], rng: np.random.Generator) -> Array:
-    chosen = split.with_channels(*model.channels)
-    replaced = [model.channels.index(name) for name in noise]
+    chosen, planes = split.with_layout(model.card.layout), model.card.layout.planes
+    replaced = [place for place, plane in enumerate(planes) if plane.partition("[")[0] in noise]
     parts = [np.empty((0, len(model.card.outputs)), np.float32)]
     extra_features, first = read_extra_features(split), 0
     while first < len(chosen):
-        patches = chosen.batch(np.arange(first, min(first + _TOGETHER, len(chosen))))[0].copy()
+        patches = chosen.batch(np.arange(first, min(first + model.card.layout.batch_rows, len(chosen))))[0].copy()
         for channel in replaced:
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
         parts.append(model.predict(patches, extra_features.take(slice(first, first + len(patches)))))
@@ -185,8 +186,8 @@ def check_origin(card: ModelCard, data: Dataset, name: str) -> None:
         )
 
 
-def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
-    """Raise an error with every reason for which a model cannot be asked about a dataset."""
+def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = False) -> None:
+    """Raise an error with every reason for which a model cannot be asked about a dataset, of another robot too if that may be."""
     told = data.card
     problems = [
         f"classes: in the model {clause}" for clause in ClassTable(card.classes).differences(read_class_table(told))
@@ -196,17 +197,45 @@ def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
         ("patch_m", card.patch_m, told.patch_m),
         ("segment.chord_m", card.chord_m, told.recipe.segment.chord_m),
         ("label.velocity", card.label_velocity, told.label.velocity),
-        ("robot", card.robot, ", ".join(told.robots)),
+        *(() if any_robot else (("robot", card.robot, ", ".join(told.robots)),)),
     )
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
     if len(card.outputs) != len(told.label.columns):
         problems.append(f"it predicts only {', '.join(card.outputs)}, expected {' and '.join(told.label.columns)}")
-    absent = [channel for channel in card.channels if channel not in told.layers]
+    absent = [name for name in card.layout.layers if name not in told.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:
         raise ModelError(*(f"{name} does not fit {data.path}: {problem}" for problem in problems))
+
+
+def collect_runs(model: Model, data: Dataset) -> list[Run]:
+    """Return the labelled samples of each run that the model was not trained on, in order: all runs of another dataset than its own."""
+    is_own = compute_dataset_checksum(data.card) == model.card.dataset.sha256
+    parts: list[dict[str, NDArray[Any]]] = []
+    for name in ("test", "unseen") if is_own else ("train", "test", "unseen"):
+        part = collect_measured(data[name], {})
+        said, features = predict_costs(model, part.split), read_extra_features(part.split)
+        parts.append(
+            {name: part.split.column(name) for name in ("run_id", "start_ns", "arc_length_m")}
+            | {name: getattr(features, name) for name in ("class_id", "slope_rad", "turn_radpm")}
+            | {f"{what} {q}": of[q] for what, of in (("measured", part.costs), ("predicted", said.costs)) for q in "TE"}
+        )
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    order, found = np.lexsort((columns["start_ns"], columns["run_id"].astype(np.str_))), list[Run]()
+    columns = {name: values[order] for name, values in columns.items()}
+    for run in np.unique(columns["run_id"]).tolist():
+        here = columns["run_id"] == run
+        of = {name: values[here].astype(np.float64) for name, values in columns.items() if name != "run_id"}
+        step_m = np.diff(of["start_ns"]) * 1e-9 * (of["arc_length_m"] / of["measured T"])[:-1]
+        metres = make_metres(
+            model.physics, length_m=of["arc_length_m"], class_id=of["class_id"].astype(np.int64), slope_rad=of["slope_rad"],
+            turn_rad=np.nan_to_num(of["turn_radpm"]) * of["arc_length_m"], distance_m=np.insert(np.cumsum(step_m), 0, 0.0),
+            predicted={CALLED[q]: of[f"predicted {q}"] for q in "TE"}, measured={CALLED[q]: of[f"measured {q}"] for q in "TE"},
+        )  # fmt: skip
+        found.append(Run(str(run), metres))
+    return found
 
 
 _SUFFIX = {"w": "watt", "v": "mps", "T": "s", "E": "joule"}

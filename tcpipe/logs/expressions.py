@@ -118,6 +118,11 @@ _SUFFIX = re.compile(
 )
 
 
+def simplify_name(name: str) -> str:
+    """Return a column's name in lower case without its unit, ``_`` for blanks and hyphens: that by which it is recognised."""
+    return re.sub(r"[\s-]+", "_", split_unit(name)[0].strip().lower())
+
+
 def split_unit(name: str) -> tuple[str, str | None, bool]:
     """Return a column's name without the unit that it ends with, that unit, and whether it stands in brackets.
 

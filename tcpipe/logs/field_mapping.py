@@ -18,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs import roles
-from tcpipe.logs.expressions import FORM, UNITS, Expression, ExpressionError, parse_expression, split_unit
+from tcpipe.logs.expressions import (
+    FORM,
+    UNITS,
+    Expression,
+    ExpressionError,
+    parse_expression,
+    simplify_name,
+    split_unit,
+)
 from tcpipe.logs.fix_quality import CODES, CODES_OF_NAMES, classify_fixes, find_status, split_codes
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
@@ -385,15 +393,11 @@ _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
 """No receiver's message is longer or has more numbers; one that is made to hurt does not cost minutes."""
 
 
-def _simplify(name: str) -> str:
-    return re.sub(r"[\s-]+", "_", split_unit(name)[0].strip().lower())
-
-
 def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     """Return the name of each field of a role; {} where one is missing that the role needs."""
     found: dict[str, str] = {}
     for field, pattern in CALLED[role].items():
-        match = next((name for name in names if re.fullmatch(pattern, _simplify(name))), None)
+        match = next((name for name in names if re.fullmatch(pattern, simplify_name(name))), None)
         if match is not None and match not in found.values():
             found[field] = match
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.logs.expressions import simplify_name
+
 Array = NDArray[Any]
 Columns = Mapping[str, Array]
 Floats = NDArray[np.float64]
@@ -60,14 +62,16 @@ def split_codes(text: str) -> tuple[str | None, str]:
     codes, colon, column = text.partition(":")
     if colon and codes.strip() in CODES:
         return codes.strip(), column.strip()
-    named = (codes for codes, pattern in CODES_OF_NAMES.items() if re.fullmatch(pattern, text.lower()))
+    named = (codes for codes, pattern in CODES_OF_NAMES.items() if re.fullmatch(pattern, simplify_name(text)))
     return next(named, None), text
 
 
 def find_quality(names: Iterable[str]) -> list[str]:
     """Return the first name that may be a fix quality, with the codes that are likeliest: ``gga: quality``; [] where none is."""
-    likely = {"gga": r"(.*[_. ])?(qual(ity)?|mode|fix[_ ]?(type|mode)?)", "navsat": r"(.*[_. ])?status"}
-    found = [f"{codes}: {name}" for codes, of in likely.items() for name in names if re.fullmatch(of, name.lower())]
+    likely = {"gga": r"(.*[_.])?(qual(ity)?|mode|fix_?(type|mode)?)", "navsat": r"(.*[_.])?status"}
+    found = [
+        f"{codes}: {name}" for codes, of in likely.items() for name in names if re.fullmatch(of, simplify_name(name))
+    ]
     return found[:1]
 
 

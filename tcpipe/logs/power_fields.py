@@ -93,7 +93,12 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
 
     Turn rates of wheels are no velocities.
     """
-    speeds = [name for name in names if {"vel", "velocity", "speed"} & set(split_words(name))]
+    speeds = [
+        name
+        for name in names
+        if {"vel", "velocity", "speed", "spd"} & set(split_words(name))
+        or split_unit(name.replace("`", ""))[1] in UNITS["m/s"]
+    ]
     sides = {"l", "left", "r", "right", "fl", "fr", "rl", "rr"}
     sided = [name for name in speeds if sides & set(split_words(name))]
     units = {split_unit(name.replace("`", ""))[1] for name in sided}
@@ -107,12 +112,13 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
 
 
 def _read_name(name: str) -> _Named | None:
-    bare, unit, _ = split_unit(name.replace("`", "").removesuffix("[]"))
+    bare, unit, in_brackets = split_unit(name.replace("`", "").removesuffix("[]"))
     (core, side), own = split_sides(bare), split_words(bare.rpartition(".")[2])
     quantity = next((what for word in reversed(own) for what, of in _QUANTITIES.items() if of.fullmatch(word)), None)
     measured, scale = _UNITS.get(unit or "", (quantity, 1.0))
     of_rail = any(_SUPPLY.fullmatch(word) or _DRIVES.fullmatch(word) for word in core)
-    quantity = quantity or (measured if of_rail and scale != 1.0 else None)  # a "wheel_v" alone is a velocity
+    is_stated = in_brackets and (of_rail or {"u", "v", "i", "p"} & set(own))  # as U_bat [V]
+    quantity = quantity or (measured if is_stated or (of_rail and scale != 1.0) else None)  # "wheel_v" is a velocity
     if quantity is None or measured != quantity or any(_OTHER.fullmatch(word) for word in own):
         return None
     rest = tuple(word for word in core if not any(of.fullmatch(word) for of in _QUANTITIES.values()))

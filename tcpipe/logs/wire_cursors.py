@@ -110,11 +110,11 @@ class Scalars:
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """``lengths`` bytes each, shape (M,), equal in a grid: scalars side by side (numpy's type), or a text (Python's encoding)."""
+    """``lengths`` bytes each, shape (M,), equal in a grid: scalars side by side, or a text (``dtype`` None)."""
 
     places: Places
     lengths: Int64Array
-    kind: np.dtype[np.generic] | str
+    dtype: np.dtype[np.generic] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,10 +207,9 @@ class _Cursors:
                 dtype = np.dtype(self._dialect.byte_order + of.code)
                 return Scalars(self.take(rows, dtype.itemsize, dtype.itemsize), dtype)
             case Text():
-                lengths = self.count(rows) * (of.wide.step if of.wide else 1)
-                kept = lengths if of.wide else np.maximum(lengths - self._dialect.terminator, 0)
-                codec = of.wide.codec(self._dialect.byte_order) if of.wide else "utf-8"
-                return Runs(self.take(rows, lengths, 1), np.broadcast_to(kept, len(rows)), codec)
+                lengths = self.count(rows)
+                kept = np.maximum(lengths - self._dialect.terminator, 0)
+                return Runs(self.take(rows, lengths, 1), np.broadcast_to(kept, len(rows)), None)
             case Record():
                 return self.record(of, rows)
             case Array():
@@ -317,10 +316,10 @@ def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
         case Scalars(dtype=dtype):
             scalars = [_list_offsets(p.places) for p in pieces if isinstance(p, Scalars)]
             return Scalars(np.concatenate(scalars)[order], dtype)
-        case Runs(kind=kind):
+        case Runs(dtype=dtype):
             runs = [(_list_offsets(p.places), p.lengths) for p in pieces if isinstance(p, Runs)]
             offsets, lengths = (np.concatenate(of)[order] for of in zip(*runs, strict=True))
-            return Runs(offsets, lengths, kind)
+            return Runs(offsets, lengths, dtype)
         case Fields():
             columns = zip(*(p.fields for p in pieces if isinstance(p, Fields)), strict=True)
             return Fields(len(order), tuple(_join_values(column, order) for column in columns))

@@ -1,6 +1,6 @@
 """What a message definition says of the bytes: scalars, texts, arrays and records, as one small tree; and the text of a definition.
 
-Both ROS 1 serialisation and CDR lay these types out field after field; how is `tcpipe.logs.wire_layout`'s knowledge.
+Both ROS 1 serialisation and CDR lay these types out field after field; how is `tcpipe.logs.wire_cursors`'s knowledge.
 
 A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log holds the message first, then every message it is
 made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaults and comments do not matter for reading.
@@ -29,34 +29,15 @@ class Scalar:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A length-prefixed string: ``count`` bytes of UTF-8 (``wide`` None), or wide characters."""
-
-    wide: Wide | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Wide:
-    """How wide characters are laid out: ``step`` bytes for each unit of the length before them, ``width`` bytes a character."""
-
-    step: int
-    width: int
-
-    def codec(self, byte_order: str) -> str:
-        """Return Python's name of the encoding; ``byte_order`` is ``<`` or ``>``."""
-        return f"utf-{8 * self.width}-{'le' if byte_order == '<' else 'be'}"
-
-
-WIDE_FORMS = (Wide(4, 4), Wide(2, 2), Wide(1, 2))
-"""Forms of a wide string in CDR: in ROS 2 up to Iron a count and 32 bits a character; later 16 bits; in XTypes the length is in bytes."""
+    """A length-prefixed string: so many bytes of UTF-8."""
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A message: named fields in wire order; ``fixed`` when every message of the type has the same size."""
+    """A message: named fields in wire order, which unfold to so many columns."""
 
     name: str
     fields: tuple[tuple[str, WireType], ...]
-    fixed: bool
     leaves: int
 
 
@@ -69,19 +50,6 @@ class Array:
 
 
 WireType = Scalar | Text | Record | Array
-
-
-def is_fixed(wire_type: WireType) -> bool:
-    """Return whether all values of the type occupy the same number of bytes (but for alignment)."""
-    match wire_type:
-        case Scalar():
-            return True
-        case Text():
-            return False
-        case Record():
-            return wire_type.fixed
-        case Array():
-            return wire_type.length is not None and is_fixed(wire_type.element)
 
 
 def count_leaves(wire_type: WireType) -> int:
@@ -138,41 +106,8 @@ def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
 
 
 def record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
-    """Make a record; whether it is fixed and how wide it unfolds follow from its fields."""
-    return Record(name, fields, all(is_fixed(of) for _, of in fields), sum(count_leaves(of) for _, of in fields))
-
-
-def has_wide_texts(of: WireType) -> bool:
-    """Return whether there are wide strings in the type."""
-    match of:
-        case Text():
-            return of.wide is not None
-        case Record():
-            return any(has_wide_texts(field) for _, field in of.fields)
-        case Array():
-            return has_wide_texts(of.element)
-        case _:
-            return False
-
-
-def convert_wide_texts(of: Record, form: Wide) -> Record:
-    """Return the type with its wide strings in another form."""
-    fields = tuple((name, _convert_type(field, form)) for name, field in of.fields)
-    return Record(of.name, fields, of.fixed, of.leaves)
-
-
-def _convert_type(of: WireType, form: Wide) -> WireType:
-    match of:
-        case Text(wide=Wide()):
-            return Text(form)
-        case Record():
-            return convert_wide_texts(of, form)
-        case Array(element=Text(wide=Wide())):
-            return Array(Text(form), of.length)
-        case Array(element=Record() as element):
-            return Array(convert_wide_texts(element, form), of.length)
-        case _:
-            return of
+    """Make a record; how wide it unfolds follows from its fields."""
+    return Record(name, fields, sum(count_leaves(of) for _, of in fields))
 
 
 def iterate_flat_fields(of: Record, prefix: str = "") -> Iterator[tuple[str, WireType]]:

@@ -19,7 +19,7 @@ from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, find_logs, is_log_file, list_logs_below
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
-from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files
+from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files, walk_folders
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -308,7 +308,8 @@ def _stat_files(path: Path) -> list[os.stat_result]:
     except OSError:
         return []
     if stat.S_ISDIR(seen.st_mode):
-        return [file.stat() for file in sorted(path.rglob("*")) if file.is_file()]
+        names = (f"{place}/{name}" for place, _, held in walk_folders(path) for name in held)
+        return [of for file in sorted(names) if stat.S_ISREG((of := os.stat(file)).st_mode)]  # noqa: PTH116
     return [seen] if stat.S_ISREG(seen.st_mode) else []
 
 

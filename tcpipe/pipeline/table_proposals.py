@@ -19,6 +19,7 @@ from tcpipe.logs.field_mapping import (
     CALLED,
     MAPPED,
     STAMP_UNITS,
+    FieldSource,
     find_other_unit,
     match_field_names,
     parse_stamps_ns,
@@ -70,17 +71,17 @@ class _Table:
         return max(min(self.span_ns[1], other.span_ns[1]) - max(self.span_ns[0], other.span_ns[0]), 0)
 
 
-def propose_tables(path: Path) -> tuple[ProposedRecipe, dict[str, tuple[str, ...]]]:
-    """Return the recipe for a table, or those in a folder, that have known names, and by file what its columns are called.
+def propose_tables(path: Path) -> ProposedRecipe:
+    """Return the recipe for a table, or those in a folder, that have known names; its head lists their columns and what cannot be read.
 
-    Of several tables for a role, that is used which covers the drive of the others best. The recipe's head names what cannot be read.
+    Of several tables for a role, that is used which covers the drive of the others best.
     """
     folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
-    columns: dict[str, tuple[str, ...]] = {}
-    head = list[str]()
+    columns: dict[str, Sequence[str]] = {}
+    head = [""]
     for file in files:
         try:
-            columns[file.relative_to(folder).as_posix()] = tuple(read_column_names(file))
+            columns[file.relative_to(folder).as_posix()] = read_column_names(file)
         except LogError as error:
             head.append(str(error))
     roles: dict[str, list[tuple[_Table, list[ProposedLine]]]] = {}
@@ -90,9 +91,8 @@ def propose_tables(path: Path) -> tuple[ProposedRecipe, dict[str, tuple[str, ...
         found = [(role, (table, lines)) for role, lines in _iterate_roles(table)] if table else []
         for role, candidate in found:
             roles.setdefault(role, []).append(candidate)
-        if not found:
-            why = "no known fields" if table else "no stamps"
-            head.append(f"{name} is not used, {why} in its columns {', '.join(names)}")
+        unused = "" if found else ", not used: no known fields" if table else ", not used: no stamps"
+        head.append(f"{name}{unused}; columns {', '.join(names)}")
     ranked = [of for candidates in roles.values() for of in sorted(candidates, key=lambda of: -of[0].rows)[:1]]
     lines, log = list[ProposedLine](), path
     for role, candidates in roles.items():
@@ -106,7 +106,7 @@ def propose_tables(path: Path) -> tuple[ProposedRecipe, dict[str, tuple[str, ...
     with_voltage = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
     lines = [line for line in lines if line.note != NO_VOLTAGE or make_rail_name(line.table) not in with_voltage]
     lines += propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)
-    return ProposedRecipe(head, lines, format_path(log)), columns
+    return ProposedRecipe(head, lines, format_path(log))
 
 
 def _group_files(folder: Path, files: Sequence[Path]) -> dict[str, Path]:
@@ -168,13 +168,13 @@ def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     measured = [name for name in table.names if name not in commands]
     found = {"gnss": match_field_names("gnss", measured), "imu": match_field_names("imu", measured)}
     found["command"] = match_field_names("command", commands)
-    if not found["gnss"]:
-        sided = match_sided_velocities([_quote(name) for name in measured])
-        if sided and (other := find_other_unit(parse_expression(sided["angular_z"]), "rad/s")):
-            to_mps = f"* {UNITS['m/s'][other]:.9g} {_OVER_TRACK}"
-            sided["angular_z"] = sided["angular_z"].removesuffix(_OVER_TRACK) + to_mps
-        found["wheel_odometry"] = match_field_names("wheel_odometry", measured) or sided
-        found["pose"] = {} if found["wheel_odometry"] else match_field_names("pose", measured)
+    sided = match_sided_velocities([_quote(name) for name in measured])
+    if sided and (other := find_other_unit(parse_expression(sided["angular_z"]), "rad/s")):
+        to_mps = f"* {UNITS['m/s'][other]:.9g} {_OVER_TRACK}"
+        sided["angular_z"] = sided["angular_z"].removesuffix(_OVER_TRACK) + to_mps
+    found["wheel_odometry"] = (not found["gnss"] and match_field_names("wheel_odometry", measured)) or sided
+    is_moving = found["gnss"] or found["wheel_odometry"]
+    found["pose"] = {} if is_moving else match_field_names("pose", measured)
     for role, columns in found.items():
         if columns and (lines := _make_lines(table, role, role, columns)):
             yield role, lines
@@ -255,9 +255,10 @@ def _find_units(table: _Table, role: str, columns: Mapping[str, str]) -> dict[st
 
 def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[str, Floats]:
     """Return the values of columns by field, in its unit; without those that hold no number."""
-    fields = read_fields("", role, columns, _find_units(table, role, columns), table.names)
-    if isinstance(fields, list):
-        return {}
+    units, fields = _find_units(table, role, columns), dict[str, FieldSource]()
+    for name, text in columns.items():  # one that cannot be read takes no other with it
+        read = read_fields("", role, {name: text}, {of: unit for of, unit in units.items() if of == name}, table.names)
+        fields |= read if isinstance(read, dict) else {}
     _, found = read_values(table.path, table.stamp, fields)
     return {name: values for name, values in found.items() if np.isfinite(values).any()}
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
+from tcpipe.cost.adaptation import Run, make_metres
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.dataset import Dataset
@@ -35,6 +36,8 @@ from tcpipe.planning.cost_model import (
     join_predictions,
     predict_segments,
 )
+from tcpipe.planning.search import find_turning
+from tcpipe.recipe import SampleConfig
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
 from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
@@ -160,9 +163,11 @@ def compute_drive_cost(
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
     segments = segments.sort_by("start_ns")
-    shift_m = np.array((shifts or {}).get(run.run_id, (0.0, 0.0, 0.0)))
-    said = _predict_drive(model, source, segments, data, shift_m[:2])
-    reasons, energy = _list_reasons(model, segments, said, data, shift_m[2]), ENERGIES[model.label_energy].energy
+    shift_m, recipe = np.array((shifts or {}).get(run.run_id, (0.0, 0.0, 0.0))), data.card.recipe
+    said = _predict_drive(model, source, segments, recipe.read.gnss_crs, shift_m[:2])
+    std_m = np.hypot(to_floats(segments, "position_std_m"), shift_m[2])
+    reasons = _list_reasons(model, segments, said, std_m > recipe.sample.max_position_std_m)
+    energy = ENERGIES[model.label_energy].energy
     length_m, good = to_floats(segments, "arc_length_m"), np.array([not why for why in reasons])
     named = sorted({name for why in reasons for name in why})
     trained = data["train"]
@@ -189,26 +194,55 @@ def compute_drive_cost(
 
 
 def _predict_drive(
-    model: CostModel, source: MapReader, segments: pa.Table, data: Dataset, shift_m: Floats
+    model: CostModel, source: MapReader, segments: pa.Table, gnss_crs: str, shift_m: Floats
 ) -> SegmentPredictions:
     """Return what the model says of each segment, on its ground by the map: where it was driven, moved by a shift (x, y)."""
-    projection = find_map_projection(source, data.card.recipe.read.gnss_crs)
+    projection = find_map_projection(source, gnss_crs)
     start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m for name in ("start", "end"))
-    turn_radpm = (
-        to_floats(segments, "mean_abs_yaw_rate_radps")
-        * to_floats(segments, "duration_s")
-        / to_floats(segments, "arc_length_m")
-    )
+    turn_radpm = _find_turns(segments) / to_floats(segments, "arc_length_m")
     frames = make_patch_frames(start, end, to_floats(segments, "chord_m"))
     return join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
 
 
+def _find_turns(segments: pa.Table) -> Floats:
+    """Return how far each segment turns, both ways counted [rad]."""
+    return to_floats(segments, "mean_abs_yaw_rate_radps") * to_floats(segments, "duration_s")
+
+
+def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
+    """Return the labelled segments of a run on ground that the model knows, predicted and measured; `UsageError` if there are none.
+
+    The run may be of another robot, payload or season: a model is adapted by it.
+    """
+    check_model(model, source)
+    segments, gnss_crs = run.segments().sort_by("start_ns"), run.manifest.recipe.read.gnss_crs
+    said = _predict_drive(model, source, segments, gnss_crs, np.zeros(2)) if segments.num_rows else None
+    uncertain = to_floats(segments, "position_std_m") > SampleConfig().max_position_std_m
+    reasons = [] if said is None else _list_reasons(model, segments, said, uncertain)
+    good = np.array([not why for why in reasons], np.bool_)
+    if said is None or not good.any():
+        named = ", ".join(sorted({name.replace("_", " ") for why in reasons for name in why})) or "it has no segments"
+        raise UsageError(
+            f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
+        )
+    duration, energy = to_floats(segments, "chord_m") / said.velocity_mps, ENERGIES[model.label_energy].energy
+    length_m, turn_rad = to_floats(segments, "arc_length_m"), _find_turns(segments)
+    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+    turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, said.terrain_class)
+    start_xy_m = find_map_projection(source, gnss_crs).forward(read_lonlat_deg(segments, "start"))
+    metres = make_metres(
+        model.physics, length_m=length_m, class_id=said.terrain_class, slope_rad=said.slope_rad, turn_rad=turn_rad,
+        predicted={"duration": duration, "energy": said.power_watt * duration + turn_joule},
+        measured={"duration": to_floats(segments, "duration_s"), "energy": to_floats(segments, energy)},
+        distance_m=np.insert(np.cumsum(np.linalg.norm(np.diff(start_xy_m, axis=0), axis=1)), 0, 0.0),
+    )  # fmt: skip
+    return Run(run.run_id, {name: of.take(good) for name, of in metres.items()})
+
+
 def _list_reasons(
-    model: CostModel, segments: pa.Table, said: SegmentPredictions, data: Dataset, shift_std_m: float
+    model: CostModel, segments: pa.Table, said: SegmentPredictions, uncertain: NDArray[np.bool_]
 ) -> list[list[str]]:
-    """Return why each segment is not compared; nothing where it is."""
-    std_m = np.hypot(to_floats(segments, "position_std_m"), shift_std_m)
-    uncertain = std_m > data.card.recipe.sample.max_position_std_m
+    """Return why each segment is not compared; nothing where it is. ``uncertain``: whose place is not known well enough, shape (N,)."""
     unlabelled = ~np.isfinite(
         to_floats(segments, ENERGIES[model.label_energy].energy) + to_floats(segments, "duration_s")
     )
@@ -312,7 +346,8 @@ def evaluate_drives(
 ) -> DrivesResult:
     """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``, or to a URL.
 
-    Where the dataset's runs were moved onto their map (``sample.align``), drives are moved by the same method, or a finding says why not.
+    Where the dataset's runs were moved onto their map (``sample.align``), drives are moved together with
+    those of them that are in the store, or a finding says why not.
 
     Raises
     ------
@@ -329,8 +364,12 @@ def evaluate_drives(
         raise UsageError(f"{place}: is a file, expected a directory to write {JSON} and {PAGE} into")
     recipe, shifts, moved = data.card.recipe, dict[str, tuple[float, float, float]](), list[Finding]()
     if recipe.sample.align:
-        registrations, moved = register_runs(runs, source, recipe)
+        names = {run.run_id for run in runs}
+        known = {(run.run_id, run.recipe_id) for run in data.card.runs} | {(run.run_id, run.recipe_id) for run in runs}
+        together = [run for run in opened.runs() if (run.run_id, run.recipe_id) in known]
+        registrations, found_on_map = register_runs(together, source, recipe)
         shifts = list_shifts(registrations)
+        moved = [of for of in found_on_map if of.subject.kind != "run" or of.subject.name in names]
     found = tuple(
         compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
         for run, log in zip(runs, logs, strict=True)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
+from tcpipe.cost.adaptation import Run, adapt, make_metres
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
-from tcpipe.errors import PathError, UsageError
+from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
@@ -82,14 +83,17 @@ def find_projection(source: MapReader) -> Projection:
     return find_map_projection(source, "EPSG:4326")
 
 
-def compute_path_cost(model: CostModel, source: MapReader, lonlat_deg: Floats, *, where: str) -> PathCost:
-    """Return what a path costs.
+def compute_path_cost(
+    model: CostModel, source: MapReader, lonlat_deg: Floats, *, where: str, known: Run | None = None
+) -> PathCost:
+    """Return what a path costs, by the model as it is or adapted by the metres of a run.
 
     Parameters
     ----------
     model, source : who predicts, and the map.
     lonlat_deg : the path's points, WGS 84, shape (P, 2).
     where : what the path is called in errors.
+    known : metres of a run of the robot that is to drive the path.
 
     Raises
     ------
@@ -106,7 +110,7 @@ def compute_path_cost(model: CostModel, source: MapReader, lonlat_deg: Floats, *
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
     said = join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
-    return _sum_costs(model, source, pieces, said)
+    return _sum_costs(model, source, pieces, said, known)
 
 
 def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
@@ -128,7 +132,9 @@ def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, wh
     return pieces
 
 
-def _sum_costs(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions) -> PathCost:
+def _sum_costs(
+    model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions, known: Run | None
+) -> PathCost:
     bits, class_id, errors = said.reasons, said.terrain_class, fit_errors(model.residuals)
     duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
     turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
@@ -137,7 +143,19 @@ def _sum_costs(model: CostModel, source: MapReader, pieces: Pieces, said: Segmen
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
     (fast, slow), (least, most), sums = (nothing, nothing), (nothing, nothing), None
-    if errors is not None:
+    if known is not None:
+        if errors is None:
+            raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
+        predicted = {"duration": duration, "energy": energy}
+        there = make_metres(
+            model.physics, length_m=pieces.arc_m, class_id=class_id, slope_rad=said.slope_rad, turn_rad=turn_rad,
+            predicted=predicted, measured=predicted, distance_m=np.cumsum(pieces.arc_m) - pieces.arc_m,
+        )  # fmt: skip
+        adapted = {name: adapt(errors[name], known.metres[name]).predict(of) for name, of in there.items()}
+        duration, energy = adapted["duration"].value, adapted["energy"].value
+        (fast, slow), (least, most) = ((of.low, of.high) for of in (adapted["duration"], adapted["energy"]))
+        sums = {name: of.total for name, of in adapted.items()}
+    elif errors is not None:
         fast, slow = errors["duration"].compute_intervals(duration, class_id)
         least, most = errors["energy"].compute_intervals(energy, class_id)
         sums = {

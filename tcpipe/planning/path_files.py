@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.cost.adaptation import Run
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
@@ -59,6 +60,8 @@ class NamedTotals(PathTotals):
     robot: str
     label_energy: str = "total"
     """``total`` or ``net``: which energy it is."""
+    adapted_by: str | None = field(default=None, metadata=LEFT_OUT)
+    """Run whose metres adapted the model."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,6 +90,7 @@ class PathResult(NamedTotals):
     def __str__(self) -> str:
         """Return the totals, their intervals, and findings, as plain lines."""
         above = ", net" if self.label_energy == "net" else ""
+        above += f", adapted by {self.adapted_by}" if self.adapted_by else ""
         findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
         lines = [f"{self.path}: {format_cost(self)}{above}", *findings]
         if self.out is not None:
@@ -131,8 +135,12 @@ def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
         yield make_finding("one-held-out-run", path, sample_count=of.held_out_samples)
 
 
-def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None) -> PathResult:
+def predict_path(
+    model: CostModel, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
+) -> PathResult:
     """Return what the line in a GeoJSON file costs; write its pieces to ``out`` and the totals beside it.
+
+    ``adapted_by`` is a run by whose metres the model is adapted.
 
     Raises
     ------
@@ -146,13 +154,15 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
             raise UsageError(f"{out}: is the file of the path; give the table another name")
     lonlat_deg = read_line(path)
     line = {"lonlat_deg": lonlat_deg.tolist(), "version": _PATH_VERSION}
-    key = digest({**line, "model": model.checksum, "map": source.summary()})
+    adapted = {} if adapted_by is None else {"adapted_by": adapted_by.checksum()}
+    key = digest({**line, "model": model.checksum, "map": source.summary(), **adapted})
     if out is not None and (known := _compute_totals(out, key)) is not None:
         return convert_record(known, PathResult, path=path, out=out, status="unchanged")
-    cost = compute_path_cost(model, source, lonlat_deg, where=str(path))
+    cost = compute_path_cost(model, source, lonlat_deg, where=str(path), known=adapted_by)
     totals = convert_record(
-        cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot, label_energy=model.label_energy
-    )
+        cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot, label_energy=model.label_energy,
+        adapted_by=None if adapted_by is None else adapted_by.name,
+    )  # fmt: skip
     if out is not None:
         write_pieces(out, cost.pieces)
         write_sealed(

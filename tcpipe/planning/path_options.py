@@ -26,6 +26,13 @@ class PredictPathOptions:
     )
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
+    adapt: str | Path | None = option(
+        None,
+        Option(
+            "Adapt MODEL by the labelled metres of a run, of this or another robot: an ingested log, by its path or its run's name.",
+            metavar="RUN",
+        ),
+    )  # fmt: skip
     store: str | Path = option("tcpipe-store", STORE)
 
 

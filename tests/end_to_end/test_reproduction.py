@@ -100,7 +100,7 @@ def test_train_and_evaluate_by_hand(reproduced):
     here, _ = reproduced
     trained = tcpipe("train", "here/dataset", "model", "--width", "16", "--epochs", "1", cwd=here, env=ENV)
     assert trained.returncode == 0, trained.stderr
-    assert "% of the time feeding" in trained.stdout
+    assert "% of it feeding" in trained.stdout
     done = tcpipe(
         "evaluate", "model", "here/dataset", "--no-baselines", "--noise-draws", "1", "--json", cwd=here, env=ENV
     )

@@ -126,16 +126,6 @@ def test_what_cannot_be_decoded_is_named_and_counted():
     assert all("wrong_format" in finding.names["reason"] for finding in lost)
 
 
-def test_the_events_of_a_service_are_read_by_the_services_definition():
-    path = shared_data("peers/rosbag2/rosbag2_cpp/test/rosbag2_cpp/bags/only_services.mcap")
-    with open_log(path) as log:
-        events = log.table("/add_two_ints/_service_event").to_pylist()
-    asked = {e["info.sequence_number"]: e["request"][0] for e in events if e["request"]}
-    answered = {e["info.sequence_number"]: e["response"][0]["sum"] for e in events if e["response"]}
-    assert len(asked) == 6
-    assert answered == {number: pair["a"] + pair["b"] for number, pair in asked.items()}
-
-
 @pytest.fixture(scope="module")
 def husky_directories(tmp_path_factory):
     archive = shared_data("damaged/husky_test1_rosbag2_dirs.tar.xz")

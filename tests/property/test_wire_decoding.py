@@ -12,8 +12,7 @@ from rosbags.typesys import get_types_from_msg
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_part import MessageBlock
 from tcpipe.formats.logs.ros_types import MessageType
-from tcpipe.logs.wire_cursors import find_dialect, walk
-from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, Scalar, Text, convert_wide_texts, record
+from tcpipe.logs.wire_types import Array, Record, Scalar, Text, record
 
 CODES = ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 HEADERS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4), None: ("<", 1)}
@@ -23,9 +22,9 @@ HEADERS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), 
 class Writer:
     """Serialises one message as the specifications say, one value after the other."""
 
-    def __init__(self, header, form):
+    def __init__(self, header):
         self.order, self.max_alignment = HEADERS[header]
-        self.header, self.form, self.body = header, form, bytearray()
+        self.header, self.body = header, bytearray()
 
     def message(self, of, value):
         self.write(of, value)
@@ -42,10 +41,6 @@ class Writer:
     def write(self, of, value):
         if isinstance(of, Scalar):
             self.number(of.code, value)
-        elif isinstance(of, Text) and of.wide:
-            text = value.encode(self.form.codec(self.order))
-            self.number("u4", len(text) // self.form.step)
-            self.body += text
         elif isinstance(of, Text):
             text = value.encode() + (b"\0" if self.header else b"")
             self.number("u4", len(text))
@@ -62,10 +57,9 @@ class Writer:
                 self.write(of.element, element)
 
 
-def wire_types(*, wide):
+def wire_types():
     scalars = st.builds(Scalar, st.sampled_from(CODES))
-    texts = st.sampled_from([Text(), Text(WIDE_FORMS[0])]) if wide else st.just(Text())
-    leaves = st.one_of(scalars, texts)
+    leaves = st.one_of(scalars, st.just(Text()))
 
     def records(children, *, fewest=0):
         fields = st.lists(children, min_size=fewest, max_size=4)
@@ -83,7 +77,7 @@ def wire_types(*, wide):
     )
 
 
-def random_value(of, rng, lengths, wide):
+def random_value(of, rng, lengths):
     """A value; ``lengths`` decides how long texts and lists are."""
     if isinstance(of, Scalar):
         if of.code == "?":
@@ -93,12 +87,11 @@ def random_value(of, rng, lengths, wide):
         limits = np.iinfo(of.code)
         return int(rng.integers(limits.min, limits.max, dtype=of.code, endpoint=True))
     if isinstance(of, Text):
-        letters = "abcdé€" if not of.wide or wide == 4 else "ab𝄞"
-        return "".join(rng.choice(list(letters)) for _ in range(int(lengths.integers(0, 5))))
+        return "".join(rng.choice(list("abcdé€")) for _ in range(int(lengths.integers(0, 5))))
     if isinstance(of, Record):
-        return {name: random_value(field, rng, lengths, wide) for name, field in of.fields}
+        return {name: random_value(field, rng, lengths) for name, field in of.fields}
     count = int(lengths.integers(0, 5)) if of.length is None else of.length
-    return [random_value(of.element, rng, lengths, wide) for _ in range(count)]
+    return [random_value(of.element, rng, lengths) for _ in range(count)]
 
 
 def flat(of, value, prefix=""):
@@ -109,8 +102,8 @@ def flat(of, value, prefix=""):
             yield prefix + name, value[name]
 
 
-def decoded(of, payloads, encoding):
-    table = TopicTable(MessageType(of, "log", {}), encoding)
+def decoded(of, payloads, encoding, definitions=None):
+    table = TopicTable(MessageType(of, "log", definitions or {}), encoding)
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.arange(len(payloads))
     table.add(
@@ -124,19 +117,16 @@ def decoded(of, payloads, encoding):
 @settings(max_examples=60, deadline=None)
 @given(
     header=st.sampled_from(list(HEADERS)),
-    form=st.sampled_from(WIDE_FORMS),
     alike=st.booleans(),
     count=st.sampled_from([1, 12, 70]),
     seed=st.integers(0, 1 << 20),
     data=st.data(),
 )
-def test_every_type_in_every_serialisation(header, form, alike, count, seed, data):  # noqa: PLR0917
-    of = data.draw(wire_types(wide=header is not None))
+def test_every_type_in_every_serialisation(header, alike, count, seed, data):
+    of = data.draw(wire_types())
     rng = np.random.default_rng(seed)
-    values = [random_value(of, rng, np.random.default_rng(seed) if alike else rng, form.width) for _ in range(count)]
-    payloads = [Writer(header, form).message(of, value) for value in values]
-    if header is not None and _ambiguous(of, payloads, form):
-        return
+    values = [random_value(of, rng, np.random.default_rng(seed) if alike else rng) for _ in range(count)]
+    payloads = [Writer(header).message(of, value) for value in values]
     found = decoded(of, payloads, "cdr" if header else "ros1")
     columns = [name for name, _ in flat(of, values[0])]
     assert found.column_names[2:] == columns
@@ -145,27 +135,12 @@ def test_every_type_in_every_serialisation(header, form, alike, count, seed, dat
         assert json.dumps(found[name].to_pylist()) == json.dumps(expected), name
 
 
-def _ambiguous(of, payloads, form):
-    """Whether another form of wide strings fits as many messages, so that nothing can tell."""
-
-    def fitting(of):
-        some = [np.frombuffer(payload, np.uint8) for payload in payloads[:32]]
-        start = np.zeros(1, np.int64)
-        walks = (walk(of, one, start, start + len(one), find_dialect(one.tobytes(), "cdr")) for one in some)
-        return sum(bool(walked.fits[0]) for walked in walks)
-
-    others = [fitting(convert_wide_texts(of, other)) for other in WIDE_FORMS if other != form]
-    return convert_wide_texts(of, WIDE_FORMS[0]) != convert_wide_texts(of, WIDE_FORMS[1]) and max(others) >= fitting(
-        convert_wide_texts(of, form)
-    )
-
-
 @pytest.mark.parametrize("header", list(HEADERS))
 def test_a_message_that_fits_no_definition_costs_only_itself(header):
     of = record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
     rng = np.random.default_rng(0)
-    values = [random_value(of, rng, rng, 4) for _ in range(100)]
-    payloads = [Writer(header, WIDE_FORMS[0]).message(of, value) for value in values]
+    values = [random_value(of, rng, rng) for _ in range(100)]
+    payloads = [Writer(header).message(of, value) for value in values]
     order, _ = HEADERS[header]
     start = 4 if header else 0
     for row in (3, 50, 99):
@@ -195,7 +170,7 @@ def test_arrays_of_messages_that_hold_short_arrays_of_messages():
         {"a": [{"b": [{"x": m + 10.0 * i + j} for j in range(2)], "c": [m, i, -m, -i]} for i in range(5)]}
         for m in range(12)
     ]
-    writer = [Writer(b"\x00\x01", None).message(outer, value) for value in values]
+    writer = [Writer(b"\x00\x01").message(outer, value) for value in values]
     lengths = np.full(len(writer), len(writer[0]), np.int64)
     order = np.arange(len(writer))
     table = TopicTable(MessageType(outer, "log", {}), "cdr")
@@ -205,3 +180,13 @@ def test_arrays_of_messages_that_hold_short_arrays_of_messages():
     found = table.take()
     found.validate(full=True)
     assert found["a"].to_pylist() == [value["a"] for value in values]
+
+
+@pytest.mark.parametrize("header", [b"\x00\x01", None])
+def test_a_list_too_long_to_be_walked_side_by_side_is_read_message_by_message(header):
+    of = record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
+    values = [{"texts": ["a"] * count, "number": float(count)} for count in (21_000, 2, 0)]
+    payloads = [Writer(header).message(of, value) for value in values]
+    found = decoded(of, payloads, "cdr" if header else "ros1", _definitions())
+    assert found["texts"].to_pylist() == [value["texts"] for value in values]
+    assert found["number"].to_pylist() == [value["number"] for value in values]

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import click
 import numpy as np
+import pyarrow.compute as pc
 import pytest
+from installed_command import plain_lines
 from installed_command import tcpipe as command
-from synthetic_store import box, lonlat, region_file, small_store
+from synthetic_store import add_run, box, lanes, lonlat, region_file, segments, small_store
 
 import tcpipe
 from tcpipe import api
@@ -20,6 +22,7 @@ from tcpipe.cli import cli
 from tcpipe.errors import UsageError
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.fitting import FitConfig
+from tcpipe.store import open_store
 
 STUB = Path(tcpipe.__file__).with_suffix(".pyi")
 FUNCTIONS = {"train": "train", "evaluate": "evaluate", "predict-path": "predict_path", "plan-path": "plan_path"}
@@ -158,4 +161,40 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
     assert plan.lonlat_deg[[0, -1]] == pytest.approx(np.array(ends), abs=1e-8)
     assert tcpipe.predict_path("model", plan.out, store=store).length_m == pytest.approx(
         plan.plans["time"].length_m, abs=0.01
+    )
+
+
+def test_a_model_is_adapted_by_runs_of_the_store(place, monkeypatch):
+    """A run of another robot takes 30 % more energy: the model learns that from it, and a path takes 30 % more."""
+    here, store = place
+    monkeypatch.chdir(here)
+    tcpipe.train("dataset", "adaptable", model="physics")
+    table = segments("heavy", *lanes(-15.5 + 2.0 * np.arange(8), -14.0, 14.0), start_ns=10**18, robot="jackal")
+    for name in ("power_watt", "energy_joule"):
+        at = table.schema.get_field_index(name)
+        table = table.set_column(at, table.schema.field(at), pc.multiply(table.column(name), 1.3))
+    add_run(open_store(store), "heavy", table)
+
+    plain, adapted = (
+        _said(here, "predict-path", "adaptable", "--path", "path.geojson", "--store", store, "--adapt", run)
+        for run in ("south", "heavy")
+    )
+    assert (plain["adapted_by"], adapted["adapted_by"]) == ("south", "heavy")
+    assert adapted["energy_joule"] / plain["energy_joule"] == pytest.approx(1.3, abs=0.05)
+    assert adapted["duration_s"] == pytest.approx(plain["duration_s"], rel=0.05)
+    low, high = adapted["energy_interval_joule"]
+    assert low < adapted["energy_joule"] < high
+
+    found = tcpipe.evaluate("adaptable", "dataset", "of drives", adapt=(40, 0), drives=["heavy"], store=store)
+    plain, adapted = (of.rmse for of in found.values.errors if (of.quantity, of.predictor) == ("energy", "model"))
+    assert adapted < 0.5 * plain
+    assert json.loads((here / "of drives" / "adaptation.json").read_text())["known_m"] == [0.0, 40.0]
+    said = _said(here, "evaluate", "adaptable", "dataset", "of runs", "--adapt", "0,5")
+    assert {(of["predictor"], of["metres"]) for of in said["errors"]} == {
+        ("model", 0.0), ("model", 5.0), ("mean of the metres", 5.0),
+    }  # fmt: skip
+    done = command("evaluate", "adaptable", "dataset", "--adapt", "0,9000", cwd=here)
+    assert "give smaller values to --adapt" in plain_lines(done, 1)
+    assert "expected metres with commas" in plain_lines(
+        command("evaluate", "adaptable", "dataset", "--adapt", "ten", cwd=here), 2
     )

@@ -14,16 +14,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.arrow_values import IrregularColumns, find_arrow_type
+from tcpipe.formats.logs.arrow_values import WalkedColumns, find_arrow_type
 from tcpipe.formats.logs.log_part import MessageBlock, gather_integers, group_by_key
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
 from tcpipe.logs.wire_cursors import Dialect, LayoutError, RaggedError, WalkResult, find_dialect, walk
 from tcpipe.logs.wire_types import (
-    WIDE_FORMS,
     Record,
-    convert_wide_texts,
     find_field_units,
-    has_wide_texts,
     iterate_flat_fields,
 )
 from tcpipe.tables.arrays import number_column
@@ -91,7 +88,6 @@ class TopicTable:
         """About how much memory the messages take that no table was taken of yet."""
         self._type, self._encoding = message_type, encoding
         self._wire = message_type.wire
-        self._wide_open = has_wide_texts(message_type.wire)
         self._alike: dict[int, _Gathered] = {}
         self._ragged: _Gathered = []
         self._alike_bytes = self._ragged_bytes = 0
@@ -112,8 +108,6 @@ class TopicTable:
         self._seen += count
         self._times.append((block.log_time_ns, block.publish_time_ns, block.ordinal))
         self.held_bytes += int(block.lengths.sum()) + _TIMES_BYTES * count
-        if self._wide_open:
-            self._settle_wide_texts(block)
         distinct = np.unique(block.lengths).tolist() if block.length is None else [block.length] if count else []
         if len(distinct) == 1:
             self._add_alike(rows, block.buffer, block.offsets, distinct[0])
@@ -127,23 +121,6 @@ class TopicTable:
                 self._add_alike(rows[chosen], block.buffer, block.offsets[chosen], length)
         if self._alike_bytes > FLUSH_BYTES:
             self._flush()
-
-    def _settle_wide_texts(self, block: MessageBlock) -> None:
-        """Find out in which form wide strings are written: the one that the messages fit; those without such a string tell nothing."""
-        places = zip(block.offsets[:_FEW].tolist(), block.lengths[:_FEW].tolist(), strict=True)
-        payloads = [np.frombuffer(block.buffer[start : start + length], np.uint8) for start, length in places]
-        forms = {form: convert_wide_texts(self._type.wire, form) for form in WIDE_FORMS}
-        fitting = {form: sum(self._fits(of, payload) for payload in payloads) for form, of in forms.items()}
-        best = max(fitting, key=fitting.__getitem__)
-        self._wire = forms[best]
-        self._wide_open = len(set(fitting.values())) == 1
-
-    def _fits(self, of: Record, payload: NDArray[np.uint8]) -> bool:
-        try:
-            dialect = find_dialect(payload[:4].tobytes(), self._encoding)
-            return bool(walk(of, payload, np.zeros(1, np.int64), np.full(1, len(payload)), dialect).fits[0])
-        except (LayoutError, RaggedError):
-            return False
 
     def _add_alike(self, rows: _Int64, buffer: memoryview, offsets: _Int64, length: int) -> None:
         """Add messages of equal length."""
@@ -258,11 +235,11 @@ class TopicTable:
         """Decode messages side by side, and what that cannot do one by one."""
         walked = self._walked(data, starts, ends, dialect)
         if walked.root:
-            irregular = IrregularColumns(data)
-            self._add_part(rows[walked.fits], list(irregular.columns(walked.root, self._wire)))
-            self.replaced_texts += irregular.replaced_texts
+            walked_columns = WalkedColumns(data)
+            self._add_part(rows[walked.fits], list(walked_columns.columns(walked.root, self._wire)))
+            self.replaced_texts += walked_columns.replaced_texts
         left = ~walked.fits
-        if left.any() and dialect.known_to_rosbags and not has_wide_texts(self._wire):
+        if left.any() and dialect.known_to_rosbags:
             self._row_by_row(rows[left], data, starts[left], ends[left])
         elif left.any():
             self._leave_out("its lengths contradict its size", int(left.sum()))

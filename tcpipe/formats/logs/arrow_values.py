@@ -1,4 +1,4 @@
-"""Arrow arrays from bytes: the building blocks of `tcpipe.formats.logs.arrow_columns`, and the columns of irregular messages."""
+"""Arrow arrays from bytes: the building blocks of `tcpipe.formats.logs.arrow_columns`, and the columns of messages."""
 
 from __future__ import annotations
 
@@ -26,15 +26,8 @@ def find_arrow_type(of: WireType) -> pa.DataType:
             return pa.list_(find_arrow_type(of.element), of.length or -1)
 
 
-def make_texts(count: int, offsets: pa.Buffer, raw: pa.Buffer, codec: str) -> tuple[pa.StringArray, int]:
-    """Return texts from Arrow's offsets and their bytes, and how many are not in the encoding: what is no character there is replaced."""
-    if codec != "utf-8":
-        pieces = pa.BinaryArray.from_buffers(pa.binary(), count, [None, offsets, raw]).to_pylist()
-        decoded = [piece.decode(codec, errors="replace") for piece in pieces]
-        replaced = sum(
-            text.encode(codec, "surrogatepass") != piece for text, piece in zip(decoded, pieces, strict=True)
-        )
-        return pa.array(decoded, pa.string()), replaced
+def make_texts(count: int, offsets: pa.Buffer, raw: pa.Buffer) -> tuple[pa.StringArray, int]:
+    """Return texts from Arrow's offsets and their bytes, and how many are no UTF-8: what is no character is replaced."""
     found = pa.StringArray.from_buffers(count, offsets, raw)
     if not (np.frombuffer(raw, np.uint8) & 0x80).any():
         return found, 0
@@ -57,7 +50,7 @@ def make_lists(values: pa.Array, counts: Int64Array, length: int | None) -> pa.A
     return pa.Array.from_buffers(pa.list_(values.type), len(counts), [None, pa.py_buffer(offsets)], children=[values])
 
 
-class IrregularColumns:
+class WalkedColumns:
     """Builds the columns of messages that `tcpipe.logs.wire_cursors` has walked; ``data`` is what it walked over."""
 
     def __init__(self, data: NDArray[np.uint8]) -> None:
@@ -81,11 +74,11 @@ class IrregularColumns:
                 return pa.Array.from_buffers(find_arrow_type(of), values.count, [None], children=children)
             case Lists(), Array():
                 return make_lists(self._array(values.elements, of.element), values.counts, of.length)
-            case Runs(kind=np.dtype() as dtype), Array():
+            case Runs(dtype=np.dtype() as dtype), Array():
                 elements = number_column(np.frombuffer(self._compact(values)[1], dtype))
                 return make_lists(elements, values.lengths // dtype.itemsize, of.length)
-            case Runs(kind=str() as codec), Text():
-                found, replaced = make_texts(len(values.lengths), *self._compact(values), codec)
+            case Runs(), Text():
+                found, replaced = make_texts(len(values.lengths), *self._compact(values))
                 self.replaced_texts += replaced
                 return found
             case Scalars(places=Grid() as grid, dtype=dtype), Scalar():

@@ -30,7 +30,6 @@ from tcpipe.logs.wire_types import (
     BASE_TYPES,
     MAX_COLUMNS,
     MAX_FIXED_ELEMENTS,
-    WIDE_FORMS,
     Array,
     FieldType,
     MsgTextError,
@@ -69,16 +68,7 @@ _MAX_LENGTH = 1 << 31
 _MAX_DEPTH = 64
 _TYPE_NAME, _FIELD_NAME = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*"), re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PLACEHOLDER = "structure_needs_at_least_one_member"
-_IDL_SEPARATOR = _MSG_SEPARATOR = "=" * 80 + "\n"
-_SERVICE_SPLIT = re.compile(r"^---[ \t]*\n", re.MULTILINE)
-_EVENT_INFO = """\
-MSG: service_msgs/ServiceEventInfo
-uint8 event_type
-builtin_interfaces/Time stamp
-uint8[16] client_gid
-int64 sequence_number
-"""
-"""As service_msgs defines it (ros2/rcl_interfaces); constants change no byte."""
+_IDL_SEPARATOR = "=" * 80 + "\n"
 
 
 class DefinitionError(ValueError):
@@ -258,15 +248,14 @@ class _Unfold:
             return Array(element, length if kind == Nodetype.ARRAY else None)
         if kind == Nodetype.NAME:
             return self.record(argument, within)
-        if argument[0] in ("string", "wstring"):
-            return Text(WIDE_FORMS[0] if argument[0] == "wstring" else None)
+        if argument[0] == "string":
+            return Text()
         if argument[0] not in _CODES:
             raise DefinitionError(f"type {within[-1]}: fields of type {argument[0]} are not supported")
         return Scalar(_CODES[argument[0]])
 
 
 def _parse_definitions(type_name: str, definition: str, schema_encoding: str) -> _Definitions:
-    definition = _make_event_definition(type_name, definition)
     try:
         if schema_encoding == "ros2idl" or definition.startswith(_IDL_SEPARATOR + "IDL: "):
             return _parse_idl(definition)
@@ -276,21 +265,6 @@ def _parse_definitions(type_name: str, definition: str, schema_encoding: str) ->
             raise DefinitionError(f"type {type_name}: its definition is that of a service, not of a message") from None
         stopped_at = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise DefinitionError(f"type {type_name}: its definition cannot be parsed ({stopped_at[:80]})") from None
-
-
-def _make_event_definition(type_name: str, definition: str) -> str:
-    """Return the definition of a service's events where the log defines the service, as ROS 2 logs do; any other as it is."""
-    service, *others = definition.split(_MSG_SEPARATOR)
-    parts = _SERVICE_SPLIT.split(service)
-    package, _, name = type_name.partition("/srv/")
-    if len(parts) != 2 or not name.endswith("_Event"):
-        return definition
-    stem = name.removesuffix("_Event")
-    event = f"service_msgs/ServiceEventInfo info\n{stem}_Request[<=1] request\n{stem}_Response[<=1] response\n"
-    halves = [
-        f"MSG: {package}/srv/{stem}_{half}\n{text}\n" for half, text in zip(("Request", "Response"), parts, strict=True)
-    ]
-    return _MSG_SEPARATOR.join([event, *halves, _EVENT_INFO, *others])
 
 
 def _parse_msg(type_name: str, definition: str) -> _Definitions:

@@ -14,13 +14,16 @@ from tcpipe.recipe import TableMapping
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
 """What a file of a table is called."""
 
+_STORE, _DATASET = {"store.json", "log"}, {"dataset.json", "samples.parquet"}
+"""What lies in a store, and in a dataset."""
+
 Mappings = Mapping[str, TableMapping]
 """The recipe's tables, by name."""
 
 
 def list_table_files(folder: Path) -> list[Path]:
     """Return the tables in a folder and below it, by name; hidden ones are passed over."""
-    return sorted(Path(place) / name for place, _, names in _walk_folders(folder) for name in names if is_table(name))
+    return sorted(Path(place) / name for place, _, names in walk_folders(folder) for name in names if is_table(name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +50,7 @@ def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
     numbered = [mapping.file for mapping in mappings.values() if "*" in mapping.file]
     fixed = [mapping.file for mapping in mappings.values() if mapping.file and "*" not in mapping.file]
     found = list[tuple[Path, ...]]()
-    for place, folders, _ in _walk_folders(path):
+    for place, folders, _ in walk_folders(path):
         folder = Path(place)
         files = sorted(file for pattern in numbered for file in folder.glob(pattern))
         runs = (run for file in files if (run := find_table_run(file, mappings)))
@@ -76,10 +79,11 @@ def find_table_run(path: Path | str, mappings: Mappings) -> TableRun | None:
     return None
 
 
-def _walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+def walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """Yield each folder with the names of folders in it, which the caller may take out, and of files; links to folders are not followed.
 
-    As `os.walk`, which on Python 3.11 calls itself as deep as folders are nested.
+    As `os.walk`, which on Python 3.11 calls itself as deep as folders are nested. Stores and datasets are left out: a log does not
+    change because somebody keeps its results beside it.
     """
     waiting = [str(folder)]
     while waiting:
@@ -92,6 +96,8 @@ def _walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
                 elif not entry.name.startswith((".", "~")):
                     folders.append(entry.name)
         folders.sort()
+        if {*names, *folders} >= _STORE or {*names} >= _DATASET:
+            continue
         yield place, folders, names
         waiting += (f"{place}/{name}" for name in reversed(folders))
 

@@ -134,7 +134,7 @@ def test_a_folder_without_known_names_says_so(tmp_path):
 @pytest.mark.parametrize("columns", [{**FIXES, "volt": 24.0, "amp": 2.0}, {"volt": 24 + 1e-3 * SECONDS, "amp": 2.0}])
 def test_what_a_role_measures_is_no_stamp(tmp_path, columns):
     write(tmp_path / "drive.csv", **columns)
-    with pytest.raises(UsageError, match=r"drive\.csv is not used, no stamps in its columns"):
+    with pytest.raises(UsageError, match=r"drive\.csv, not used: no stamps; columns"):
         propose_recipe(tmp_path)
 
 
@@ -207,3 +207,22 @@ def test_of_several_columns_of_one_name_a_person_decides(tmp_path):
         "time,voltage,current,current\n" + "".join(f"{UTC_S + k},24,{k},{k}\n" for k in range(30))
     )
     assert "# [tables.power]" in propose_recipe(tmp_path).toml()
+
+
+def test_one_table_of_odd_names_is_fixes_wheels_and_power(tmp_path):
+    table = {"Timestamp_us": WALL_NS // 1000, "GPS__Lat": 26.37 + 1e-6 * np.arange(ROWS), "GPS__Lng": -80.1}
+    table |= {"Alt__MSL__(ft)": 10.0, "Fix__Quality": 4, "spd_L__(km/h)": 1.8, "spd_R__(km/h)": 1.9, "SoC__%": 80}
+    write(tmp_path / "log.csv", **table, **{"U_bat__[V]": 25.1, "I_bat__[A]": 2.0 + SECONDS})
+    values, recipe, _ = proposed(tmp_path)
+    tables = values["tables"]
+    assert tables["gnss"]["columns"] == {
+        "latitude": "GPS Lat", "longitude": "GPS Lng", "altitude": "Alt MSL (ft)", "quality": "Fix Quality"
+    }  # fmt: skip
+    assert tables["wheel_odometry"]["columns"] == {"linear_x": "(`spd_L (km/h)` + `spd_R (km/h)`) / 2"}
+    assert tables["wheel_odometry"]["units"] == {"linear_x": "km/h"}
+    assert tables["power"]["columns"] == {"voltage": "`U_bat [V]`", "current": "`I_bat [A]`"}
+    log = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
+    read = log.tables(["/gnss", "/wheel_odometry"])
+    assert read["/gnss"]["altitude"][0].as_py() == pytest.approx(3.048)
+    assert read["/wheel_odometry"]["twist.twist.linear.x"][0].as_py() == pytest.approx(1.85 / 3.6)
+    assert read["/wheel_odometry"]["twist.twist.angular.z"][0].as_py() == pytest.approx(0.1 / 3.6 / 0.5)

@@ -67,15 +67,16 @@ def test_one_name_may_mean_two_things():
     assert kinds == [(("x", Scalar("f4")),), (("y", Scalar("f8")),)]
 
 
-def test_the_events_of_a_service_follow_from_its_definition():
-    text = "Point at\n---\nbool done\n" + SEPARATOR + "MSG: acme_msgs/Point\nfloat64 x\n"
-    text = text.replace("Point at", "acme_msgs/Point at")
-    found = resolve(text, "acme_msgs/srv/Go_Event").wire
-    assert [name for name, _ in found.fields] == ["info", "request", "response"]
-    info, request, response = (of for _, of in found.fields)
-    assert [name for name, _ in info.fields] == ["event_type", "stamp", "client_gid", "sequence_number"]
-    assert [name for name, _ in request.element.fields] == ["at"]
-    assert response.element.fields == (("done", Scalar("?")),)
+@pytest.mark.parametrize(
+    ("text", "name", "problem"),
+    [
+        ("int64 a\n---\nint64 sum\n", "acme_msgs/srv/Add_Event", "that of a service"),
+        ("wstring wide\n", "acme_msgs/msg/Wide", "fields of type wstring are not supported"),
+    ],
+)
+def test_what_is_not_decoded_says_why(text, name, problem):
+    with pytest.raises(DefinitionError, match=problem):
+        resolve(text, name=name)
 
 
 def test_idl():

@@ -13,6 +13,7 @@ from tcpipe.formats.logs.table_log import open_tables
 from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_toml
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.proposals import propose_recipe
 from tcpipe.recipe import Recipe, TableMapping
 from tcpipe.recipe.checking import from_values
 from tcpipe.simulation.scenarios import make_tiny
@@ -185,7 +186,10 @@ def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_pat
     )  # fmt: skip
     found = inspect(folder, recipe=Recipe())
     assert found.kind == "tables"
-    assert "notes.csv is not used" in found.recipe
+    assert "notes.csv, not used" in found.recipe
+    assert found.recipe == propose_recipe(folder).toml()
+    alone = inspect(folder / "fixes.csv", recipe=Recipe())
+    assert alone.recipe == propose_recipe(folder / "fixes.csv").toml()
     recipe = from_values(Recipe, parse_toml(found.recipe), where="proposed")
     assert {table.role or name for name, table in recipe.tables.items()} == {
         "gnss",
@@ -204,6 +208,16 @@ def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_pat
         "/voltage_left": "power",
         "/current_left": "power",
     }
+
+
+def test_a_store_inside_the_folder_of_tables_is_no_part_of_the_log(tmp_path):
+    folder = folder_with(tmp_path, odom=odometry())
+    recipe = Recipe(tables={"wheel_odometry": WHEELS})
+    (beside,) = ingest([folder], store=tmp_path / "store", recipe=recipe).results
+    (inside,) = ingest([folder], store=folder / "tcpipe-store", recipe=recipe).results
+    assert (inside.status, inside.run.run_id) == (beside.status, beside.run.run_id)
+    (again,) = ingest([folder], store=folder / "tcpipe-store", recipe=recipe).results
+    assert again.status == "unchanged"
 
 
 def test_a_folder_of_tables_is_ingested_as_one_log_and_what_is_in_the_way_is_said(tmp_path):

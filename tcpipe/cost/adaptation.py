@@ -1,0 +1,321 @@
+"""Adapt a model to another run, robot, payload or season by the first metres of it.
+
+The trained model is the prior. With p what it predicts of the metres of the new run, and y what was measured there::
+
+    y = p + X b + e,   b ~ N(0, s² (t q)²),   e ~ N(0, s² S (R + r L) S)
+
+The columns of X are in the unit of y: p itself (scale), its mean per metre (offset), and what the robot's physics says that grade and turns
+cost. b is relative to them; a Bayesian linear regression gives it. S are the spreads that the model states of a metre, R the correlation of
+neighbours, L one that falls over 20 m: what a model does not know of new ground. s² has an inverse-gamma prior of mean about 1, so that all
+that is stated has Student's t (Gelman et al., Bayesian Data Analysis, 2013, 14.2). How far the prior reaches, t, and how much of the errors
+is of the ground, r, are not known: all of a small grid are averaged, each with the evidence that the metres give it (ibid., 7.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from hashlib import sha256
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import stdtrit
+
+from tcpipe.cost.prediction_errors import COVERAGE, Errors, SumDistribution
+from tcpipe.tables.facts import PhysicsFit
+
+Floats = NDArray[np.float64]
+
+_PRIOR = 0.05
+"""q: standard deviation of a coefficient at the least reach, of what it multiplies."""
+_REACHES = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""t."""
+_GROUND_SHARES = (0.0, 0.5, 2.0)
+"""r."""
+_GROUND_M = 20.0
+_FREEDOM = 4.0
+"""Of the prior of s²: as many metres as it counts."""
+_NEIGHBOUR_M, _MOST_NEIGHBOUR = 1.5, 0.45
+_TAIL = (1.0 + COVERAGE) / 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Metres:
+    """N metres of one run in order, shape (N,): one quantity as it was predicted and, where it is known, measured."""
+
+    predicted: Floats
+    measured: Floats
+    class_id: NDArray[np.integer]
+    distance_m: Floats
+    """Where each begins, along the run."""
+    length_m: Floats
+    physics: Floats
+    """What parts of the robot's physics cost, in the quantity's unit, shape (N, parts)."""
+
+    def take(self, rows: NDArray[np.bool_]) -> Metres:
+        """Return some of them."""
+        return Metres(*(getattr(self, of.name)[rows] for of in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class Adapted:
+    """What an adapted model says of metres, shape (N,), with the ends of their intervals, and of their sum."""
+
+    value: Floats
+    low: Floats
+    high: Floats
+    total: SumDistribution
+
+
+@dataclass(frozen=True, slots=True)
+class _Component:
+    """The regression for one reach and share of the ground."""
+
+    weight: float
+    coefficients: Floats
+    covariance: Floats
+    scale: float
+    """Estimate of s²."""
+    ground_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Adaptation:
+    """A model's errors on a new run, by the metres that are known of it."""
+
+    errors: Errors
+    per_metre: float
+    freedom: float
+    components: tuple[_Component, ...]
+
+    def predict(self, there: Metres) -> Adapted:
+        """Return what the model says of other metres; where it predicts nothing, NaN, which is in no sum."""
+        known = np.isfinite(there.predicted)
+        if not known.all():
+            parts = self.predict(there.take(known))
+            columns = np.full((3, known.size), np.nan)
+            columns[:, known] = parts.value, parts.low, parts.high
+            return Adapted(columns[0], columns[1], columns[2], parts.total)
+        design, spread = _make_design(there, self.per_metre), self.errors.compute_std(there.predicted, there.class_id)
+        neighbours, ground = (_sum_products(spread, there, of) for of in (_find_neighbour(self.errors), None))
+        weights = np.array([of.weight for of in self.components])
+        values = there.predicted + np.array([design @ of.coefficients for of in self.components])
+        variances, totals = [], []
+        for of in self.components:
+            known = np.einsum("ij,jk,ik->i", design, of.covariance, design)
+            variances.append(of.scale * (known + (1.0 + of.ground_share) * spread**2))
+            summed = design.sum(axis=0)
+            totals.append(of.scale * (summed @ of.covariance @ summed + neighbours + of.ground_share * ground))
+        mean, variance = _mix(weights, values, np.array(variances))
+        total, total_variance = _mix(weights, values.sum(axis=1), np.array(totals))
+        wider = float(stdtrit(self.freedom, _TAIL))
+        common = wider * self.errors.common_share * float(np.abs(mean).sum())
+        half = float(np.hypot(wider * np.sqrt(total_variance), common))
+        low, high = (_widen(end, self.freedom) * np.sqrt(variance) for end in (self.errors.low, self.errors.high))
+        return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half))
+
+
+def adapt(errors: Errors, known: Metres) -> Adaptation:
+    """Return a model's errors, adapted by metres of a run that were measured; at least one."""
+    per_metre = float(np.abs(known.predicted).sum() / known.length_m.sum())
+    design, residual = _make_design(known, per_metre), known.measured - known.predicted
+    spread = errors.compute_std(known.predicted, known.class_id)
+    apart_m = np.abs(known.distance_m[:, None] - known.distance_m)
+    beside = np.eye(len(residual)) + _find_neighbour(errors) * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
+    freedom, found = _FREEDOM + len(residual), []
+    for share in _GROUND_SHARES:
+        noise = spread[:, None] * (beside + share * np.exp(-apart_m / _GROUND_M)) * spread
+        factor = cho_factor(noise, lower=True)
+        whitened, solved = cho_solve(factor, design), cho_solve(factor, residual)
+        precision, log_noise = design.T @ whitened, 2.0 * float(np.log(np.diag(factor[0])).sum())
+        for reach in _REACHES:
+            prior = np.eye(design.shape[1]) / (_PRIOR * reach) ** 2
+            covariance = np.linalg.inv(prior + precision)
+            coefficients = covariance @ (whitened.T @ residual)
+            misfit = float(residual @ solved - coefficients @ (whitened.T @ residual))
+            log_det = log_noise + float(np.linalg.slogdet(prior + precision)[1] - np.linalg.slogdet(prior)[1])
+            evidence = -0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM))
+            found.append(_Component(evidence, coefficients, covariance, (_FREEDOM + misfit) / freedom, share))
+    weights = np.exp([of.weight - max(of.weight for of in found) for of in found])
+    components = (
+        _Component(float(weight), of.coefficients, of.covariance, of.scale, of.ground_share)
+        for weight, of in zip(weights / weights.sum(), found, strict=True)
+    )
+    return Adaptation(errors, per_metre, freedom, tuple(components))
+
+
+def _make_design(of: Metres, per_metre: float) -> Floats:
+    return np.column_stack([of.predicted, per_metre * of.length_m, np.nan_to_num(of.physics)])
+
+
+def _find_neighbour(errors: Errors) -> float:
+    """Return the correlation of neighbours beyond that of their run, which the regression takes up."""
+    at = int(np.searchsorted(errors.lag_m, 1.0, side="right")) - 1
+    return float(np.clip(errors.correlation[at] - errors.correlation[-1], -_MOST_NEIGHBOUR, _MOST_NEIGHBOUR))
+
+
+def _sum_products(spread: Floats, of: Metres, neighbour: float | None) -> float:
+    """Return sum_ij of a_i a_j times the correlation of neighbours, or that of the ground."""
+    gaps_m = np.diff(of.distance_m)
+    if neighbour is not None:
+        return float((spread**2).sum() + 2.0 * neighbour * (spread[1:] * spread[:-1])[gaps_m < _NEIGHBOUR_M].sum())
+    total, carried = float((spread**2).sum()), 0.0
+    for fades, before, here in zip(np.exp(-gaps_m / _GROUND_M), spread[:-1], spread[1:], strict=True):
+        carried = fades * (carried + before)
+        total += 2.0 * here * carried
+    return total
+
+
+def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Floats]:
+    """Return mean and variance of a mixture, over the first axis."""
+    mean = np.tensordot(weights, values, 1)
+    return mean, np.tensordot(weights, variances + (values - mean) ** 2, 1)
+
+
+def _widen(quantile: float, freedom: float) -> float:
+    """Return a quantile of standardised errors, wider by what Student's t is wider than the normal."""
+    return quantile * float(stdtrit(freedom, _TAIL)) / _NORMAL
+
+
+_NORMAL = 1.6448536269514722
+
+
+def _make_sum(middle: float, half: float) -> SumDistribution:
+    """Return the distribution of a sum whose 90 % interval has this half-width."""
+    return SumDistribution(middle, half / _NORMAL, half / _NORMAL)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Measured metres of a run, by quantity (``duration``, ``energy``), in order."""
+
+    name: str
+    metres: Mapping[str, Metres]
+
+    def checksum(self) -> str:
+        """Return a hash of what adapts a model."""
+        arrays = [getattr(of, field.name) for of in self.metres.values() for field in fields(of)]
+        return sha256(b"".join(np.ascontiguousarray(values).tobytes() for values in arrays)).hexdigest()
+
+
+def make_metres(
+    physics: PhysicsFit | None,
+    *,
+    length_m: Floats,
+    class_id: NDArray[np.integer],
+    slope_rad: Floats,
+    turn_rad: Floats,
+    predicted: Mapping[str, Floats],
+    measured: Mapping[str, Floats],
+    distance_m: Floats,
+) -> dict[str, Metres]:
+    """Return metres of a run by quantity; what grade and turns cost in energy is that of the model's own robot, where it is known."""
+    columns = []
+    for term, cause in (("grade", length_m * np.tan(slope_rad)), ("turning", np.abs(turn_rad))):
+        if values := [of.value for of in (physics.terms if physics else ()) if of.term == term]:
+            columns.append(float(np.mean(values)) * cause)
+    nothing = np.empty((len(length_m), 0))
+    parts = {"duration": nothing, "energy": np.column_stack(columns) if columns else nothing}
+    return {
+        name: Metres(predicted[name], measured[name], class_id, distance_m, length_m, parts[name]) for name in predicted
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptedErrors:
+    """Errors of one predictor on the rest of runs, after the first ``metres`` of each are known."""
+
+    quantity: str
+    metres: float
+    predictor: str
+    """``model``, adapted where metres are known, or the mean of these metres."""
+    runs: int
+    samples: int
+    rmse: float
+    coverage_percent: float
+    """Of single metres, by 90 % intervals."""
+    total_error_percent: float
+    """Mean absolute error of the sums over the rests of runs."""
+    totals_inside: int
+    """Runs whose sum is inside its 90 % interval."""
+
+
+MODEL, MEAN = "model", "mean of the metres"
+
+_LEAST_REST = 10
+"""Metres that are left to predict, at least, of a run."""
+
+
+def compare_adaptations(
+    errors: Mapping[str, Errors], runs: Sequence[Run], known_m: Sequence[float]
+) -> Iterator[AdaptedErrors]:
+    """Yield errors on the rest of each run after so many metres of it are known, beside the mean of these metres.
+
+    The rest begins after the most metres, so that all rows are of the same metres; a run too short for some ``known_m`` is in none.
+    """
+    first_m = max(known_m)
+    for quantity, of in errors.items():
+        parts = [(run.metres[quantity], _find_driven(run.metres[quantity])) for run in runs]
+        parts = [(metres, driven) for metres, driven in parts if (driven > first_m).sum() >= _LEAST_REST]
+        if not parts:
+            continue
+        for metres_m in sorted(known_m):
+            for predictor in (MODEL, MEAN) if metres_m else (MODEL,):
+                found = [
+                    (rest, _predict_rest(of, metres.take(driven <= metres_m), rest, predictor))
+                    for metres, driven in parts
+                    for rest in [metres.take(driven > first_m)]
+                ]
+                yield _measure(quantity, metres_m, predictor, found)
+
+
+def _find_driven(of: Metres) -> Floats:
+    """Return the metres with labels up to the end of each."""
+    return np.asarray(np.cumsum(of.length_m))
+
+
+def _predict_rest(errors: Errors, known: Metres, rest: Metres, predictor: str) -> Adapted:
+    if predictor == MEAN:
+        return _predict_mean(known, rest)
+    if len(known.predicted):
+        return adapt(errors, known).predict(rest)
+    low, high = errors.compute_intervals(rest.predicted, rest.class_id)
+    total = errors.compute_sum(rest.predicted, rest.class_id)
+    return Adapted(rest.predicted, low, high, total)
+
+
+def _predict_mean(known: Metres, rest: Metres) -> Adapted:
+    """Return the mean of known metres for all others, with the intervals of independent normal ones."""
+    per_metre = known.measured / known.length_m
+    count, mean = len(per_metre), float(per_metre.mean())
+    std = float(per_metre.std(ddof=1)) if count > 1 else np.inf
+    wider = float(stdtrit(max(count - 1.0, 1.0), _TAIL))
+    value, length_m = mean * rest.length_m, float(rest.length_m.sum())
+    half = wider * std * np.sqrt(1.0 + 1.0 / count) * rest.length_m
+    whole = wider * std * float(np.sqrt((rest.length_m**2).sum() + length_m**2 / count))
+    return Adapted(value, value - half, value + half, _make_sum(mean * length_m, whole))
+
+
+def _measure(quantity: str, metres_m: float, predictor: str, found: Sequence[tuple[Metres, Adapted]]) -> AdaptedErrors:
+    error = np.concatenate([said.value - rest.measured for rest, said in found])
+    inside = np.concatenate([(said.low <= rest.measured) & (rest.measured <= said.high) for rest, said in found])
+    sums = np.array([rest.measured.sum() for rest, _ in found])
+    totals = np.array([[said.total.middle, *said.total.interval] for _, said in found])
+    return AdaptedErrors(
+        quantity=quantity, metres=metres_m, predictor=predictor, runs=len(found), samples=len(error),
+        rmse=float(np.sqrt(np.mean(error**2))), coverage_percent=100.0 * float(inside.mean()),
+        total_error_percent=100.0 * float(np.mean(np.abs(totals[:, 0] / sums - 1.0))),
+        totals_inside=int(((totals[:, 1] <= sums) & (sums <= totals[:, 2])).sum()),
+    )  # fmt: skip
+
+
+def format_adaptations(found: Sequence[AdaptedErrors]) -> Iterator[str]:
+    """Yield errors on the rest of runs as plain lines, a table by metres."""
+    for of in found:
+        unit, digits = ("s", 3) if of.quantity == "duration" else ("J", 1)
+        yield (
+            f"{of.quantity} after {of.metres:g} m, {of.predictor}: RMSE {of.rmse:.{digits}f} {unit}, 90 % intervals cover "
+            f"{of.coverage_percent:.1f} % of {of.samples} metres; sums off by {of.total_error_percent:.1f} %, "
+            f"{of.totals_inside} of {of.runs} inside"
+        )
