@@ -4,11 +4,12 @@ The trained model is the prior. With p what it predicts of the metres of the new
 
     y = p + X b + e,   b ~ N(0, s² (t q)²),   e ~ N(0, s² S (R + r L) S)
 
-The columns of X are in the unit of y: p itself (scale), its mean per metre (offset), and what the robot's physics says that grade and turns
-cost. b is relative to them; a Bayesian linear regression gives it. S are the spreads that the model states of a metre, R the correlation of
-neighbours, L one that falls over 20 m: what a model does not know of new ground. s² has an inverse-gamma prior of mean about 1, so that all
-that is stated has Student's t (Gelman et al., Bayesian Data Analysis, 2013, 14.2). How far the prior reaches, t, and how much of the errors
-is of the ground, r, are not known: all of a small grid are averaged, each with the evidence that the metres give it (ibid., 7.4).
+The columns of X are in the unit of y: p itself (scale), and what a usual metre or second of the run costs times its length (offset),
+predicted duration (idle power), slope (payload; 10 % count as a metre) and turn (0.3 rad count as a metre). b is relative to them; a
+Bayesian linear regression gives it. S are the spreads that the model states of a metre, R the correlation of neighbours, L one that falls
+over tens or hundreds of metres: what a model does not know of new ground. s² has an inverse-gamma prior of mean about 1, so that all that
+is stated has Student's t (Gelman et al., Bayesian Data Analysis, 2013, 14.2). How far the prior reaches, t, and how much of the errors is
+of the ground, r and its length, are not known: all of a small grid are averaged, each with its evidence (ibid., 7.4).
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, SumDistribution
-from tcpipe.tables.facts import PhysicsFit
 
 Floats = NDArray[np.float64]
 
@@ -31,9 +31,10 @@ _PRIOR = 0.05
 """q: standard deviation of a coefficient at the least reach, of what it multiplies."""
 _REACHES = (1.0, 2.0, 4.0, 8.0, 16.0)
 """t."""
-_GROUND_SHARES = (0.0, 0.5, 2.0)
-"""r."""
-_GROUND_M = 20.0
+_GROUNDS = ((0.0, 20.0), (0.5, 20.0), (2.0, 20.0), (0.5, 200.0), (2.0, 200.0), (8.0, 200.0))
+"""r, and the distance over which L falls [m]."""
+_RISE_M, _TURN_RAD = 0.1, 0.3
+"""What costs about as much as a metre."""
 _FREEDOM = 4.0
 """Of the prior of s²: as many metres as it counts."""
 _NEIGHBOUR_M, _MOST_NEIGHBOUR = 1.5, 0.45
@@ -50,8 +51,12 @@ class Metres:
     distance_m: Floats
     """Where each begins, along the run."""
     length_m: Floats
-    physics: Floats
-    """What parts of the robot's physics cost, in the quantity's unit, shape (N, parts)."""
+    duration_s: Floats
+    """Predicted."""
+    rise_m: Floats
+    """Over each, uphill positive."""
+    turn_rad: Floats
+    """Over each, both ways counted."""
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
@@ -77,7 +82,7 @@ class _Component:
     covariance: Floats
     scale: float
     """Estimate of s²."""
-    ground_share: float
+    ground: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +90,8 @@ class Adaptation:
     """A model's errors on a new run, by the metres that are known of it."""
 
     errors: Errors
-    per_metre: float
+    usual: tuple[float, float]
+    """Of the known metres, predicted a metre and a second."""
     freedom: float
     components: tuple[_Component, ...]
 
@@ -97,16 +103,18 @@ class Adaptation:
             columns = np.full((3, known.size), np.nan)
             columns[:, known] = parts.value, parts.low, parts.high
             return Adapted(columns[0], columns[1], columns[2], parts.total)
-        design, spread = _make_design(there, self.per_metre), self.errors.compute_std(there.predicted, there.class_id)
-        neighbours, ground = (_sum_products(spread, there, of) for of in (_find_neighbour(self.errors), None))
+        design, spread = _make_design(there, *self.usual), self.errors.compute_std(there.predicted, there.class_id)
+        neighbours = _sum_neighbours(spread, there, _find_neighbour(self.errors))
+        grounds = {ground_m: _sum_ground(spread, there, ground_m) for _, ground_m in _GROUNDS}
         weights = np.array([of.weight for of in self.components])
         values = there.predicted + np.array([design @ of.coefficients for of in self.components])
         variances, totals = [], []
         for of in self.components:
             known = np.einsum("ij,jk,ik->i", design, of.covariance, design)
-            variances.append(of.scale * (known + (1.0 + of.ground_share) * spread**2))
+            share, ground_m = of.ground
+            variances.append(of.scale * (known + (1.0 + share) * spread**2))
             summed = design.sum(axis=0)
-            totals.append(of.scale * (summed @ of.covariance @ summed + neighbours + of.ground_share * ground))
+            totals.append(of.scale * (summed @ of.covariance @ summed + neighbours + share * grounds[ground_m]))
         mean, variance = _mix(weights, values, np.array(variances))
         total, total_variance = _mix(weights, values.sum(axis=1), np.array(totals))
         wider = float(stdtrit(self.freedom, _TAIL))
@@ -118,14 +126,15 @@ class Adaptation:
 
 def adapt(errors: Errors, known: Metres) -> Adaptation:
     """Return a model's errors, adapted by metres of a run that were measured; at least one."""
-    per_metre = float(np.abs(known.predicted).sum() / known.length_m.sum())
-    design, residual = _make_design(known, per_metre), known.measured - known.predicted
+    whole = float(np.abs(known.predicted).sum())
+    usual = whole / float(known.length_m.sum()), whole / float(known.duration_s.sum())
+    design, residual = _make_design(known, *usual), known.measured - known.predicted
     spread = errors.compute_std(known.predicted, known.class_id)
     apart_m = np.abs(known.distance_m[:, None] - known.distance_m)
     beside = np.eye(len(residual)) + _find_neighbour(errors) * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
     freedom, found = _FREEDOM + len(residual), []
-    for share in _GROUND_SHARES:
-        noise = spread[:, None] * (beside + share * np.exp(-apart_m / _GROUND_M)) * spread
+    for share, ground_m in _GROUNDS:
+        noise = spread[:, None] * (beside + share * np.exp(-apart_m / ground_m)) * spread
         factor = cho_factor(noise, lower=True)
         whitened, solved = cho_solve(factor, design), cho_solve(factor, residual)
         precision, log_noise = design.T @ whitened, 2.0 * float(np.log(np.diag(factor[0])).sum())
@@ -136,17 +145,20 @@ def adapt(errors: Errors, known: Metres) -> Adaptation:
             misfit = float(residual @ solved - coefficients @ (whitened.T @ residual))
             log_det = log_noise + float(np.linalg.slogdet(prior + precision)[1] - np.linalg.slogdet(prior)[1])
             evidence = -0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM))
-            found.append(_Component(evidence, coefficients, covariance, (_FREEDOM + misfit) / freedom, share))
+            found.append(
+                _Component(evidence, coefficients, covariance, (_FREEDOM + misfit) / freedom, (share, ground_m))
+            )
     weights = np.exp([of.weight - max(of.weight for of in found) for of in found])
     components = (
-        _Component(float(weight), of.coefficients, of.covariance, of.scale, of.ground_share)
+        _Component(float(weight), of.coefficients, of.covariance, of.scale, of.ground)
         for weight, of in zip(weights / weights.sum(), found, strict=True)
     )
-    return Adaptation(errors, per_metre, freedom, tuple(components))
+    return Adaptation(errors, usual, freedom, tuple(components))
 
 
-def _make_design(of: Metres, per_metre: float) -> Floats:
-    return np.column_stack([of.predicted, per_metre * of.length_m, np.nan_to_num(of.physics)])
+def _make_design(of: Metres, per_metre: float, per_second: float) -> Floats:
+    alike_m = np.column_stack([of.length_m, of.rise_m / _RISE_M, np.abs(of.turn_rad) / _TURN_RAD])
+    return np.column_stack([of.predicted, per_second * of.duration_s, per_metre * np.nan_to_num(alike_m)])
 
 
 def _find_neighbour(errors: Errors) -> float:
@@ -155,13 +167,16 @@ def _find_neighbour(errors: Errors) -> float:
     return float(np.clip(errors.correlation[at] - errors.correlation[-1], -_MOST_NEIGHBOUR, _MOST_NEIGHBOUR))
 
 
-def _sum_products(spread: Floats, of: Metres, neighbour: float | None) -> float:
-    """Return sum_ij of a_i a_j times the correlation of neighbours, or that of the ground."""
-    gaps_m = np.diff(of.distance_m)
-    if neighbour is not None:
-        return float((spread**2).sum() + 2.0 * neighbour * (spread[1:] * spread[:-1])[gaps_m < _NEIGHBOUR_M].sum())
+def _sum_neighbours(spread: Floats, of: Metres, neighbour: float) -> float:
+    """Return sum_ij of a_i a_j times the correlation R."""
+    products = (spread[1:] * spread[:-1])[np.diff(of.distance_m) < _NEIGHBOUR_M]
+    return float((spread**2).sum() + 2.0 * neighbour * products.sum())
+
+
+def _sum_ground(spread: Floats, of: Metres, ground_m: float) -> float:
+    """Return sum_ij of a_i a_j times the correlation L."""
     total, carried = float((spread**2).sum()), 0.0
-    for fades, before, here in zip(np.exp(-gaps_m / _GROUND_M), spread[:-1], spread[1:], strict=True):
+    for fades, before, here in zip(np.exp(-np.diff(of.distance_m) / ground_m), spread[:-1], spread[1:], strict=True):
         carried = fades * (carried + before)
         total += 2.0 * here * carried
     return total
@@ -197,29 +212,6 @@ class Run:
         """Return a hash of what adapts a model."""
         arrays = [getattr(of, field.name) for of in self.metres.values() for field in fields(of)]
         return sha256(b"".join(np.ascontiguousarray(values).tobytes() for values in arrays)).hexdigest()
-
-
-def make_metres(
-    physics: PhysicsFit | None,
-    *,
-    length_m: Floats,
-    class_id: NDArray[np.integer],
-    slope_rad: Floats,
-    turn_rad: Floats,
-    predicted: Mapping[str, Floats],
-    measured: Mapping[str, Floats],
-    distance_m: Floats,
-) -> dict[str, Metres]:
-    """Return metres of a run by quantity; what grade and turns cost in energy is that of the model's own robot, where it is known."""
-    columns = []
-    for term, cause in (("grade", length_m * np.tan(slope_rad)), ("turning", np.abs(turn_rad))):
-        if values := [of.value for of in (physics.terms if physics else ()) if of.term == term]:
-            columns.append(float(np.mean(values)) * cause)
-    nothing = np.empty((len(length_m), 0))
-    parts = {"duration": nothing, "energy": np.column_stack(columns) if columns else nothing}
-    return {
-        name: Metres(predicted[name], measured[name], class_id, distance_m, length_m, parts[name]) for name in predicted
-    }
 
 
 @dataclass(frozen=True, slots=True)

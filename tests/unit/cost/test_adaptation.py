@@ -30,8 +30,8 @@ def made_run(rng, metres=300, *, scale=1.0, offset=0.0, payload=0.0):
     slope = 0.1 * np.sin(np.arange(metres) / 15.0 + rng.uniform(0.0, 6.0))
     predicted = 150.0 + 600.0 * slope + rng.normal(0.0, 10.0, metres)
     measured = (scale * predicted + offset + payload * 600.0 * slope) * (1.0 + 0.05 * rng.standard_normal(metres))
-    along = np.arange(metres, dtype=float)
-    return Metres(predicted, measured, np.full(metres, 4), along, np.ones(metres), 600.0 * slope[:, None])
+    along, ones = np.arange(metres, dtype=float), np.ones(metres)
+    return Metres(predicted, measured, np.full(metres, 4), along, ones, ones, slope, 0.0 * ones)
 
 
 CHANGES = {"same": {}, "heavier": {"payload": 0.4}, "another robot": {"scale": 1.5, "offset": -20.0}}
@@ -61,7 +61,7 @@ def test_a_long_run_leaves_the_least_squares_fit():
     errors, known = made_errors(), made_run(np.random.default_rng(3), 1500, scale=1.4, offset=15.0, payload=0.2)
     errors = replace(errors, correlation=np.zeros_like(errors.correlation))
     adapted = adapt(errors, known).predict(known).value
-    design = np.column_stack([known.predicted, known.length_m, known.physics])
+    design = np.column_stack([known.predicted, known.length_m, known.rise_m])
     spread = errors.compute_std(known.predicted, known.class_id)
     by_hand = design @ np.linalg.lstsq(design / spread[:, None], known.measured / spread, rcond=None)[0]
     np.testing.assert_allclose(adapted, by_hand, rtol=0.01)
