@@ -119,7 +119,7 @@ def main() -> None:
     assert errors is not None, "too few samples to train on"
     metres = np.mean([run.metres["energy"].length_m.sum() for run in runs])
     print(
-        f"{model.card.training.samples['fitted']} samples of {given.train} drives; {len(runs)} further ones, {metres:.0f} m of each compared"
+        f"{model.card.training.samples['fitted']} samples of {given.train} drives; {len(runs)} further ones, {metres:.0f} m each"
     )
     for quantity in ("duration", "energy"):
         for length in LENGTHS:

@@ -198,8 +198,8 @@ def adapted_lines(name: str, other: str, known: Metre, there: Metre) -> Iterator
                 who = model if of.predictor == MODEL else "mean of the known metres"
                 r2 = 1.0 - of.rmse**2 / float(np.var(metres.measured[-of.samples :]))
                 yield (
-                    f"| {name} by {other} | {who} | {of.metres:g} | {of.samples} | {of.rmse:.0f} J | {r2:.2f} | {of.coverage_percent:.0f} | "
-                    f"{of.total_error_percent:.0f} | {'yes' if of.totals_inside else 'no'} |"
+                    f"| {name} by {other} | {who} | {of.metres:g} | {of.samples} | {of.rmse:.0f} J | {r2:.2f} "
+                    f"| {of.coverage_percent:.0f} | {of.total_error_percent:.0f} | {'yes' if of.totals_inside else 'no'} |"
                 )
 
 
@@ -362,7 +362,7 @@ def main() -> None:
                         sep="\n",
                     )
     print(
-        "\n| E of the rest of a drive | model | known [m] | rest [m] | RMSE | R² | held by 90 % [%] | sum off by [%] | its interval holds it |\n"
+        "\n| E of the rest of a drive | model | known [m] | rest [m] | RMSE | R² | held by 90 % [%] | sum off by [%] | held |\n"
         + "|---" * 9
         + "|"
     )

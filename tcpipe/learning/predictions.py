@@ -102,7 +102,7 @@ class Predicted:
 def make_residuals(train: Split, said: Array) -> Residuals:
     """Return labels and held-out predictions of power and velocity, shape (N, 2), in the columns that a model keeps."""
     labels = train.labels.astype(np.float64)
-    columns = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class")}
+    columns = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class", "fold")}
     for number, (quantity, unit) in enumerate((("power", "watt"), ("velocity", "mps"))):
         columns |= {f"{quantity}_{unit}": labels[:, number], f"{quantity}_predicted_{unit}": said[:, number]}
     return columns

@@ -39,19 +39,22 @@ CHANGES = {"same": {}, "heavier": {"payload": 0.4}, "another robot": {"scale": 1
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_an_adapted_model_is_better_and_its_intervals_cover(change):
-    """90 % of metres and of sums after 50 m, of 60 runs (a share of 60 has a deviation of 4 %); the error falls to that of the noise."""
+    """At least 90 % of metres and of sums after 50 m, less the chance of 60 runs; the error falls to that of the noise.
+
+    Intervals are too wide where the ground of the rest is that of the known metres: that it may be another is not known from 50 m.
+    """
     rng, errors = np.random.default_rng(1), made_errors()
     runs = [Run(str(number), {"energy": made_run(rng, **change)}) for number in range(60)]
     found = {(of.metres, of.predictor): of for of in compare_adaptations({"energy": errors}, runs, (0, 10, 50))}
     plain, some, much = (found[metres, MODEL] for metres in (0, 10, 50))
     assert {(of.runs, of.samples) for of in found.values()} == {(60, 60 * 250)}
-    assert 86.0 <= much.coverage_percent <= 97.0
+    assert 86.0 <= much.coverage_percent <= 99.5
     assert much.totals_inside >= 48
     if change:
         assert plain.coverage_percent < 60.0  # what is not adapted is sure of itself, and wrong
         assert much.rmse < 0.7 * plain.rmse
         assert much.rmse < some.rmse
-        assert much.rmse < 0.8 * found[50, MEAN].rmse
+        assert much.rmse < 0.5 * found[50, MEAN].rmse
     else:
         assert much.rmse < 1.03 * plain.rmse  # nothing is lost where nothing is to be adapted
 
