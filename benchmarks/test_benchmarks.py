@@ -55,6 +55,7 @@ SMALLEST = {
     "error_budget": Smallest("", rf"averaged, 20 Hz \| {NUMBER} %"),
     "faults": Smallest("kills --only 'a file over another' --times 1", r"together +[1-9]"),
     "few_samples": Smallest("{dataset} --counts 60 --kinds physics", rf"60 physics +test +: E +{NUMBER} ± {NUMBER} J"),
+    "own_layers": Smallest("{out} --drives 6", rf"noise +: E +{NUMBER} J, T {NUMBER} s on"),
     "first_minute": Smallest("{out} tiny", rf"\| {NUMBER} ± {NUMBER} segments an hour \|"),
     "fuse": Smallest(
         "--hours 0.01 --paired-seconds 5", rf"15-state filterpy +{NUMBER} us/event[\s\S]*peak memory {NUMBER} MB"

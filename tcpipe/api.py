@@ -33,7 +33,9 @@ def run_train(options: TrainOptions) -> TrainResult:
     from tcpipe.recipe.checking import from_values
 
     given = {of.name: value for of in fields(FitConfig) if (value := getattr(options, of.name)) is not None}
-    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
+    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features", "layers"})
+    if isinstance(layers := given.get("layers"), str):
+        given["layers"] = [name.strip() for name in layers.split(",")]
     given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
     return run(
         options.dataset, options.out, config=from_values(FitConfig, given, where="train"), no_resume=options.no_resume

@@ -139,6 +139,10 @@ class ArrayMap:
     def layers(self):
         return make_paper_layers([name for name in self.arrays if name not in self.more], self.classes) | self.more
 
+    def select(self, layers):
+        assert set(self.layers) <= set(layers)
+        return self
+
     def read(self, layer, row0, row1, col0, col1):
         return self.arrays[layer][row0:row1, col0:col1]
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
 
 CLASSES_SEEN = (4, 5, 6, 7)
 
@@ -67,6 +68,10 @@ class PhysicsModel:
     residuals: dict = field(default_factory=made_residuals)
     physics: PhysicsFit | None = None
     takes_turns: bool = False
+
+    @property
+    def layers(self):
+        return make_paper_layers(PAPER_LAYERS, self.classes)
 
     def predict(self, patches, beside=None):  # noqa: ARG002  it is told nothing that it wants
         height = patches[..., self.channels.index("height")].astype(np.float64)

@@ -46,10 +46,6 @@ def _exit_code(logs: Sequence[InspectedLog]) -> int:
     return 3 if any(failed) or any(log.damage for log in logs) else 0
 
 
-_COLUMNS = 14
-"""So many columns of a table are named."""
-
-
 def _print_logs(found: InspectedLogs) -> None:
     for log in found.logs:
         _print_log(log)
@@ -228,15 +224,7 @@ def _print_run(found: InspectedRun) -> None:
 
 
 def _print_tables(found: InspectedTables) -> None:
-    print_line(f"{found.path}: {len(found.columns)} tables without a mapping in the recipe")
-    print_line("")
-    _print_table(["table", "columns"], [[file, _format_list(names)] for file, names in found.columns.items()])
-    print_line("")
     print_lines(found.recipe.rstrip())
-
-
-def _format_list(names: Sequence[str]) -> str:
-    return ", ".join(names[:_COLUMNS]) + (f" and {len(names) - _COLUMNS} more" if len(names) > _COLUMNS else "")
 
 
 def _format_answer(value: object) -> str:

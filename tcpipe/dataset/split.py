@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
-from tcpipe.dataset.tensor import make_tensor_layout
+from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
 from tcpipe.errors import DatasetError
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
@@ -169,6 +169,10 @@ class Split:
         files = self.view.stored.files
         form = make_tensor_layout(channels, files.layers, files.patch_px)
         return replace(self, view=replace(self.view, form=form))
+
+    def with_layout(self, layout: TensorLayout) -> Split:
+        """Return the split with tensors as another dataset's: its channels, scaled by its ranges."""
+        return replace(self, view=replace(self.view, form=layout))
 
     def take(self, chosen: ArrayLike) -> Split:
         """Return some samples: their indices, or a mask of shape (N,)."""

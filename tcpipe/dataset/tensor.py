@@ -18,6 +18,8 @@ Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
 ONE_HOT = "_one_hot"
 """Ending of a categorical layer's name: a channel for each of its classes, 1 where the pixel is of it."""
 
+_BATCH_ROWS, _BATCH_BYTES = 2_048, 40_000_000
+
 _BYTES = np.arange(256, dtype=np.uint8)
 
 
@@ -38,9 +40,22 @@ class TensorLayout:
         return tuple(sort_layers({name: self.known[name] for name in map(self._of, self.channels)}))
 
     @cached_property
+    def planes(self) -> tuple[str, ...]:
+        """Names along the tensor's last axis: channels, those of several planes as ``name[1]``, ``name[2]`` …."""
+        widths = ((channel, self._width(channel)) for channel in self.channels)
+        return tuple(
+            f"{channel}[{place + 1}]" if width > 1 else channel for channel, width in widths for place in range(width)
+        )
+
+    @property
     def depth(self) -> int:
         """Length of the tensor's last axis."""
-        return sum(self._width(channel) for channel in self.channels)
+        return len(self.planes)
+
+    @property
+    def batch_rows(self) -> int:
+        """Samples whose tensors are formed at once where all are wanted one after another: 40 MB, 2,048 at most."""
+        return max(min(_BATCH_BYTES // (4 * self.depth * self.patch_px**2), _BATCH_ROWS), 1)
 
     def _of(self, channel: str) -> str:
         return channel if channel in self.known else channel.removesuffix(ONE_HOT)

@@ -228,14 +228,8 @@ def _read_polygon(rings: Json) -> BaseGeometry | str:
 def _find_ring_problem(lonlat: NDArray[np.float64]) -> str | None:
     if lonlat.ndim != 2 or lonlat.shape[1:] != (2,) or not np.isfinite(lonlat).all():
         return "its coordinates are not rings of finite [lon, lat] positions"
-    lon, lat = lonlat[np.argmax(np.abs(lonlat).max(axis=1))]
-    if abs(lat) > 90 and abs(lat) <= 180 and abs(lon) <= 90:
-        return f"coordinates ({lon:g}, {lat:g}) are no lon/lat: the axes look swapped; GeoJSON is lon before lat"
-    if abs(lon) > 180 or abs(lat) > 90:
-        return (
-            f"coordinates ({lon:g}, {lat:g}) are no lon/lat degrees: they look projected; "
-            "GeoJSON is WGS84 (RFC 7946): export it again as EPSG:4326"
-        )
+    if problem := _find_lonlat_problem(lonlat):
+        return problem
     if len(lonlat) < 4 or (lonlat[0] != lonlat[-1]).any():
         return f"a ring of {len(lonlat)} positions is not closed; a ring has at least 4 and ends where it begins"
     return None
@@ -320,13 +314,19 @@ def _read_positions(where: str, coordinates: Json) -> NDArray[np.float64]:
 
 def check_lonlat(where: str, lonlat_deg: NDArray[np.float64]) -> None:
     """Raise `PathError` for positions, shape (P, 2), that are no longitude and latitude."""
+    if problem := _find_lonlat_problem(lonlat_deg):
+        raise PathError(f"{where}: {problem}")
+
+
+def _find_lonlat_problem(lonlat_deg: NDArray[np.float64]) -> str | None:
     lon, lat = lonlat_deg[np.argmax(np.abs(lonlat_deg).max(axis=1))]
     if 90.0 < abs(lat) <= 180.0 and abs(lon) <= 90.0:
-        raise PathError(f"{where}: ({lon:g}, {lat:g}) is no lon, lat: the axes look swapped; longitude comes first")
+        return f"coordinates ({lon:g}, {lat:g}) are no lon/lat: the axes look swapped; longitude comes first"
     if abs(lon) > 180.0 or abs(lat) > 90.0:
-        raise PathError(
-            f"{where}: ({lon:g}, {lat:g}) is no lon, lat in degrees: it looks projected; expected WGS 84 (EPSG:4326)"
+        return (
+            f"coordinates ({lon:g}, {lat:g}) are no lon/lat degrees: they look projected; expected WGS 84 (EPSG:4326)"
         )
+    return None
 
 
 def make_line_feature(lonlat_deg: NDArray[np.float64], properties: P) -> LineFeature[P]:

@@ -156,7 +156,12 @@ def _fit_trees(ours: Model, train: Split) -> tuple[Predict, Array]:
         )
 
     model, said = fit_table(
-        features(train), labels, np.ones_like(labels), folds, channels=train.channels, class_count=ours.classes.count
+        features(train),
+        labels,
+        np.ones_like(labels),
+        folds,
+        channels=train.view.form.planes,
+        class_count=ours.classes.count,
     )
     return lambda split: model.predict(features(split)), said
 

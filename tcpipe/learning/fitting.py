@@ -52,6 +52,8 @@ class FitConfig:
     """Energy to train on: total, or net of idle power (less the idle power)."""
     extra_features: bool = False
     """Whether turn and commanded speed of each segment are inputs, too."""
+    layers: tuple[str, ...] = ()
+    """Channels of the patch; empty: the paper's, as far as the dataset has them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,20 +5,25 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from tcpipe.dataset.energies import ENERGIES, EnergyName
 from tcpipe.dataset.extra_features import ExtraFeature
+from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
 from tcpipe.errors import clean_line
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json
+from tcpipe.formats.maps.map_facts import Description, read_layers
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.predictor import Inputs, find_kind
 from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
 from tcpipe.terrain.classes import ClassTable, TerrainClass
+from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
 
 KIND = "tcpipe model"
 
@@ -66,7 +71,7 @@ class Training:
     device: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class ModelCard:
     """All of model.json but its seal."""
 
@@ -74,6 +79,8 @@ class ModelCard:
     schema_version: int = SCHEMA_VERSION
     architecture: Architecture
     channels: tuple[str, ...]
+    layers: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
+    """Of its channels, those that are not the paper's, as its dataset describes them."""
     outputs: tuple[str, ...]
     """Columns that it predicts, in order: w, v (or E for a baseline)."""
     extra_features: tuple[ExtraFeature, ...] = ()
@@ -101,13 +108,19 @@ class ModelCard:
     checksums: Mapping[str, Checksum] = field(default_factory=dict)
     """Of the files beside it, by name."""
 
+    @cached_property
+    def layout(self) -> TensorLayout:
+        """Return how its tensors are formed: by the ranges of the dataset that it was trained on."""
+        paper = make_paper_layers(PAPER_LAYERS, ClassTable(self.classes))
+        known = {**paper, **read_layers(self.layers, self.classes, Path("model.json"))}
+        return make_tensor_layout(self.channels, known, self.architecture.patch_px)
+
     @property
     def inputs(self) -> Inputs:
         """Return what its predictor takes and gives."""
-        shape = self.architecture
         return Inputs(
-            self.channels, shape.patch_px, shape.depth, self.patch_m, ClassTable(self.classes).count, self.extra_features,
-            self.outputs, self.scale,
+            self.channels, self.architecture.patch_px, self.layout.planes, self.patch_m, ClassTable(self.classes).count,
+            self.extra_features, self.outputs, self.scale,
         )  # fmt: skip
 
 

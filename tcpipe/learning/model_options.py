@@ -73,6 +73,14 @@ class TrainOptions:
             ("--extra-features",), earlier="--beside",
         ),
     )  # fmt: skip
+    layers: str | Sequence[str] | None = option(
+        None,
+        Option(
+            "Layers of the patch, with commas between them, own ones by their names; NAME_one_hot has a channel for each class "
+            "(default: ortho, terrain and height, as far as the dataset has them).",
+            metavar="NAME,NAME,…",
+        ),
+    )  # fmt: skip
     seed: int | None = option(None, Option("Seed of weights, shuffles and mirrors.", kind=SEED, shown=0))
     no_resume: bool = option(
         False, Option("Start again instead of resuming a stopped training.", ("--no-resume",), earlier="--fresh")

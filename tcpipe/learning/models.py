@@ -36,6 +36,7 @@ from tcpipe.learning.predictor import Predictor, find_kind
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.layers import Layer
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -89,6 +90,11 @@ class Model:
     def channels(self) -> tuple[str, ...]:
         """Channels of a patch, in order."""
         return self.card.channels
+
+    @property
+    def layers(self) -> Mapping[str, Layer]:
+        """Layers by name, scaled as those of the dataset that it was trained on."""
+        return self.card.layout.known
 
     @property
     def patch_m(self) -> float:

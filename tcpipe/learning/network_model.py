@@ -169,7 +169,7 @@ class NetworkModel(Predictor):
 
 def make_architecture(inputs: Inputs, width: int) -> Architecture:
     """Return the sizes of a network with these inputs and outputs."""
-    return Architecture(inputs.patch_px, inputs.depth, len(inputs.outputs), width, len(inputs.extra_features))
+    return Architecture(inputs.patch_px, len(inputs.planes), len(inputs.outputs), width, len(inputs.extra_features))
 
 
 def _make_trainer(fit: Samples) -> tuple[Trainer, str]:

@@ -24,7 +24,6 @@ from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.columns import Column, to_floats
 from tcpipe.terrain.classes import ClassTable
 
-_TOGETHER = 1024
 CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
 """What columns of tables call the quantities."""
 
@@ -126,12 +125,12 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
 
 
 def _predict_outputs(model: Model, split: Split, noise: Sequence[str], rng: np.random.Generator) -> Array:
-    chosen = split.with_channels(*model.channels)
-    replaced = [model.channels.index(name) for name in noise]
+    chosen, planes = split.with_layout(model.card.layout), model.card.layout.planes
+    replaced = [place for place, plane in enumerate(planes) if plane.partition("[")[0] in noise]
     parts = [np.empty((0, len(model.card.outputs)), np.float32)]
     extra_features, first = read_extra_features(split), 0
     while first < len(chosen):
-        patches = chosen.batch(np.arange(first, min(first + _TOGETHER, len(chosen))))[0].copy()
+        patches = chosen.batch(np.arange(first, min(first + model.card.layout.batch_rows, len(chosen))))[0].copy()
         for channel in replaced:
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
         parts.append(model.predict(patches, extra_features.take(slice(first, first + len(patches)))))
@@ -205,7 +204,7 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
     ]
     if len(card.outputs) != len(told.label.columns):
         problems.append(f"it predicts only {', '.join(card.outputs)}, expected {' and '.join(told.label.columns)}")
-    absent = [channel for channel in card.channels if channel not in told.layers]
+    absent = [name for name in card.layout.layers if name not in told.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:
         raise ModelError(*(f"{name} does not fit {data.path}: {problem}" for problem in problems))

@@ -39,18 +39,16 @@ Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.floating]
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
-_TOGETHER = 1024
-
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
     """What the patches and features of a model are of, and what it predicts."""
 
     channels: tuple[str, ...]
-    """What the last axis of patches holds."""
+    """Layers of the patches."""
     patch_px: int
-    depth: int
-    """Length of that axis: a channel may have several planes."""
+    planes: tuple[str, ...]
+    """What the last axis of patches holds: a channel, or ``name[1]``, ``name[2]`` … of one that has several planes."""
     patch_m: float
     class_count: int
     """Largest class id of the table by which the terrain channel is scaled."""
@@ -198,8 +196,9 @@ def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
 def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
     """Return predictions of samples, shape (N, outputs); their patches are formed some at a time."""
     out = np.empty((len(samples), len(samples.inputs.outputs)))
-    for first in range(0, len(samples), _TOGETHER):
-        rows = np.arange(first, min(first + _TOGETHER, len(samples)))
+    together = samples.split.view.form.batch_rows
+    for first in range(0, len(samples), together):
+        rows = np.arange(first, min(first + together, len(samples)))
         out[rows] = predictor.predict(samples.split.batch(rows)[0], samples.features.take(rows))
     return out
 

@@ -9,6 +9,8 @@ channel  features
 height   slope along travel and steepness across it [rad], curvature along and across [1/m] of the best paraboloid, standard
          deviation of the ground from it (roughness) and highest minus lowest pixel (relief) [m]
 terrain  share of the patch that each class has
+band     mean and standard deviation of each band of a layer of several; the principal components of their means over the training
+         samples, 8 at most, come after the features of all channels
 others   mean, standard deviation (contrast), mean difference of neighbours along travel (texture)
 ======== ==================================================================================================================
 
@@ -18,7 +20,7 @@ Mirroring a patch across its travel changes none of them. A pixel without data c
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
@@ -37,8 +39,11 @@ from tcpipe.terrain.layers import HEIGHT_RANGE_M
 
 Floats = NDArray[np.float64]
 
-_OF_GROUND, _OF_OTHERS = 6, 3
+_OF_GROUND, _OF_BAND, _OF_OTHERS = 6, 2, 3
 """Features of a channel."""
+
+MOST_COMPONENTS = 8
+"""Principal components of a layer of several bands."""
 
 
 def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_count: int, patch_m: float) -> Floats:
@@ -47,7 +52,7 @@ def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_c
     Parameters
     ----------
     patches : values in [0, 1]; travel is along the columns.
-    channels : what the last axis holds.
+    channels : what the last axis holds: `Inputs.planes`.
     class_count : largest class id of the table that the terrain channel is scaled by.
     patch_m : side of a patch [m].
     """
@@ -58,6 +63,8 @@ def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_c
             parts.append(_compute_ground_features(values * np.float32(HEIGHT_RANGE_M), patch_m))
         elif channel == "terrain":
             parts.append(_compute_class_shares(values, class_count))
+        elif _is_band(channel):
+            parts.append(np.column_stack([values.mean(axis=(1, 2)), values.std(axis=(1, 2))]))
         else:
             texture = np.abs(np.diff(values, axis=2)).mean(axis=(1, 2))
             parts.append(np.column_stack([values.mean(axis=(1, 2)), values.std(axis=(1, 2)), texture]))
@@ -68,14 +75,54 @@ def find_slope_and_class(
     features: Floats, channels: Sequence[str], class_count: int
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Return slope [rad] and most frequent class of patches by their features, shape (N,) each; 0 without heights, or classes."""
-    slope, class_id, at = np.zeros(len(features)), np.zeros(len(features), np.int64), 0
-    for channel in channels:
+    slope, class_id = np.zeros(len(features)), np.zeros(len(features), np.int64)
+    for channel, at in _locate_features(channels, class_count):
         if channel == "height":
             slope = features[:, at]
         elif channel == "terrain":
             class_id = features[:, at : at + class_count].argmax(axis=1) + 1
-        at += {"height": _OF_GROUND, "terrain": class_count}.get(channel, _OF_OTHERS)
     return slope, class_id
+
+
+def _is_band(channel: str) -> bool:
+    return "[" in channel
+
+
+def _locate_features(channels: Sequence[str], class_count: int) -> Iterator[tuple[str, int]]:
+    """Yield each channel and the place of its first feature."""
+    at = 0
+    for channel in channels:
+        yield channel, at
+        known = {"height": _OF_GROUND, "terrain": class_count}
+        at += _OF_BAND if _is_band(channel) else known.get(channel, _OF_OTHERS)
+
+
+@dataclass(frozen=True, slots=True)
+class Components:
+    """Principal components of some features: ``(features - centre) @ axes.T``; ``axes`` has the shape (components, features)."""
+
+    centre: Floats
+    axes: Floats
+
+    def append(self, features: Floats) -> Floats:
+        """Return features with their components behind them."""
+        return np.hstack([features, (features - self.centre) @ self.axes.T]) if len(self.axes) else features
+
+
+def fit_components(features: Floats, channels: Sequence[str], class_count: int) -> Components:
+    """Return the first principal components of the means of the bands of each layer, shape (N, features) of training samples."""
+    columns: dict[str, list[int]] = {}
+    for channel, at in _locate_features(channels, class_count):
+        if _is_band(channel):
+            columns.setdefault(channel.partition("[")[0], []).append(at)
+    centre, rows = features.mean(axis=0), [np.empty((0, features.shape[1]))]
+    for places in columns.values():
+        _, _, axes = np.linalg.svd(features[:, places] - centre[places], full_matrices=False)
+        axes = axes[:MOST_COMPONENTS]
+        axes *= np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]  # the sign is anyone's choice
+        rows.append(np.zeros((len(axes), features.shape[1])))
+        rows[-1][:, places] = axes
+    return Components(centre, np.concatenate(rows))
 
 
 def _compute_ground_features(height_m: Patches, patch_m: float) -> NDArray[np.float32]:
@@ -151,6 +198,11 @@ _FOREST_FORMS: Mapping[str, ArrayForm] = {
     "root": ("uint32", ("trees",)), "depth": ("uint32", ("trees",)), "output": ("uint32", ("trees",)),
 }  # fmt: skip
 """Types and shapes of a forest's arrays."""
+_COMPONENT_FORMS: Mapping[str, ArrayForm] = {
+    "centre": ("float64", ("features",)),
+    "axes": ("float64", ("components", "features")),
+}
+_NO_COMPONENTS = {"centre": np.empty(0), "axes": np.empty((0, 0))}
 _MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
 
 
@@ -324,6 +376,7 @@ class BoostingModel(Predictor):
 
     table: TableModel
     inputs: Inputs
+    components: Components
 
     about: ClassVar[str] = (
         "a curve over the slope of each class, and boosted trees over features of the patch (LightGBM), their number chosen by "
@@ -337,19 +390,23 @@ class BoostingModel(Predictor):
         out = np.empty((len(patches), len(self.inputs.outputs)))
         for first in range(0, len(patches), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
-            out[rows] = self.table.predict(np.column_stack([self._compute_features(patches[rows]), numbers[rows]]))
+            of_patches = self.components.append(self._compute_features(patches[rows]))
+            out[rows] = self.table.predict(np.column_stack([of_patches, numbers[rows]]))
         return out
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return curves and trees by name."""
-        return self.table.arrays()
+        """Return curves, trees and principal components by name."""
+        return self.table.arrays() | (asdict(self.components) if len(self.components.axes) else {})
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> BoostingModel:
         """Return the model of these arrays."""
-        check_arrays(arrays, {**_FOREST_FORMS, **list_curve_arrays(len(inputs.outputs))})
-        curves, rest = read_curves("linear", arrays)
-        return cls(TableModel(curves, read_forest(rest), inputs.channels, inputs.class_count), inputs)
+        forms = {**_FOREST_FORMS, **list_curve_arrays(len(inputs.outputs))}
+        check_arrays(arrays, {**forms, **_COMPONENT_FORMS}, optional=_COMPONENT_FORMS)
+        components = {name: of for name, of in arrays.items() if name in _COMPONENT_FORMS}
+        curves, rest = read_curves("linear", {name: of for name, of in arrays.items() if name not in components})
+        table = TableModel(curves, read_forest(rest), inputs.planes, inputs.class_count)
+        return cls(table, inputs, Components(**{**_NO_COMPONENTS, **components}))
 
     @classmethod
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
@@ -357,32 +414,34 @@ class BoostingModel(Predictor):
         del job
         began, inputs = time.perf_counter(), samples.inputs
         numbers = standardize_features(inputs.extra_features, samples.features)
-        features = np.column_stack([compute_features(samples.split, inputs.patch_m, inputs.class_count), numbers])
+        plain = compute_features(samples.split, inputs.patch_m, inputs.class_count)
+        components = fit_components(plain, inputs.planes, inputs.class_count)
+        features = np.column_stack([components.append(plain), numbers])
         fed_s = time.perf_counter() - began
         table, held_out = fit_table(
             features,
             samples.labels,
             samples.weights,
             samples.folds,
-            channels=inputs.channels,
+            channels=inputs.planes,
             class_count=inputs.class_count,
         )
         trees = int(np.bincount(table.forest.output).max())
         times = TrainingTimes(time.perf_counter() - began, fed_s, len(samples))
-        return Fitted(cls(table, inputs), held_out, trees, trees, training_times_s=times)
+        return Fitted(cls(table, inputs, components), held_out, trees, trees, training_times_s=times)
 
     def _compute_features(self, patches: Patches) -> Floats:
         of = self.inputs
-        return compute_patch_features(patches, channels=of.channels, class_count=of.class_count, patch_m=of.patch_m)
+        return compute_patch_features(patches, channels=of.planes, class_count=of.class_count, patch_m=of.patch_m)
 
 
-_TOGETHER, _READ_TOGETHER = 256, 1024
+_TOGETHER = 256
 
 
 def compute_features(split: Split, patch_m: float, class_count: int) -> Floats:
     """Return the features of all samples, shape (N, features); patches are formed some at a time."""
-    parts = []
-    for first in range(0, len(split), _READ_TOGETHER):
-        patches = split.batch(np.arange(first, min(first + _READ_TOGETHER, len(split))))[0]
-        parts.append(compute_patch_features(patches, channels=split.channels, class_count=class_count, patch_m=patch_m))
+    parts, layout = list[Floats](), split.view.form
+    for first in range(0, len(split), layout.batch_rows):
+        patches = split.batch(np.arange(first, min(first + layout.batch_rows, len(split))))[0]
+        parts.append(compute_patch_features(patches, channels=layout.planes, class_count=class_count, patch_m=patch_m))
     return np.concatenate(parts)

@@ -14,6 +14,7 @@ import pyarrow as pa
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
 from tcpipe.dataset.extra_features import ExtraFeature, available_features, read_extra_features
+from tcpipe.dataset.tensor import ONE_HOT
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, has_card
@@ -40,6 +41,7 @@ from tcpipe.learning.predictor import (
 )
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
+from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS
 from tcpipe.terrain.sampling import compute_relief_m
 
 logger = logging.getLogger("tcpipe")
@@ -133,7 +135,17 @@ def train(
     rules, other = config or FitConfig(), variant or Variant()
     data = open_dataset(dataset, label=rules.label)
     kind = find_kind(rules.model)
-    other = replace(other, channels=kind.channels or other.channels)
+    if kind.channels and rules.layers:
+        raise UsageError(
+            f"--layers: a model of kind {rules.model} takes the slope and class of a metre, no patch; remove it"
+        )
+    other = replace(other, channels=kind.channels or other.channels or rules.layers)
+    if kind.channels:
+        logger.info(
+            "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, rules.model
+        )
+    elif variant is None:
+        _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
         return _train_into_bucket(dataset, str(out).rstrip("/"), key, rules, other)
@@ -174,6 +186,20 @@ def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig
     with write_generation(url, CARD) as place:
         result = train(dataset, place, config=rules, variant=other)
     return replace(result, path=url)
+
+
+def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -> None:
+    """Log which layers of a dataset a model takes, and warn of those of the user's that it does not take unasked."""
+    named = {channel.removesuffix(ONE_HOT) for channel in channels}
+    taken = [
+        *(name for name in LAYERS if name in named),
+        *(name for name in data.card.layers if name in named - {*LAYERS}),
+    ]
+    unused = [name for name in data.card.layers if name not in taken]
+    logger.info("%s: layers: %s; not used: %s", data.path, ", ".join(channels), ", ".join(unused) or "none")
+    if own := [] if is_chosen else [name for name in unused if name not in PAPER_LAYERS]:
+        message = "%s: the model does not use %s; to use it: --layers %s"
+        logger.warning(message, data.path, ", ".join(own), ",".join([*taken, *own]))
 
 
 def compute_dataset_checksum(card: DatasetCard) -> str:
@@ -223,7 +249,7 @@ def make_samples(task: Task, rules: FitConfig, data: Dataset, kind: type[Predict
     if kind.features or (kind.features is None and rules.extra_features and len(task.outputs) > 1):
         extra_features = _find_extra_features(used, kind.features, data)
     inputs = Inputs(
-        channels=task.train.channels, patch_px=data.card.patch_px, depth=task.train.view.form.depth, patch_m=data.card.patch_m,
+        channels=task.train.channels, patch_px=data.card.patch_px, planes=task.train.view.form.planes, patch_m=data.card.patch_m,
         class_count=read_class_table(data.card).count, extra_features=extra_features, outputs=task.outputs,
         scale=tuple(map(float, collect_labels(task.train, task.outputs).max(axis=0))),
     )  # fmt: skip
@@ -345,12 +371,13 @@ def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key:
     return ModelCard(
         architecture=Architecture(
             inputs.patch_px,
-            inputs.depth,
+            len(inputs.planes),
             len(inputs.outputs),
             config.width if kind.stops_by_fold else 0,
             len(inputs.extra_features),
         ),
         channels=inputs.channels,
+        layers={name: card.layers[name] for name in samples.split.view.form.layers if name not in PAPER_LAYERS},
         outputs=inputs.outputs,
         scale=inputs.scale,
         extra_features=inputs.extra_features,
@@ -362,7 +389,9 @@ def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key:
         label_includes=card.label.includes,
         robot=", ".join(card.robots),
         classes=read_class_table(card).classes,
-        training_range=find_training_range(used.with_channels(*card.layers)),
+        training_range=find_training_range(
+            used.with_channels(*(name for name in ("terrain", "height") if name in card.layers))
+        ),
         physics=card.physics.get(card.robots[0]) if len(card.robots) == 1 else None,
         dataset=TrainedOn(card.name, compute_dataset_checksum(card), card.data_model_version, card.splits),
         training=Training(

@@ -170,16 +170,16 @@ def _inspect_in_store(path: Path | str) -> InspectedStore | InspectedRun | None:
 def _inspect_logs_or_tables(
     path: Path, recipe: Recipe, ask: Callable[[Path | str], InspectedLog]
 ) -> InspectedLog | InspectedLogs | InspectedTables:
-    is_alone = is_table(path.name) and not recipe.tables
-    if not path.is_dir() and not is_alone:
+    of_tables = [files[0] for files in find_table_logs(path, recipe.tables)]
+    if path.is_dir():
+        logs = [*list_logs_below(path), *of_tables]
+        if logs or not list_table_files(path):
+            return _inspect_logs_at(logs, path, ask)
+    elif of_tables or not is_table(path.name):
         return ask(path)
-    logs = [*list_logs_below(path), *(files[0] for files in find_table_logs(path, recipe.tables))]
-    if logs or not (is_alone or list_table_files(path)):
-        return _inspect_logs_at(logs, path, ask)
     from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
 
-    found, columns = propose_tables(path)
-    return InspectedTables(path=str(path), columns=columns, recipe=found.toml())
+    return InspectedTables(path=str(path), recipe=propose_tables(path).toml())
 
 
 def _inspect_logs_at(
@@ -242,11 +242,9 @@ def _make_stored(run: RunDirectory) -> StoredIngestion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedTables:
-    """A folder of tables without a mapping in the recipe: what they hold, and the recipe that is proposed."""
+    """Tables without a mapping in the recipe: their columns, and the recipe that is proposed."""
 
     kind: Literal["tables"] = "tables"
     path: str
-    columns: Mapping[str, tuple[str, ...]]
-    """By file, what its columns are called."""
     recipe: str
     """What ``tcpipe init --from`` would write [TOML]."""

@@ -62,10 +62,11 @@ def propose_recipe(
         if not logs:
             from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
 
-            found, _ = propose_tables(path)
+            found = propose_tables(path)
             if not found.lines:
                 raise UsageError(
-                    f"{path}: it contains no log, and no table with stamps and columns of known names", *found.head
+                    f"{path}: it contains no log, and no table with stamps and columns of known names",
+                    *filter(None, found.head),
                 )
             return found
         others = [f"proposed for the first of {len(logs)} logs"] if len(logs) > 1 else []

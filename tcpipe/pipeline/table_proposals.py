@@ -71,17 +71,17 @@ class _Table:
         return max(min(self.span_ns[1], other.span_ns[1]) - max(self.span_ns[0], other.span_ns[0]), 0)
 
 
-def propose_tables(path: Path) -> tuple[ProposedRecipe, dict[str, tuple[str, ...]]]:
-    """Return the recipe for a table, or those in a folder, that have known names, and by file what its columns are called.
+def propose_tables(path: Path) -> ProposedRecipe:
+    """Return the recipe for a table, or those in a folder, that have known names; its head lists their columns and what cannot be read.
 
-    Of several tables for a role, that is used which covers the drive of the others best. The recipe's head names what cannot be read.
+    Of several tables for a role, that is used which covers the drive of the others best.
     """
     folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
-    columns: dict[str, tuple[str, ...]] = {}
-    head = list[str]()
+    columns: dict[str, Sequence[str]] = {}
+    head = [""]
     for file in files:
         try:
-            columns[file.relative_to(folder).as_posix()] = tuple(read_column_names(file))
+            columns[file.relative_to(folder).as_posix()] = read_column_names(file)
         except LogError as error:
             head.append(str(error))
     roles: dict[str, list[tuple[_Table, list[ProposedLine]]]] = {}
@@ -91,9 +91,8 @@ def propose_tables(path: Path) -> tuple[ProposedRecipe, dict[str, tuple[str, ...
         found = [(role, (table, lines)) for role, lines in _iterate_roles(table)] if table else []
         for role, candidate in found:
             roles.setdefault(role, []).append(candidate)
-        if not found:
-            why = "no known fields" if table else "no stamps"
-            head.append(f"{name} is not used, {why} in its columns {', '.join(names)}")
+        unused = "" if found else ", not used: no known fields" if table else ", not used: no stamps"
+        head.append(f"{name}{unused}; columns {', '.join(names)}")
     ranked = [of for candidates in roles.values() for of in sorted(candidates, key=lambda of: -of[0].rows)[:1]]
     lines, log = list[ProposedLine](), path
     for role, candidates in roles.items():
@@ -107,7 +106,7 @@ def propose_tables(path: Path) -> tuple[ProposedRecipe, dict[str, tuple[str, ...
     with_voltage = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
     lines = [line for line in lines if line.note != NO_VOLTAGE or make_rail_name(line.table) not in with_voltage]
     lines += propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)
-    return ProposedRecipe(head, lines, format_path(log)), columns
+    return ProposedRecipe(head, lines, format_path(log))
 
 
 def _group_files(folder: Path, files: Sequence[Path]) -> dict[str, Path]:

@@ -24,7 +24,7 @@ from tcpipe.errors import ModelError
 from tcpipe.tables.bits import flag_name
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import NODATA_ID, ClassTable
-from tcpipe.terrain.layers import HEIGHT_STEP_M, PAPER_LAYERS, make_paper_layers
+from tcpipe.terrain.layers import COLOURS, HEIGHT_STEP_M, LAYERS, PAPER_LAYERS, Layer
 from tcpipe.terrain.sampling import (
     Patches,
     PatchFrames,
@@ -36,9 +36,6 @@ from tcpipe.terrain.sampling import (
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
 
 Floats = NDArray[np.float64]
-
-BATCH_PATCHES = 2_048
-"""Patches whose tensors exist at once: 40 MB."""
 
 
 class CostModel(Protocol):
@@ -63,6 +60,10 @@ class CostModel(Protocol):
     @property
     def channels(self) -> tuple[str, ...]:
         """Channels of the tensor, in order (`tcpipe.dataset.tensor`)."""
+
+    @property
+    def layers(self) -> Mapping[str, Layer]:
+        """Layers by name, of which its channels are, with the ranges by which they were scaled in training."""
 
     @property
     def patch_m(self) -> float:
@@ -129,18 +130,27 @@ class Predicted:
 
 
 def _make_layout(model: CostModel) -> TensorLayout:
-    return TensorLayout(model.channels, make_paper_layers(PAPER_LAYERS, model.classes), model.patch_px)
+    return TensorLayout(model.channels, model.layers, model.patch_px)
 
 
 def check_model(model: CostModel, source: MapReader) -> None:
     """Raise `ModelError` if a map cannot give the model what it was trained on; all differences at once."""
     problems = []
     needed = _make_layout(model).layers
-    missing = [layer for layer in needed if layer not in source.layers]
-    if missing:
+    there = {**source.layers, **{name: of.layer for name, of in source.banded.items()}}
+    if missing := [layer for layer in needed if layer not in there]:
+        option = f"--{missing[0]}" if missing[0] in LAYERS else f"--layer {missing[0]}=FILE"
+        option = "--ortho-bands rgb" if missing[0] in COLOURS else option
         problems.append(
-            f"map {source.name}: has no {', '.join(missing)}, which model {model.name} needs; add the map with --{missing[0]}"
+            f"map {source.name}: has no {', '.join(missing)}, which model {model.name} needs; add the map with {option}"
         )
+    for name in set(needed) & there.keys() - PAPER_LAYERS.keys():
+        got, wanted = ((of.kind, len(of.bands), of.unit, of.classes) for of in (there[name], model.layers[name]))
+        if got != wanted:
+            described = (f"{of[0]}, {of[1] or 1} bands in {of[2]}" for of in (got, wanted))
+            problems.append(
+                f"map {source.name}: {name} is {' not '.join(described)}, or has other classes: add another raster"
+            )
     if "terrain" in needed and "terrain" in source.layers and model.classes != source.classes:
         different = "; ".join(source.classes.differences(model.classes))
         problems.append(
@@ -167,7 +177,8 @@ def predict_patches(
     out, unknown = np.full((asked.size, 2), np.nan), np.full(asked.size, np.nan)
     turns = unknown if turn_radpm is None else turn_radpm
     extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
-    for rows in _iterate_batches(np.flatnonzero(asked)):
+    chosen = np.flatnonzero(asked)
+    for rows in (chosen[first : first + form.batch_rows] for first in range(0, chosen.size, form.batch_rows)):
         said = model.predict(form.form(pixels, rows), extra_features.take(rows))
         if said.shape != (rows.size, 2):
             raise ModelError(
@@ -176,10 +187,6 @@ def predict_patches(
         out[rows] = said
     out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan
     return Predicted(out[:, 0].copy(), out[:, 1].copy())
-
-
-def _iterate_batches(rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    yield from (rows[first : first + BATCH_PATCHES] for first in range(0, rows.size, BATCH_PATCHES))
 
 
 LANE_M = 0.7
@@ -309,6 +316,7 @@ def predict_segments(
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
     after another; without it all turn as usual.
     """
+    source = source.select({*PAPER_LAYERS, *_make_layout(model).layers})
     centring, tiles = (
         fit_bias_correction(model.residuals),
         TilePool(choose_level(source, model.patch_m / model.patch_px)),

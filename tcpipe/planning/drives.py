@@ -353,7 +353,8 @@ def evaluate_drives(
 ) -> DrivesResult:
     """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``, or to a URL.
 
-    Where the dataset's runs were moved onto their map (``sample.align``), drives are moved by the same method, or a finding says why not.
+    Where the dataset's runs were moved onto their map (``sample.align``), drives are moved together with
+    those of them that are in the store, or a finding says why not.
 
     Raises
     ------
@@ -370,8 +371,12 @@ def evaluate_drives(
         raise UsageError(f"{place}: is a file, expected a directory to write {JSON} and {PAGE} into")
     recipe, shifts, moved = data.card.recipe, dict[str, tuple[float, float, float]](), list[Finding]()
     if recipe.sample.align:
-        registrations, moved = register_runs(runs, source, recipe)
+        names = {run.run_id for run in runs}
+        known = {(run.run_id, run.recipe_id) for run in data.card.runs} | {(run.run_id, run.recipe_id) for run in runs}
+        together = [run for run in opened.runs() if (run.run_id, run.recipe_id) in known]
+        registrations, found_on_map = register_runs(together, source, recipe)
         shifts = list_shifts(registrations)
+        moved = [of for of in found_on_map if of.subject.kind != "run" or of.subject.name in names]
     found = tuple(
         compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
         for run, log in zip(runs, logs, strict=True)

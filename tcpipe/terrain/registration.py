@@ -12,11 +12,13 @@ the misfit itself: along slopes that are noisy a step is too short.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
+from scipy.optimize import brentq
+from scipy.stats import chi2
 
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
@@ -35,12 +37,15 @@ KNOWN_M = 0.25
 
 _STEP_M = 0.25
 _SPACING_M = 0.5
-_MOST_POINTS = 1_200
+_MOST_POINTS, _MOST_TOGETHER = 1_200, 6_000
+"""Of one track, and of several."""
 _FEWEST_POINTS = 60
 _BLOCKS = 12
 """Stretches left out in turn (delete-one-block jackknife): errors of GNSS and of the map are alike over metres."""
 _CHI2_999 = 13.82
 """99.9 % of χ² with two degrees of freedom."""
+_AGREE, _SCATTER_QUANTILE = 0.999, 0.1
+"""Runs' own shifts scatter about the common one by at most the 90 % upper limit."""
 _OUTLIER = 3.5
 _SIGMAS = 5.0
 """So far must the misfit fall beyond its own uncertainty: the best of 600 shifts falls by three by chance."""
@@ -102,6 +107,18 @@ class HeightScale:
 
 
 @dataclass(frozen=True, slots=True)
+class _Points:
+    """Positions on the map, (N, 2) [m], and which track each is of, (N,), rising."""
+
+    xy_m: FloatArray
+    track: Rows
+
+    def select(self, rows: Points) -> _Points:
+        """Return the points that are True in a mask."""
+        return _Points(self.xy_m[rows], self.track[rows])
+
+
+@dataclass(frozen=True, slots=True)
 class Registration:
     """How a map lies against a track.
 
@@ -109,8 +126,8 @@ class Registration:
     directions only; ``shift_std_m`` its largest standard deviation along them, NaN where none is determined. ``height_offset_m`` is track
     minus map; ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left without and with the shift,
     ``shape_misfit_m`` of what is left with the shift, a tilt and a drift. ``significant``: the shift is not chance. ``at_reach``: the best
-    shift lies at the window's edge, the true one may be larger. ``scale`` is of heights. ``axis_std_m`` are the shift's standard deviations
-    along both axes, NaN where a direction is not determined.
+    shift lies at the window's edge, the true one may be larger. ``scale`` is of heights. ``information`` is the inverse of the shift's
+    covariance, (2, 2) [1/m²], 0 along directions that are not determined.
     """
 
     points: int
@@ -123,12 +140,19 @@ class Registration:
     significant: bool
     at_reach: bool
     scale: HeightScale
-    axis_std_m: tuple[float, float]
+    information: FloatArray
 
     @property
     def shift_m(self) -> float:
         """Length of the shift [m]."""
         return float(np.hypot(*self.shift_xy_m))
+
+    @property
+    def axis_std_m(self) -> FloatArray:
+        """Standard deviations of the shift along both axes [m], NaN unless it is determined in both directions."""
+        if _count_known(self.information) < 2:
+            return np.full(2, np.nan)
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information))))
 
     @property
     def position_std_m(self) -> float:
@@ -142,23 +166,28 @@ class Registration:
 
 
 def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) -> Registration | None:
-    """Find the horizontal shift at which the map's ground fits the track's heights best.
+    """Find the horizontal shift at which the map's ground fits the track's heights best, as `register_tracks`."""
+    return register_tracks(source, [(xy_m, height_m)])
+
+
+def register_tracks(source: MapReader, tracks: Sequence[tuple[FloatArray, FloatArray]]) -> Registration | None:
+    """Find the one horizontal shift at which the map's ground fits the heights of tracks best.
 
     Parameters
     ----------
     source : the map.
-    xy_m : positions of the track in the map's CRS, in the order driven, shape (N, 2) [m]; what is not finite or not on the map is passed
-        over.
-    height_m : their heights above any surface, shape (N,) [m].
+    tracks : of each track the positions in the map's CRS, in the order driven, shape (N, 2) [m], of which what is not finite or not on the
+        map is passed over, and their heights above any surface, shape (N,) [m].
 
     Returns
     -------
     None where fewer than `_FEWEST_POINTS` points, half a metre apart, lie well inside the map and on its ground.
     """
     level = choose_level(source, _STEP_M)
-    finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
-    at = np.flatnonzero(finite)[_thin_points(xy_m[finite])]
-    at = at[level.grid.contains(xy_m[at])]
+    thinned = thin_tracks(tracks)
+    xy_m, height_m = (np.concatenate([track[part] for track in thinned]) for part in (0, 1))
+    number = np.repeat(np.arange(len(thinned)), [len(track[1]) for track in thinned])
+    at = np.flatnonzero(level.grid.contains(xy_m))
     steps = round(REACH_M / _STEP_M)
     shift_m = np.arange(-steps, steps + 1, dtype=np.float64) * _STEP_M
     ground_m = _sample_heights(level, xy_m[at], shift_m)
@@ -166,24 +195,24 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     if whole.sum() < _FEWEST_POINTS:
         return None
     at, ground_m = at[whole], ground_m[whole]
-    excess_m = ground_m - height_m[at][:, None, None]
-    near, good = _find_ground(excess_m, xy_m[at])
+    excess_m, points = ground_m - height_m[at][:, None, None], _Points(xy_m[at], number[at])
+    near, good = _find_ground(excess_m, points)
     if near.sum() < _FEWEST_POINTS:
         return None
     scale = _fit_height_scale(ground_m[near], height_m[at][near], xy_m[at][near])
-    return _refine_shift(excess_m, xy_m[at], (near, good), shift_m, scale)
+    return _refine_shift(excess_m, points, (near, good), shift_m, scale)
 
 
-def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[Points, Points]:
+def _find_ground(excess_m: FloatArray, points: _Points) -> tuple[Points, Points]:
     """Return which points are on the map's ground at the shift that fits best, (N,), and which of them tell a shift.
 
     These are not on cliffs, unless too few are left.
     """
     middle = excess_m.shape[1] // 2
-    flat_m = excess_m - _fit_tilt(xy_m, excess_m[:, middle, middle])[:, None, None]
+    flat_m = excess_m - _fit_tilt(points.xy_m, excess_m[:, middle, middle])[:, None, None]
     best = _find_least(np.median(np.abs(flat_m - np.median(flat_m, axis=0)), axis=0))
     for _ in range(_ROUNDS):
-        tilt_m = _fit_tilt(xy_m, excess_m[:, *best])
+        tilt_m = _fit_tilt(points.xy_m, excess_m[:, *best])
         left = excess_m[:, *best] - tilt_m
         left = np.abs(left - np.median(left))
         relief_m = np.ptp(_take_near(excess_m, best), axis=(1, 2))
@@ -192,7 +221,7 @@ def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[Points, Points
         good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
             return near, near
-        before, best = best, _find_least(_flatten(excess_m[good], xy_m[good])[0].var(axis=0))
+        before, best = best, _find_least(_flatten(excess_m[good], points.select(good))[0].var(axis=0))
         if best == before:
             break
     return near, good
@@ -207,13 +236,18 @@ def _fit_tilt(xy_m: FloatArray, excess_m: FloatArray) -> FloatArray:
     return np.asarray(columns[:, :2] @ fitted[:2])
 
 
-def _thin_points(xy_m: FloatArray) -> NDArray[np.int64]:
-    """Return indices of points `_SPACING_M` of path apart, or further where that would be too many."""
-    if len(xy_m) == 0:
-        return np.zeros(0, np.int64)
-    path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
-    spacing_m = max(_SPACING_M, path_m[-1] / _MOST_POINTS)
-    return np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1]
+def thin_tracks(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> list[tuple[FloatArray, FloatArray]]:
+    """Return finite points of tracks `_SPACING_M` of path apart, or further where that would be too many."""
+    tracks = [
+        (xy[is_finite], z[is_finite]) for xy, z in tracks for is_finite in (np.isfinite(xy).all(1) & np.isfinite(z),)
+    ]
+    paths_m = [
+        np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])[: len(xy)] for xy, _ in tracks
+    ]
+    total_m = sum(path_m[-1] for path_m in paths_m if path_m.size)
+    spacing_m = max(_SPACING_M, total_m / (_MOST_POINTS if len(tracks) == 1 else _MOST_TOGETHER))
+    rows = [np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1] for path_m in paths_m]
+    return [(xy[at], z[at]) for (xy, z), at in zip(tracks, rows, strict=True)]
 
 
 def _sample_heights(level: MapReader, xy_m: FloatArray, shift_m: FloatArray) -> FloatArray:
@@ -266,15 +300,17 @@ def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
 
 
 def _refine_shift(
-    raw_m: FloatArray, xy_m: FloatArray, chosen: tuple[Points, Points], shift_m: FloatArray, scale: HeightScale
+    raw_m: FloatArray, points: _Points, chosen: tuple[Points, Points], shift_m: FloatArray, scale: HeightScale
 ) -> Registration:
     """Refine the best shift of the lattice by the good points, and tell how sure it is by leaving stretches out; misfits are near ones'."""
     near, good = chosen
-    excess_m, tilt, stretches = _flatten(raw_m[good], xy_m[good])
+    excess_m, tilt, stretches = _flatten(raw_m[good], points.select(good))
     variance, middle = excess_m.var(axis=0), (shift_m.size // 2, shift_m.size // 2)
     best, inner = _find_least(variance), _find_least(variance[_NEAR:-_NEAR, _NEAR:-_NEAR])
     i, j = inner[0] + _NEAR, inner[1] + _NEAR
-    step_m, covariance, blocks = _descend(_take_near(excess_m, (i, j)), tilt, _group_stretches(xy_m[good], stretches))
+    step_m, covariance, blocks = _descend(
+        _take_near(excess_m, (i, j)), tilt, _group_stretches(points.xy_m[good], stretches)
+    )
     variances, axes = np.linalg.eigh(covariance)
     known = axes[:, variances < KNOWN_M**2]
     if not _is_distinct(excess_m, (i, j), known, shift_m, blocks):
@@ -285,7 +321,6 @@ def _refine_shift(
     fitted = known @ known.T @ np.array([shift_m[j], shift_m[i]]) + step_m
     weight = float(((known.T @ fitted) ** 2 / variances[: known.shape[1]]).sum())
     gain, sigmas = _compute_gain(unshifted, shifted, blocks)
-    axis_std_m = np.sqrt(np.diag(covariance)) if known.shape[1] == len(axes) else np.full(len(axes), np.nan)
     return Registration(
         points=len(excess_m),
         shift_xy_m=(float(fitted[0]), float(fitted[1])),
@@ -297,7 +332,7 @@ def _refine_shift(
         significant=weight > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
         at_reach=bool((np.abs(outside_m) > _EDGE_M).any()),
         scale=scale,
-        axis_std_m=(float(axis_std_m[0]), float(axis_std_m[1])),
+        information=(known / variances[: known.shape[1]]) @ known.T,
     )
 
 
@@ -315,14 +350,16 @@ def _take_near(values: FloatArray, best: tuple[int, int]) -> FloatArray:
     return values[:, i - _NEAR : i + _NEAR + 1, j - _NEAR : j + _NEAR + 1]
 
 
-def _flatten(excess_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, list[Rows]]:
+def _flatten(excess_m: FloatArray, points: _Points) -> tuple[FloatArray, FloatArray, list[Rows]]:
     """Return the excess without drift and tilt, the columns of a tilt, (N, 2), and the rows of stretches whose means are zero.
 
-    Stretches are `_DRIFT_M` long, shorter where there would be too few to leave some out.
+    Stretches are of one track, `_DRIFT_M` long, shorter where there would be too few to leave some out.
     """
-    path_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
-    stretches = np.array_split(np.arange(len(xy_m)), max(_BLOCKS, round(path_m / _DRIFT_M)))
-    stretches = [rows for rows in stretches if rows.size]
+    xy_m, tracks = points.xy_m, np.split(np.arange(len(points.track)), np.flatnonzero(np.diff(points.track)) + 1)
+    paths_m = [np.linalg.norm(np.diff(xy_m[rows], axis=0), axis=1).sum() for rows in tracks]
+    fewest = -(-_BLOCKS // len(tracks))
+    counts = [max(fewest, round(float(path_m) / _DRIFT_M)) for path_m in paths_m]
+    stretches = [part for rows, n in zip(tracks, counts, strict=True) for part in np.array_split(rows, n) if part.size]
     flat_m, tilt = (
         np.concatenate([values[rows] - values[rows].mean(axis=0) for rows in stretches]) for values in (excess_m, xy_m)
     )
@@ -341,7 +378,7 @@ def _group_stretches(xy_m: FloatArray, stretches: Sequence[Rows]) -> list[list[R
     east, north = np.floor(centre_m - centre_m.min(axis=0)).astype(np.int64).T
     orders = (np.arange(len(centre_m)), np.argsort(compute_morton(east, north), kind="stable"))
     return [
-        [np.concatenate([stretches[row] for row in block]) for block in np.array_split(order, _BLOCKS)]
+        [np.concatenate([stretches[row] for row in block]) for block in np.array_split(order, min(_BLOCKS, len(order)))]
         for order in orders
     ]
 
@@ -409,3 +446,74 @@ def _estimate_covariance(without: FloatArray) -> FloatArray:
     spread = without - without.mean(axis=0)
     covariance: FloatArray = (len(without) - 1) / len(without) * spread.T @ spread
     return covariance
+
+
+@dataclass(frozen=True, slots=True)
+class SharedShift:
+    """The shift that a run takes from all runs of a map, if any, and how far its own is from theirs [m], NaN where they agree."""
+
+    registration: Registration | None
+    difference_m: float
+
+
+def share_shift(
+    alone: Sequence[Registration], together: Registration | None, track_std_m: FloatArray
+) -> list[SharedShift]:
+    """Return what each of several runs takes from a registration of all ``together``.
+
+    The shift that all have in common, plus each run's own about it: by the standard deviation (DRMS) of its track, (N,) [m], and by what
+    the runs' shifts scatter more. None is taken where they contradict each other, or too few are determined to bound their scatter.
+    """
+    shift_m, variance = np.array([of.shift_xy_m for of in alone]), track_std_m**2 / 2.0
+    information = np.stack([of.information for of in alone])
+    weights = _widen(information, variance)
+    mean_m = np.linalg.pinv(weights.sum(axis=0), hermitian=True) @ np.einsum("nij,nj->i", weights, shift_m)
+    freedom = int(_count_known(information).sum()) - 2
+    none = [SharedShift(None, float("nan")) for _ in alone]
+    if freedom <= 0:
+        return none
+    if _square(shift_m - mean_m, weights).sum() > chi2.ppf(_AGREE, freedom):
+        return _find_contradictions(shift_m, weights)
+    if together is None or together.at_reach or not np.isfinite(together.position_std_m):
+        return none
+    error_m = shift_m - together.shift_xy_m
+
+    def compare(scatter: float) -> float:
+        squares = _square(error_m, _widen(information, variance + scatter))
+        return float(squares.sum() - chi2.ppf(_SCATTER_QUANTILE, freedom))
+
+    scatter = float(brentq(compare, 0.0, 1e6)) if compare(0.0) > 0.0 else 0.0
+    shared = []
+    for own, wider in zip(alone, _widen(together.information[None], variance + scatter), strict=True):
+        moved = replace(own, shift_xy_m=together.shift_xy_m, information=wider)
+        std_m = float(moved.axis_std_m.max())
+        taken = replace(moved, shift_std_m=std_m, shifted_misfit_m=together.shifted_misfit_m)
+        shared.append(SharedShift(taken, float("nan")))
+    return shared
+
+
+def _find_contradictions(shift_m: FloatArray, weights: FloatArray) -> list[SharedShift]:
+    """Return how far the shifts of runs, (N, 2) [m], are from the median of those that are determined; NaN where by chance."""
+    is_known = _count_known(weights) > 1
+    error_m = shift_m - (np.median(shift_m[is_known], axis=0) if is_known.any() else shift_m)
+    squares = np.where(is_known, _square(error_m, weights), 0.0)
+    is_odd = is_known & (squares >= min(_CHI2_999, squares.max()))
+    return [SharedShift(None, of) for of in np.where(is_odd, np.hypot(*error_m.T), np.nan).tolist()]
+
+
+def _square(error_m: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return squared errors over their variances, (N,)."""
+    return np.asarray(np.einsum("ni,nij,nj->n", error_m, weights, error_m))
+
+
+def _count_known(information: FloatArray) -> Rows:
+    """Return how many directions an information, (..., 2, 2) [1/m²], determines."""
+    return np.asarray((np.linalg.eigvalsh(information) > 1.0 / REACH_M**2).sum(axis=-1))
+
+
+def _widen(information: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return an information (..., 2, 2) [1/m²] with a variance [m²] added along the directions that it determines."""
+    values, axes = np.linalg.eigh(information)
+    is_known = values > 1.0 / REACH_M**2
+    wider = np.where(is_known, 1.0 / (1.0 / np.where(is_known, values, 1.0) + np.expand_dims(variance, -1)), 0.0)
+    return np.asarray((axes * wider[..., None, :]) @ np.swapaxes(axes, -1, -2))

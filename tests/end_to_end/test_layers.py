@@ -1,6 +1,11 @@
 """Rasters of a user's own, from add-map to a tensor: against closed forms, in both formats, with their classes."""
 
 import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +19,8 @@ from synthetic_store import WORLD, add_run, lanes, segments
 import tcpipe
 from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.learning.models import load_model
+from tcpipe.learning.training import _report_layers
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import Store, open_store
@@ -172,8 +179,6 @@ def test_all_that_describes_a_dataset_tells_of_them(datasets):
 
 
 def test_a_changed_pixel_of_an_own_layer_is_found(datasets, tmp_path):
-    import shutil
-
     shutil.copytree(datasets / "zarr", tmp_path / "changed")
     shard = next(path for path in (tmp_path / "changed/patches.zarr/moisture/c").rglob("*") if path.is_file())
     data = bytearray(shard.read_bytes())
@@ -231,3 +236,110 @@ def test_what_cannot_be_a_layer_is_refused_in_a_line(site, more, code, line):
     assert (result.exception.exit_code, len(result.exception.problems)) == (code, 1)
     assert line in result.exception.problems[0]
     assert sorted((site / "store").rglob("*")) == before
+
+
+PAPER = "ortho,terrain,height"
+
+
+@pytest.fixture(scope="module")
+def models(datasets):
+    """Models of the paper's layers, with the embedding, which tells the place, and with layers that tell little of it."""
+    for name, layers in (
+        ("plain", PAPER),
+        ("bands", f"{PAPER},embedding"),
+        ("idle", f"{PAPER},canopy_one_hot,ortho_red"),
+    ):
+        more = ["--model", "boosting", "--layers", layers, "-q"]
+        trained = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(datasets / f"model-{name}"), *more])
+        assert trained.exit_code == 0, trained.output
+    return datasets
+
+
+def error_mps(here, name, dataset="zarr"):
+    """RMSE of velocity on test; it follows the place."""
+    model, test = load_model(here / f"model-{name}"), tcpipe.open_dataset(here / dataset)["test"]
+    said = model.predict(test.with_layout(model.card.layout).patches)[:, 1]
+    return float(np.sqrt(np.mean((said - test.labels[:, 1]) ** 2)))
+
+
+def test_bands_that_tell_the_cost_lower_the_error_of_held_out_samples(models):
+    plain, bands, idle = (error_mps(models, name) for name in ("plain", "bands", "idle"))
+    assert bands < 0.75 * plain
+    assert idle > 0.9 * plain
+    assert error_mps(models, "bands", "parquet") == pytest.approx(bands, rel=1e-6)
+
+
+def test_a_model_says_which_layers_it_takes(datasets, tmp_path, caplog):
+    result = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "model"), "--model", "physics"])
+    assert result.exit_code == 0
+    assert "takes the slope and class of each metre, and no layer" in result.output
+    with caplog.at_level("WARNING", "tcpipe"):
+        _report_layers(tcpipe.open_dataset(datasets / "zarr"), PAPER.split(","), is_chosen=False)
+    assert (
+        "does not use canopy, embedding, moisture; to use it: --layers ortho,terrain,height,canopy,emb" in caplog.text
+    )
+    for layers, model, line in (("ortho,soil", "boosting", "requested channels: soil"), (PAPER, "physics", "no patch")):
+        more = ["--model", model, "--layers", layers]
+        result = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "other"), *more])
+        assert isinstance(result.exception, TcpipeError)
+        assert line in result.exception.problems[0]
+
+
+def test_costs_need_the_layers_of_the_model(models):
+    said = {}
+    for name in ("own", "plain"):
+        more = ["--map", name, "--cell-size", "2"]
+        said[name] = run(models, "cost-map", models / "model-bands", models / f"cost-{name}", *more)
+    assert said["own"].exit_code == 0, said["own"].output
+    assert isinstance(said["plain"].exception, TcpipeError)
+    (line,) = said["plain"].exception.problems
+    assert line.endswith(
+        "has no embedding, which model "
+        + str(models / "model-bands")
+        + " needs; add the map with --layer embedding=FILE"
+    )
+
+
+def test_a_network_takes_a_channel_for_each_band(datasets, tmp_path):
+    pytest.importorskip("torch")
+    options = ["--model", "resnet18", "--width", "16", "--epochs", "1", "--layers", "height,embedding,canopy_one_hot"]
+    trained = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "model"), *options])
+    assert trained.exit_code == 0, trained.output
+    model, test = load_model(tmp_path / "model"), tcpipe.open_dataset(datasets / "zarr")["test"]
+    assert model.card.architecture.depth == 1 + 9 + 2
+    patches = test.with_layout(model.card.layout).patches[:20]
+    other = patches.copy()
+    other[..., 5] = 1.0 - other[..., 5]  # one band alone
+    assert np.abs(model.predict(patches) - model.predict(other)).max() > 0.0
+
+
+def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
+    result = CliRunner().invoke(
+        cli, ["evaluate", *map(str, (models / "model-bands", models / "zarr", tmp_path / "e")), "--no-baselines"]
+    )
+    assert result.exit_code in {0, 3}, result.output
+    found = json.loads((tmp_path / "e" / "evaluation.json").read_text())
+    assert found
+
+
+def test_the_page_on_embeddings_runs_as_it_stands(site, tmp_path, monkeypatch):
+    """Its script and its commands, in order; one run is there, so that samples are held out instead of drives."""
+    page = (Path(__file__).parents[2] / "docs/how-to/own-layers.md").read_text()
+    script, commands = re.findall(r"^```(?:python)?\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    (tmp_path / "embed.py").write_text(script)
+    for name in ("height", "ortho", "terrain"):
+        shutil.copy(site / f"{name}.tif", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TCPIPE_STORE", str(site / "store"))
+    for command in commands.replace("--holdout run", "--holdout sample").splitlines():
+        program, *arguments = command.split()
+        if program == "python":
+            subprocess.run([sys.executable, *arguments], check=True)
+        else:
+            result = CliRunner().invoke(cli, arguments)
+            assert result.exit_code in {0, 3}, result.output
+    with rasterio.open("embedding.tif") as raster:
+        assert (raster.count, raster.res) == (12, (0.5, 0.5))
+    assert tcpipe.open_dataset("dataset", layers=["embedding"])["train"].patches.shape[3] == 12
+    for name in ("with", "without"):
+        assert Path(f"evaluation-{name}/evaluation.json").is_file()

@@ -81,7 +81,7 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
         (("predict-path", "model", "--path", "none.geojson"), 2, "no such file"),
         (("predict-path", "model", "--path", "path.geojson", "--out", "pieces.txt"), 2, "ends in .csv"),
         (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "expected LON,LAT"),
-        (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
+        (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon/lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
         (("cost-map", "model", "--cell-size", "0"), 2, "--cell-size"),
         (("cost-map", "model", "--speed", "0.5"), 2, "has no input for the commanded speed"),

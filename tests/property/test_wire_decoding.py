@@ -102,8 +102,8 @@ def flat(of, value, prefix=""):
             yield prefix + name, value[name]
 
 
-def decoded(of, payloads, encoding):
-    table = TopicTable(MessageType(of, "log", {}), encoding)
+def decoded(of, payloads, encoding, definitions=None):
+    table = TopicTable(MessageType(of, "log", definitions or {}), encoding)
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.arange(len(payloads))
     table.add(
@@ -180,3 +180,13 @@ def test_arrays_of_messages_that_hold_short_arrays_of_messages():
     found = table.take()
     found.validate(full=True)
     assert found["a"].to_pylist() == [value["a"] for value in values]
+
+
+@pytest.mark.parametrize("header", [b"\x00\x01", None])
+def test_a_list_too_long_to_be_walked_side_by_side_is_read_message_by_message(header):
+    of = record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
+    values = [{"texts": ["a"] * count, "number": float(count)} for count in (21_000, 2, 0)]
+    payloads = [Writer(header).message(of, value) for value in values]
+    found = decoded(of, payloads, "cdr" if header else "ros1", _definitions())
+    assert found["texts"].to_pylist() == [value["texts"] for value in values]
+    assert found["number"].to_pylist() == [value["number"] for value in values]

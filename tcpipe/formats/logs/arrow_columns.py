@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.arrow_values import IrregularColumns, find_arrow_type
+from tcpipe.formats.logs.arrow_values import WalkedColumns, find_arrow_type
 from tcpipe.formats.logs.log_part import MessageBlock, gather_integers, group_by_key
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
 from tcpipe.logs.wire_cursors import Dialect, LayoutError, RaggedError, WalkResult, find_dialect, walk
@@ -235,9 +235,9 @@ class TopicTable:
         """Decode messages side by side, and what that cannot do one by one."""
         walked = self._walked(data, starts, ends, dialect)
         if walked.root:
-            irregular = IrregularColumns(data)
-            self._add_part(rows[walked.fits], list(irregular.columns(walked.root, self._wire)))
-            self.replaced_texts += irregular.replaced_texts
+            walked_columns = WalkedColumns(data)
+            self._add_part(rows[walked.fits], list(walked_columns.columns(walked.root, self._wire)))
+            self.replaced_texts += walked_columns.replaced_texts
         left = ~walked.fits
         if left.any() and dialect.known_to_rosbags:
             self._row_by_row(rows[left], data, starts[left], ends[left])

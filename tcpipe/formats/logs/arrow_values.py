@@ -1,4 +1,4 @@
-"""Arrow arrays from bytes: the building blocks of `tcpipe.formats.logs.arrow_columns`, and the columns of irregular messages."""
+"""Arrow arrays from bytes: the building blocks of `tcpipe.formats.logs.arrow_columns`, and the columns of messages."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def make_lists(values: pa.Array, counts: Int64Array, length: int | None) -> pa.A
     return pa.Array.from_buffers(pa.list_(values.type), len(counts), [None, pa.py_buffer(offsets)], children=[values])
 
 
-class IrregularColumns:
+class WalkedColumns:
     """Builds the columns of messages that `tcpipe.logs.wire_cursors` has walked; ``data`` is what it walked over."""
 
     def __init__(self, data: NDArray[np.uint8]) -> None:

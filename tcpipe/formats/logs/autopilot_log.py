@@ -28,7 +28,6 @@ from tcpipe.logs.autopilot import (
 )
 from tcpipe.logs.roles import ODOMETRY, TRANSFORMS
 from tcpipe.logs.topics import AutopilotKind, find_damage
-from tcpipe.tables.arrays import make_column
 from tcpipe.tables.findings import Subject, make_finding
 
 _OWN_PACKAGES = {"ulog": "px4", "dataflash": "ardupilot"}
@@ -78,16 +77,6 @@ def _make_stamped(of: RoleMessages, stamp_ns: Int64, lever_arms: LeverArms) -> F
     return {**make_stamp_fields(stamp_ns), **of.columns, column: pa.repeat(frame, len(stamp_ns))}
 
 
-_VECTOR, _QUATERNION = (pa.struct([(axis, pa.float64()) for axis in axes]) for axes in ("xyz", "xyzw"))
-_TRANSFORM = pa.struct(
-    [
-        ("header", pa.struct([("frame_id", pa.string())])),
-        ("child_frame_id", pa.string()),
-        ("transform", pa.struct([("translation", _VECTOR), ("rotation", _QUATERNION)])),
-    ]
-)
-
-
 _NO_TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 
 
@@ -101,4 +90,4 @@ def _make_transforms(lever_arms: LeverArms) -> Fields:
         }
         for frame, xyz_m in lever_arms.items()
     ]
-    return {"transforms": make_column([rows], pa.list_(_TRANSFORM))}
+    return {"transforms": pa.array([rows])}

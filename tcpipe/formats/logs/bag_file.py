@@ -97,7 +97,6 @@ class BagPart:
         self._chunks: list[_Chunk] = []
         self.is_unchecked = False
         """Whether chunks were read that carry no checksum: all but those of bz2."""
-        self._index_heads: dict[int, tuple[int, int, int, bytes]] = {}
         self._bounds = Bounds(path, self._bytes.size)
         try:
             self._read_index_or_walk()
@@ -239,26 +238,10 @@ class BagPart:
         return found
 
     def _index_record(self, position: int) -> tuple[int, int, int]:
-        """Return the connection of an index record, and offset and size of its entries.
-
-        Their headers differ in connection and count only, so that most need no parsing.
-        """
-        head = self._bytes.peek(position, _INDEX_HEAD_BYTES)
-        length = int.from_bytes(head[:4], "little")
-        if length in self._index_heads and length + 8 <= len(head):
-            connection_at, low, high, rest = self._index_heads[length]
-            header = head[4 : length + 8]
-            size = int.from_bytes(header[length:], "little")
-            if header[:low] + header[low + 4 : high] + header[high + 4 : length] == rest and size % 12 == 0:
-                connection = int.from_bytes(header[connection_at : connection_at + 4], "little")
-                return connection, position + 8 + length, size
+        """Return the connection of an index record, and offset and size of its entries."""
         record = self._record(position)
-        if record.opcode != OP_INDEX or record.data_bytes % 12:
+        if record.opcode != OP_INDEX or record.data_bytes % _INDEX_ENTRY_BYTES:
             raise DamageError("chunk-index-damaged")
-        if len(record.fields.get(b"conn", b"")) == len(record.fields.get(b"count", b"")) == 4:
-            header = self._bytes.peek(position + 4, length)
-            low, high = sorted(places := (header.find(b"conn=") + 5, header.find(b"count=") + 6))
-            self._index_heads[length] = places[0], low, high, header[:low] + header[low + 4 : high] + header[high + 4 :]
         return record.number(b"conn"), record.data_offset, record.data_bytes
 
     def copy(self, chunk: _Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:

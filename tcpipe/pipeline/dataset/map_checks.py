@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +30,15 @@ from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection, compute_geoid_height
-from tcpipe.terrain.registration import REACH_M, Registration, register_track
+from tcpipe.terrain.registration import (
+    REACH_M,
+    Registration,
+    SharedShift,
+    register_track,
+    register_tracks,
+    share_shift,
+    thin_tracks,
+)
 from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
@@ -45,6 +54,8 @@ _REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_le
 _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
 
 _DATUM = "map-height-datum"
+_MOST_RUNS = 30
+"""Registered together at most: more of them thin the points of each."""
 
 _Ground = tuple[MapFile, Projection, Shifts]
 """A map, the projection of places onto it, and how far runs are moved there."""
@@ -62,57 +73,101 @@ def register_runs(
     findings why not. `MapError` if the map's heights are in feet.
     """
     projection = find_map_projection(source, recipe.read.gnss_crs)
+    tracks = [_register(run, source, projection, recipe.sample) for run in runs]
+    for track in tracks:
+        if track.found is not None and track.found.scale.is_feet():
+            raise MapError(_describe_feet(track.found, track.run_id, source.name))
+    shared = _share_shift(tracks, source, is_wanted=recipe.sample.align)
     registrations, findings = list[MapRegistration](), list[Finding]()
-    for run in runs:
-        registration, expected_m, track_std_m = _register(run, source, projection, recipe.sample)
-        left_m = float(np.sqrt(recipe.sample.max_position_std_m**2 - track_std_m**2))
-        reason = _find_obstacle(registration, expected_m, left_m) if recipe.sample.align else "not wanted"
-        if registration is not None and registration.scale.is_feet():
-            raise MapError(_describe_feet(registration, run.run_id, source.name))
-        if recipe.sample.align and reason and np.isfinite(track_std_m):
-            names = {"map": source.name, "reason": reason}
-            findings.append(make_finding("map-not-aligned", Subject("run", run.run_id), names=names))
-        if registration is None:
+    for track in tracks:
+        given = shared.get(track.run_id)
+        found = track.choose_shift(given) if recipe.sample.align else track.found
+        reason = track.find_obstacle(found, recipe.sample.max_position_std_m) if recipe.sample.align else "not wanted"
+        subject, names = Subject("run", track.run_id), {"map": source.name}
+        if recipe.sample.align and reason and np.isfinite(track.std_m):
+            findings.append(make_finding("map-not-aligned", subject, names=names | {"reason": reason}))
+        if track.found is None or found is None:
             continue
-        registrations.append(_make_map_registration(run.run_id, registration, expected_m, is_applied=not reason))
-        findings += _find_shift(registration, run.run_id, source.name, is_applied=not reason)
-        findings += _find_other_heights(registration, expected_m, run.run_id, source.name)
+        used = track.found if reason else found
+        registrations.append(_make_map_registration(track.run_id, used, track.expected_m, is_applied=not reason))
+        findings += _find_shift(used, track.run_id, source.name, is_applied=not reason)
+        findings += _find_other_heights(track.found, track.expected_m, track.run_id, source.name)
+        if given is not None and np.isfinite(given.difference_m):
+            std_m = float(np.hypot(track.found.position_std_m, track.std_m))
+            findings.append(
+                make_finding("map-shifts-differ", subject, names=names, difference_m=given.difference_m, std_m=std_m)
+            )
     if recipe.sample.align:
         geoid_m = compute_geoid_height(*np.reshape(projection.area_deg, (2, 2)).mean(axis=0).tolist())
         findings += _find_height_datum(registrations, source.name, geoid_m)
     return tuple(registrations), findings
 
 
-def _register(
-    run: RunDirectory, source: MapFile, projection: Projection, config: SampleConfig
-) -> tuple[Registration | None, float, float]:
-    """Return the map's registration against a run, the expected misfit, and the median DRMS of the track on the map, NaN beside it [m]."""
-    track = run.table("track", _COLUMNS)
-    lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(track, name) for name in _COLUMNS)
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """A run's certain positions on the map, thinned, in its plane, and their heights [m], and the map's registration against it.
+
+    ``expected_m`` is the expected misfit, ``std_m`` the median DRMS of the track on the map, NaN beside it [m].
+    """
+
+    run_id: str
+    points: tuple[NDArray[np.float64], NDArray[np.float64]]
+    found: Registration | None
+    expected_m: float
+    std_m: float
+
+    def find_misfit(self) -> str:
+        """Return why the run's heights do not fit the map's ground; "" where they do."""
+        if self.found is None:
+            return "too few points on the map"
+        if self.found.scale.is_off():
+            return "heights are scaled"
+        if self.found.at_reach:
+            return f"the shift may be beyond {REACH_M:g} m"
+        return "heights differ" if _is_other_ground(self.found.shape_misfit_m, self.expected_m) else ""
+
+    def choose_shift(self, given: SharedShift | None) -> Registration | None:
+        """Return the more certain of the run's own shift and the one that all runs share."""
+        if self.found is None or given is None or given.registration is None:
+            return self.found
+        return self.found if self.found.position_std_m <= given.registration.position_std_m else given.registration
+
+    def find_obstacle(self, found: Registration | None, max_std_m: float) -> str:
+        """Return why a shift cannot be applied; "" where it can: its DRMS and the track's together are at most ``max_std_m``."""
+        if found is None or self.find_misfit():
+            return self.find_misfit()
+        if not np.isfinite(found.position_std_m):
+            return "the ground does not determine the shift"
+        is_known = found.position_std_m <= np.sqrt(max_std_m**2 - self.std_m**2)
+        return "" if is_known else f"the shift is known only to {found.position_std_m:.2f} m"
+
+
+def _share_shift(tracks: Sequence[_Track], source: MapFile, *, is_wanted: bool) -> dict[str, SharedShift]:
+    """Return by run what runs that fit the map's ground take from all of them, if that is wanted, and whether they agree."""
+    fitting = [(track, track.found) for track in tracks if track.found is not None and not track.find_misfit()]
+    if len(fitting) < 2:
+        return {}
+    every = -(-len(fitting) // _MOST_RUNS)
+    together = register_tracks(source, [track.points for track, _ in fitting[::every]]) if is_wanted else None
+    std_m = np.array([track.std_m for track, _ in fitting])
+    shared = share_shift([found for _, found in fitting], together, std_m)
+    return {track.run_id: given for (track, _), given in zip(fitting, shared, strict=True)}
+
+
+def _register(run: RunDirectory, source: MapFile, projection: Projection, config: SampleConfig) -> _Track:
+    table = run.table("track", _COLUMNS)
+    lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(table, name) for name in _COLUMNS)
     std_m = np.hypot(x_std_m, y_std_m)
     certain: NDArray[np.bool_] = std_m <= config.max_position_std_m
     lonlat = np.stack([lon, lat], axis=1)[certain]
     map_error_m = read_threshold("map-heights-differ", "map_error_m")
     expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[certain] ** 2)), map_error_m)) if certain.any() else map_error_m
-    xy_m = projection.forward(lonlat)
-    here_m = std_m[certain][source.grid.contains(np.where(np.isfinite(xy_m), xy_m, np.inf))]
-    track_std_m = float(np.median(here_m)) if here_m.size else float("nan")
-    return register_track(source, xy_m, height_m[certain]), expected_m, track_std_m
-
-
-def _find_obstacle(found: Registration | None, expected_m: float, max_std_m: float) -> str:
-    """Return why the shift of a run cannot be applied; "" where it can: its DRMS is at most what the track's own leaves."""
-    if found is None:
-        return "too few points on the map"
-    if found.scale.is_off():
-        return "heights are scaled"
-    if found.at_reach:
-        return f"the shift may be beyond {REACH_M:g} m"
-    if not np.isfinite(found.position_std_m):
-        return "the ground does not determine the shift"
-    if found.position_std_m > max_std_m:
-        return f"the shift is known only to {found.position_std_m:.2f} m"
-    return "heights differ" if _is_other_ground(found.shape_misfit_m, expected_m) else ""
+    xy_m, height_m = projection.forward(lonlat), height_m[certain]
+    is_on = source.grid.contains(np.where(np.isfinite(xy_m), xy_m, np.inf))
+    track_std_m = float(np.median(std_m[certain][is_on])) if is_on.any() else float("nan")
+    found = register_track(source, xy_m, height_m)
+    (thin,) = thin_tracks([(xy_m[is_on], height_m[is_on])])
+    return _Track(run.run_id, thin, found, expected_m, track_std_m)
 
 
 def _describe_feet(found: Registration, run_id: str, name: str) -> str:

@@ -6,7 +6,13 @@ import pytest
 from tcpipe.errors import ModelError
 from tcpipe.learning import table_model as forest
 from tcpipe.learning.predictor import Inputs
-from tcpipe.learning.table_model import BoostingModel, compute_patch_features, fit_table
+from tcpipe.learning.table_model import (
+    MOST_COMPONENTS,
+    BoostingModel,
+    compute_patch_features,
+    fit_components,
+    fit_table,
+)
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
@@ -142,8 +148,24 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
 def test_arrays_there_and_back_and_an_older_kind(fitted):
     model, _ = fitted
     features, _, _ = ground(20)
-    inputs = Inputs(CHANNELS, 40, 3, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
+    inputs = Inputs(CHANNELS, 40, CHANNELS, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
     again = BoostingModel.from_arrays(model.arrays(), inputs).table
     assert np.array_equal(again.predict(features), model.predict(features))
     with pytest.raises(ModelError, match=r"the weights of another model: curve_.* is missing; train the model again"):
         BoostingModel.from_arrays(model.forest.arrays(), inputs)
+
+
+def test_components_of_bands_are_those_of_their_covariance():
+    channels = ("height", *(f"e[{n}]" for n in range(1, 13)), "ortho", *(f"two[{n}]" for n in (1, 2)))
+    rng = np.random.default_rng(5)
+    features = rng.normal(size=(300, 6 + 12 * 2 + 3 + 2 * 2))
+    means = 6 + 2 * np.arange(12)
+    features[:, means] = features[:, means] @ rng.normal(size=(12, 12)) + 3.0
+    found = fit_components(features, channels, CLASSES).append(features)[:, features.shape[1] :]
+    assert found.shape == (300, MOST_COMPONENTS + 2)
+    values, vectors = np.linalg.eigh(np.cov(features[:, means].T))
+    wanted = (features[:, means] - features[:, means].mean(axis=0)) @ vectors[:, ::-1][:, :MOST_COMPONENTS]
+    np.testing.assert_allclose(np.abs(found[:, :MOST_COMPONENTS]), np.abs(wanted), atol=1e-9)
+    np.testing.assert_allclose(found[:, :MOST_COMPONENTS].var(axis=0, ddof=1), values[::-1][:MOST_COMPONENTS])
+    np.testing.assert_allclose(np.corrcoef(found[:, MOST_COMPONENTS:].T)[0, 1], 0.0, atol=1e-12)
+    assert fit_components(features[:, :9], ("height", "ortho"), CLASSES).append(features[:, :9]).shape == (300, 9)

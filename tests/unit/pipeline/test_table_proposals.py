@@ -134,7 +134,7 @@ def test_a_folder_without_known_names_says_so(tmp_path):
 @pytest.mark.parametrize("columns", [{**FIXES, "volt": 24.0, "amp": 2.0}, {"volt": 24 + 1e-3 * SECONDS, "amp": 2.0}])
 def test_what_a_role_measures_is_no_stamp(tmp_path, columns):
     write(tmp_path / "drive.csv", **columns)
-    with pytest.raises(UsageError, match=r"drive\.csv is not used, no stamps in its columns"):
+    with pytest.raises(UsageError, match=r"drive\.csv, not used: no stamps; columns"):
         propose_recipe(tmp_path)
 
 

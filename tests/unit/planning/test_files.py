@@ -163,5 +163,5 @@ def test_names_and_points_that_cannot_be_are_one_line(source, path, tmp_path):
         plan(MODEL, source, _request(source), out=tmp_path / "plan.kml", picture=None)
     with pytest.raises(UsageError, match=r"ends in \.png"):
         plan(MODEL, source, _request(source), out=tmp_path / "plan.json", picture=tmp_path / "plan.svg")
-    with pytest.raises(PathError, match="no lon, lat"):
+    with pytest.raises(PathError, match="no lon/lat"):
         plan(MODEL, source, PlanRequest((200.0, 47.0), (15.0, 47.0)), out=tmp_path / "plan.json", picture=None)

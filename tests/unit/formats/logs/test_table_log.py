@@ -13,6 +13,7 @@ from tcpipe.formats.logs.table_log import open_tables
 from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_toml
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.proposals import propose_recipe
 from tcpipe.recipe import Recipe, TableMapping
 from tcpipe.recipe.checking import from_values
 from tcpipe.simulation.scenarios import make_tiny
@@ -185,7 +186,10 @@ def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_pat
     )  # fmt: skip
     found = inspect(folder, recipe=Recipe())
     assert found.kind == "tables"
-    assert "notes.csv is not used" in found.recipe
+    assert "notes.csv, not used" in found.recipe
+    assert found.recipe == propose_recipe(folder).toml()
+    alone = inspect(folder / "fixes.csv", recipe=Recipe())
+    assert alone.recipe == propose_recipe(folder / "fixes.csv").toml()
     recipe = from_values(Recipe, parse_toml(found.recipe), where="proposed")
     assert {table.role or name for name, table in recipe.tables.items()} == {
         "gnss",
