@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
-from tcpipe.cost.adaptation import Metres, Run, adapt
+from tcpipe.cost.adaptation import ELSEWHERE_M, Metres, Run, adapt
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
@@ -146,10 +146,12 @@ def _sum_costs(
     if known is not None:
         if errors is None:
             raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
-        begin_m, rise_m = np.cumsum(pieces.arc_m) - pieces.arc_m, pieces.arc_m * np.tan(said.slope_rad)
+        begin_m, rise_m = ELSEWHERE_M + np.cumsum(pieces.arc_m), pieces.arc_m * np.tan(said.slope_rad)
         adapted = {
-            name: adapt(errors[name], known.metres[name]).predict(
-                Metres(of, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad)
+            name: adapt(
+                errors[name],
+                known.metres[name],
+                Metres(of, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad),
             )
             for name, of in (("duration", duration), ("energy", energy))
         }

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.cost.adaptation import MEAN, MODEL, Metres, Run, adapt, compare_adaptations
+from tcpipe.cost.adaptation import ELSEWHERE_M, MEAN, MODEL, Metres, Run, adapt, compare_adaptations
 from tcpipe.cost.prediction_errors import fit_errors
 
 
@@ -41,14 +41,14 @@ CHANGES = {"same": {}, "heavier": {"payload": 0.4}, "another robot": {"scale": 1
 def test_an_adapted_model_is_better_and_its_intervals_cover(change):
     """At least 90 % of metres and of sums after 50 m, less the chance of 60 runs; the error falls to that of the noise.
 
-    Intervals are too wide where the ground of the rest is that of the known metres: that it may be another is not known from 50 m.
+    They are somewhat too wide here: that the ground of the rest is that of the known metres is not known from 50 m.
     """
     rng, errors = np.random.default_rng(1), made_errors()
     runs = [Run(str(number), {"energy": made_run(rng, **change)}) for number in range(60)]
     found = {(of.metres, of.predictor): of for of in compare_adaptations({"energy": errors}, runs, (0, 10, 50))}
     plain, some, much = (found[metres, MODEL] for metres in (0, 10, 50))
     assert {(of.runs, of.samples) for of in found.values()} == {(60, 60 * 250)}
-    assert 86.0 <= much.coverage_percent <= 99.5
+    assert 86.0 <= much.coverage_percent <= 99.0
     assert much.totals_inside >= 48
     if change:
         assert plain.coverage_percent < 60.0  # what is not adapted is sure of itself, and wrong
@@ -63,7 +63,7 @@ def test_a_long_run_leaves_the_least_squares_fit():
     """With very many metres the prior counts nothing: numpy's own least squares, weighted by the spreads, says the same."""
     errors, known = made_errors(), made_run(np.random.default_rng(3), 1500, scale=1.4, offset=15.0, payload=0.2)
     errors = replace(errors, correlation=np.zeros_like(errors.correlation))
-    adapted = adapt(errors, known).predict(known).value
+    adapted = adapt(errors, known, replace(known, distance_m=known.distance_m + ELSEWHERE_M)).value
     design = np.column_stack([known.predicted, known.length_m, known.rise_m])
     spread = errors.compute_std(known.predicted, known.class_id)
     by_hand = design @ np.linalg.lstsq(design / spread[:, None], known.measured / spread, rcond=None)[0]
@@ -74,7 +74,7 @@ def test_one_metre_hardly_moves_the_model():
     errors, run = made_errors(), made_run(np.random.default_rng(4))
     first = run.take(np.arange(300) < 1)
     odd = replace(first, measured=first.predicted * 1.1)
-    ratio = adapt(errors, odd).predict(run).value / run.predicted
+    ratio = adapt(errors, odd, run).value / run.predicted
     assert 1.0 < ratio.mean() < 1.08
 
 
