@@ -1,6 +1,6 @@
 """What a message definition says of the bytes: scalars, texts, arrays and records, as one small tree; and the text of a definition.
 
-Both ROS 1 serialisation and CDR lay these types out field after field; how is `tcpipe.logs.wire_layout`'s knowledge.
+Both ROS 1 serialisation and CDR lay these types out field after field; how is `tcpipe.logs.wire_cursors`'s knowledge.
 
 A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log holds the message first, then every message it is
 made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaults and comments do not matter for reading.
@@ -34,11 +34,10 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A message: named fields in wire order; ``fixed`` when every message of the type has the same size."""
+    """A message: named fields in wire order, which unfold to so many columns."""
 
     name: str
     fields: tuple[tuple[str, WireType], ...]
-    fixed: bool
     leaves: int
 
 
@@ -51,19 +50,6 @@ class Array:
 
 
 WireType = Scalar | Text | Record | Array
-
-
-def is_fixed(wire_type: WireType) -> bool:
-    """Return whether all values of the type occupy the same number of bytes (but for alignment)."""
-    match wire_type:
-        case Scalar():
-            return True
-        case Text():
-            return False
-        case Record():
-            return wire_type.fixed
-        case Array():
-            return wire_type.length is not None and is_fixed(wire_type.element)
 
 
 def count_leaves(wire_type: WireType) -> int:
@@ -120,8 +106,8 @@ def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
 
 
 def record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
-    """Make a record; whether it is fixed and how wide it unfolds follow from its fields."""
-    return Record(name, fields, all(is_fixed(of) for _, of in fields), sum(count_leaves(of) for _, of in fields))
+    """Make a record; how wide it unfolds follows from its fields."""
+    return Record(name, fields, sum(count_leaves(of) for _, of in fields))
 
 
 def iterate_flat_fields(of: Record, prefix: str = "") -> Iterator[tuple[str, WireType]]:
