@@ -154,7 +154,8 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     from tcpipe.planning.path_files import PlanRequest, choose_map, plan
     from tcpipe.recipe.checking import from_values
 
-    asked = {name: getattr(options, name) for name in ("objective", "cell_size_m", "allow_extrapolation")}
+    names = ("objective", "cell_size_m", "allow_extrapolation", "risk", "budget_joule", "round_trip")
+    asked = {name: getattr(options, name) for name in names}
     asked |= {"start_deg": options.start, "goal_deg": options.goal}
     request = from_values(PlanRequest, asked, where="plan_path")
     if options.cost_map is not None:

@@ -50,6 +50,7 @@ _COMMANDS = {
     "predict-path": ("model_commands", "Predict time and energy of a path"),
     "cost-map": ("model_commands", "Compute directional cost maps of a whole map"),
     "plan-path": ("model_commands", "Plan the path of least energy, time or distance"),
+    "route-graph": ("model_commands", "Write costs into a Nav2 route graph"),
     "report": ("dataset_commands", "Write the HTML page of a run, dataset or store"),
     "overlay": ("log_commands", "Write a run as MCAP, to view with its log"),
     "export": ("dataset_commands", "Export topics as Parquet, or a dataset for QGIS"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -11,7 +12,7 @@ import click
 from tcpipe.cli.options import OUTPUT_DIRECTORY, RenamedOption, add_options, jobs_option, json_option, quiet_option
 from tcpipe.cli.output import print_json, print_lines, print_result, show_progress
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
-from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions
+from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions, RouteGraphOptions
 
 if TYPE_CHECKING:
     from tcpipe.experiment.reproduction import Size
@@ -163,7 +164,7 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     print_result(result, as_json=as_json)
 
 
-def _load_inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:
+def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[CostModel, MapFile]:
     """Return the model and the map, wherever this is called."""
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map
@@ -185,5 +186,31 @@ def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
 
     with show_progress("plan-path", quiet=quiet) as shown:
         result = run_plan_path(replace(options, on_step=shown.count))
+    print_result(result, as_json=as_json)
+    return result.exit_code
+
+
+@click.command("route-graph")
+@add_options(RouteGraphOptions)
+@json_option
+@quiet_option
+def route_graph(options: RouteGraphOptions, *, as_json: bool, quiet: bool) -> int:
+    """Write time, energy and their standard deviations into a graph of Nav2's route server, for each edge in its own direction.
+
+    Exit code 3: some edges have no cost; they are left out.
+    """
+    from tcpipe.planning.route_graph import write_route_graph
+    from tcpipe.store import open_store
+
+    graph = None if options.graph is None else Path(options.graph)
+    with show_progress("route-graph", quiet=quiet):
+        result = write_route_graph(
+            *_load_inputs(options),
+            Path(options.out),
+            graph=graph,
+            store=open_store(options.store),
+            origin_deg=options.origin_deg,
+            two_way=options.two_way,
+        )
     print_result(result, as_json=as_json)
     return result.exit_code

@@ -172,6 +172,19 @@ def parse_duration(_: click.Context, __: click.Parameter, value: str) -> float:
     return float(match[1]) * _SECONDS[match[2]]
 
 
+_JOULE = {"J": 1.0, "kJ": 1e3, "MJ": 1e6, "Wh": 3600.0, "kWh": 3.6e6}
+
+
+def parse_energy(_: click.Context, __: click.Parameter, value: str | None) -> float | None:
+    """Turn ``300Wh``, ``1.2kWh``, ``500kJ`` into joules."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(J|kJ|MJ|Wh|kWh)", value.strip())
+    if match is None or not float(match[1]):
+        raise click.BadParameter(f"{value!r}: expected an energy with its unit: 300Wh, 1.2kWh, 500kJ")
+    return float(match[1]) * _JOULE[match[2]]
+
+
 def parse_shard(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
     """Turn ``I/N`` into two numbers, I from 1 to N."""
     if value is None:
@@ -245,6 +258,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "layers": {"callback": layer_values, "multiple": True, "type": ONE_OF_SEVERAL},
     "class_tables": {"callback": class_table_values, "multiple": True, "type": ONE_OF_SEVERAL},
     "duration": {"callback": parse_duration},
+    "energy": {"callback": parse_energy},
     "shard": {"callback": parse_shard},
     "holdout": {"callback": parse_holdout},
     "lengths": {"callback": parse_lengths},

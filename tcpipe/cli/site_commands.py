@@ -148,6 +148,7 @@ _ANSWERS = {
     "preflight.answer": "pipeline.preflight.Preflight",
     "prune.answer": "pipeline.prune.Pruned",
     "reproduce.answer": "experiment.reproduction.Reproduction",
+    "route-graph.answer": "planning.route_graph.RouteGraphResult",
     "simulate.answer": "simulation.SimulatedSite",
     "status.answer": "pipeline.status.Status",
     "train.answer": "learning.training.TrainResult",

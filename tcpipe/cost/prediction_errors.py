@@ -73,6 +73,11 @@ class SumDistribution:
     std_above: float
 
     @property
+    def std(self) -> float:
+        """Return the mean of both standard deviations."""
+        return 0.5 * (self.std_below + self.std_above)
+
+    @property
     def interval(self) -> tuple[float, float]:
         """Return the ends of the interval of `COVERAGE`."""
         return self.compute_quantile(_TAIL), self.compute_quantile(1.0 - _TAIL)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.terrain.layers import LAYERS, Layer, sort_layers
+from tcpipe.terrain.layers import Layer, sort_layers
 
 Floats = NDArray[np.float32]
 Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
@@ -69,16 +69,11 @@ class TensorLayout:
 
         ``mirrored`` tells which of them are mirrored across their direction of travel, shape (B,).
         """
-        from tcpipe.dataset.tensor_kernel import form_bytes, form_numbers, form_paper_tensor  # noqa: PLC0415  numba loads with the first batch
+        from tcpipe.dataset.tensor_kernel import form_bytes, form_numbers  # noqa: PLC0415  numba loads with the first batch
 
         flips = np.zeros(len(rows), np.bool_) if mirrored is None else mirrored
         px = self.patch_px
         out = np.empty((len(rows), px, px, self.depth), np.float32)
-        if self.channels == LAYERS:
-            most = np.float32(255.0), np.float32(max(self.known["terrain"].high - 1.0, 1.0))
-            step = np.float32(self.known["height"].scaling[0])
-            form_paper_tensor(*(pixels[layer] for layer in LAYERS), rows, flips, *most, step, out)
-            return out
         at = 0
         for channel in self.channels:
             layer = self.known[self._of(channel)]
@@ -91,7 +86,7 @@ class TensorLayout:
                 values[flips] = values[flips, :, ::-1]
                 out[..., at : at + self._width(channel)] = layer.band_channels(values, px)
             elif layer.stored == np.uint8:
-                form_bytes(pixels[channel], rows, flips, layer.channel(_BYTES), at, out)
+                form_bytes(pixels[channel], rows, flips, layer.channel_of_bytes, at, out)
             else:
                 scaling = (np.float32(number) for number in layer.scaling)
                 form_numbers(pixels[channel], rows, flips, layer.stored.type(layer.nodata), *scaling, at, out)

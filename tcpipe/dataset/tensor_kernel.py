@@ -9,47 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
-from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-
-@compile_kernel
-def form_paper_tensor(  # noqa: PLR0917
-    ortho: NDArray[np.uint8],
-    terrain: NDArray[np.uint8],
-    height: NDArray[np.uint16],
-    rows: Ints,
-    mirrored: Mask,
-    most_grey: np.float32,
-    most_class: np.float32,
-    step: np.float32,
-    out: Floats,
-) -> None:
-    """Form ``rows`` of all three layers into ``out``, (B, px, px, 3).
-
-    ``most_grey`` and ``most_class`` are what becomes 1 of ortho and, from class 1 on, of terrain; ``step`` is a stored height over 1 m;
-    all float32.
-    """
-    side, one, depth = np.uint64(out.shape[1]), np.uint64(1), np.uint64(3)
-    none, whole = np.float32(0.0), np.float32(1.0)
-    for b in range(rows.size):
-        n = rows[b]
-        greys, classes, heights = ortho[n].reshape(-1), terrain[n].reshape(-1), height[n].reshape(-1)
-        line = out[b].reshape(-1)
-        for r in range(side):
-            first = r * side
-            source = (side - one - r) * side if mirrored[b] else first
-            for c in range(side):
-                at, i = (first + c) * depth, source + c
-                line[at] = np.float32(greys[i]) / most_grey
-                above = np.float32(classes[i]) - whole
-                line[at + one] = (above if above > none else none) / most_class  # noqa: FURB136  (vectorises, max does not)
-                rise = np.float32(heights[i]) * step
-                rise = rise if rise < whole else whole  # noqa: FURB136
-                line[at + depth - one] = rise if heights[i] != HEIGHT_NODATA else none
 
 
 @compile_kernel

@@ -80,12 +80,15 @@ def find_crossed_cells(course: int) -> tuple[CrossedCell, ...]:
 
 
 Floats32 = NDArray[np.float32]
+Classes = NDArray[np.uint8]
 Cells = NDArray[np.int64]
 
 CELLS_OF_BLOCK = BATCH // COURSES
 
 _STRIP_TILES = CACHED_TILES // 3 - 3
 """Tiles across a strip of the map: three rows of it are held at once (`tcpipe.terrain.tiles`)."""
+
+_ROWS_TOGETHER = 256
 
 BARRED = NO_COST | Reason.OBSTACLE
 """Ground that a planner never crosses."""
@@ -237,14 +240,9 @@ class LazyCostGrid:
         self.judged[wanted] = True
         self.predicted[wanted] = True
 
-    def class_id(self) -> NDArray[np.uint8]:
+    def class_id(self) -> Classes:
         """Return the class under the middle of each cell, shape (rows, cols); 0 without data, or without classes."""
-        grid = self.costs.grid
-        if "terrain" not in self.source.layers:
-            return np.zeros((grid.rows, grid.cols), np.uint8)
-        row, col = np.mgrid[: grid.rows, : grid.cols]
-        middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
-        return np.maximum(find_classes_at(self.source, middle), 0).astype(np.uint8).reshape(grid.rows, grid.cols)
+        return read_classes(self.source, self.costs.grid)
 
     def _learn(self, wanted: Mask, step: Callable[[int, int], None], *, ask: bool) -> None:
         todo = list(iterate_blocks(self.source, self.model, self.costs.grid, wanted))
@@ -252,6 +250,17 @@ class LazyCostGrid:
         for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
             self.costs.put(cells, found)
             step(number, len(todo))
+
+
+def read_classes(source: MapReader, grid: MapGrid) -> Classes:
+    """Return the class under the middle of each cell, shape (rows, cols); 0 without data, or without classes."""
+    classes = np.zeros((grid.rows, grid.cols), np.uint8)
+    for first in range(0, grid.rows, _ROWS_TOGETHER) if "terrain" in source.layers else ():
+        rows = classes[first : first + _ROWS_TOGETHER]
+        row, col = np.mgrid[first : first + len(rows), : grid.cols]
+        middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
+        rows[:] = np.maximum(find_classes_at(source, middle), 0).reshape(rows.shape)
+    return classes
 
 
 def make_survey(model: CostModel, source: MapReader, cell_size_m: float) -> LazyCostGrid:

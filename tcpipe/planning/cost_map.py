@@ -3,11 +3,11 @@
 ::
 
     cost-map.json                      what it is made from, courses, reasons, shares, checksums
-    power.tif velocity.tif             [W], [m/s]: a band a course, then min, mean, best course
+    power.tif velocity.tif             [W], [m/s]: a band a course, then min, mean, best course, std over the trusted courses
     duration.tif energy.tif            [s/m], [J/m]: the same
     reasons.tif                        `Reason` bits: a band a course, then those that all courses share
     height.tif                         of the cells' middles [m]
-    duration.{yaml,pgm} energy.{…}     Nav2 maps of the mean over the courses
+    duration.{yaml,pgm} energy.{…}     Nav2 maps of the mean over the trusted courses
     duration.qml energy.qml            how QGIS shows duration.tif and energy.tif: the mean, by colour
 """
 
@@ -26,6 +26,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.cost.prediction_errors import Errors, fit_errors
 from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.execution import Executor, run_all, unwrap_result
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
@@ -49,9 +50,10 @@ from tcpipe.planning.cost_grid import (
     iterate_blocks,
     make_empty_grid,
     make_grid,
+    read_classes,
 )
 from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, predict_segments
-from tcpipe.planning.path_cost import find_projection
+from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
 
@@ -63,7 +65,7 @@ Step: TypeAlias = Callable[[int, int], None]
 
 CARD = "cost-map.json"
 KIND = "tcpipe cost map"
-VERSION = "1.1"
+VERSION = "1.2"
 
 _BLOCKS_KEPT = 8
 """Blocks after which what is done is on disk, and those of a task."""
@@ -71,6 +73,9 @@ _BLOCKS_KEPT = 8
 _QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
 _BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)
 _MEAN_BAND = COURSES + 2
+AGGREGATION = "mean over the courses without a reason"
+"""Of a cell: the mean band and the Nav2 maps."""
+
 _GREATEST_IS_BEST = "velocity"
 
 
@@ -112,6 +117,8 @@ class CostMapCard:
     reason_share: Mapping[str, float]
     """Of cells and courses."""
     barred_by: tuple[str, ...]
+    aggregation: str
+    """Of the courses of a cell, in its bands and in the Nav2 maps."""
     checksums: Mapping[str, Checksum]
     origin_deg: tuple[float, float] | None = None
     """Longitude and latitude where the frame of the Nav2 maps begins; None where it is the CRS's own."""
@@ -193,7 +200,7 @@ def make_cost_map(
         return replace(made, path=url)
     out = Path(out)
     clear_beside(out)
-    grid, origin_m = make_grid(source, cell_size_m), _find_origin_m(source, origin_deg)
+    grid, origin_m = make_grid(source, cell_size_m), find_origin_m(source, origin_deg)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claim_spool(out) as place:
@@ -373,30 +380,11 @@ def _predict_missing(  # noqa: PLR0917
         step(number, len(todo))
 
 
-_FARTHEST_ORIGIN_M = 100_000.0
-"""From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
-
-
-def _find_origin_m(source: MapFile, origin_deg: tuple[float, float] | None) -> tuple[float, float]:
-    """Return a place in the plane of the map's CRS, (0, 0) without one; `UsageError` where it is not near the map."""
-    if origin_deg is None:
-        return 0.0, 0.0
-    x_m, y_m = find_projection(source).forward(np.array([origin_deg]))[0].tolist()
-    x_min, y_min, x_max, y_max = source.grid.bounds_m
-    off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
-    if not off_m <= _FARTHEST_ORIGIN_M:
-        raise UsageError(
-            f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: is {off_m / 1000.0:.0f} km from map {source.name}, expected at most "
-            f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of the origin of the robot's map frame"
-        )
-    return x_m, y_m
-
-
 def _write_files(
     model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
 ) -> CostMapCard:
     """Write all files but the card; return it."""
-    scales = _write(directory, costs, origin_m)
+    scales = _write(directory, _Strips(costs, fit_errors(model.residuals), read_classes(source, costs.grid)), origin_m)
     cells, shares = _compute_shares(costs)
     return CostMapCard(
         key=key,
@@ -406,25 +394,30 @@ def _write_files(
         label_energy=model.label_energy,
         grid=costs.grid,
         courses_deg=tuple(ANGLES_DEG.tolist()),
-        bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course")),
+        bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course", "std")),
         units=_QUANTITIES,
         reasons={str(int(reason)): flag_name(reason) for reason in Reason},
         nav2_scale=scales,
         cells=cells,
         reason_share=shares,
+        aggregation=AGGREGATION,
         barred_by=tuple(flag_name(reason) for reason in Reason if reason & BARRED),
         checksums=compute_checksums(directory),
     )
 
 
-def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
+def _write(directory: Path, strips: _Strips, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
     """Write all files but the card; return the scales of the Nav2 maps."""
-    grid = costs.grid
+    costs, grid = strips.costs, strips.costs.grid
     layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}
     layout["affine"] = (grid.pixel_size_m, 0.0, grid.x_min_m, 0.0, -grid.pixel_size_m, grid.y_max_m)
     for name, unit in _QUANTITIES.items():
-        bands = [*((band, unit) for band in (*_BAND_NAMES, "min", "mean")), ("best course, ccw from grid east", "deg")]
-        strip = partial(_compute_strip, costs, name)
+        bands = [
+            *((band, unit) for band in (*_BAND_NAMES, "min", "mean")),
+            ("best course, ccw from grid east", "deg"),
+            ("std of a metre", unit),
+        ]
+        strip = partial(strips.compute, name)
         write_cog(directory / f"{name}.tif", strip, dtype="float32", nodata=float("nan"), bands=bands, **layout)
     bands = [(band, "bits") for band in (*_BAND_NAMES, "all courses")]
     write_cog(
@@ -432,34 +425,41 @@ def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> d
     )
     layout |= {"dtype": "float32", "nodata": float("nan"), "bands": [("height", "m")]}
     write_cog(directory / "height.tif", lambda first, last: costs.height_m[None, first:last], **layout)
-    scales = {name: _write_nav2(directory / f"{name}.yaml", costs, name, origin_m) for name in ("duration", "energy")}
+    scales = {name: _write_nav2(directory / f"{name}.yaml", strips, name, origin_m) for name in ("duration", "energy")}
     for name, scale in scales.items():
         write_text(directory / f"{name}.qml", make_raster_style(_MEAN_BAND, scale.lowest, scale.highest))
     return scales
 
 
-def _read_values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
-    """Return a quantity of rows, shape (16, rows, cols)."""
-    power, velocity = costs.power_watt[:, first:last], costs.velocity_mps[:, first:last]
-    values = {"power": power, "velocity": velocity}.get(name)
-    if values is None:
-        values = 1.0 / velocity if name == "duration" else power / velocity
-    return np.asarray(values)
+@dataclass(frozen=True, slots=True)
+class _Strips:
+    """Rows of a quantity, from the costs, the errors of the model's predictions and the class of each cell."""
+
+    costs: CostGrid
+    errors: Mapping[str, Errors] | None
+    class_id: NDArray[np.uint8]
+
+    def compute(self, name: str, first: int, last: int) -> Floats32:
+        """Return a quantity of rows, and its minimum, mean, best course and standard deviation, shape (20, rows, cols).
+
+        The last four are over the courses without a reason. The standard deviation is that of a metre, mean over the courses.
+        """
+        power, velocity = self.costs.power_watt[:, first:last], self.costs.velocity_mps[:, first:last]
+        values = {"power": power, "velocity": velocity}.get(name)
+        if values is None:
+            values = 1.0 / velocity if name == "duration" else power / velocity
+        trusted = np.where(self.costs.reasons[:, first:last] == 0, values, np.float32(np.nan))
+        is_known = ~np.isnan(trusted)
+        worth = np.where(is_known, -trusted if name == _GREATEST_IS_BEST else trusted, np.inf)
+        best, least = ANGLES_DEG[worth.argmin(axis=0)], np.where(is_known, trusted, np.inf).min(axis=0)
+        some = is_known.any(axis=0)
+        nothing = np.full(trusted.shape, np.nan)
+        std = nothing if self.errors is None else self.errors[name].compute_std(trusted, self.class_id[first:last])
+        more = [*(np.where(some, band, np.nan) for band in (least, _mean(trusted), best)), _mean(std)]
+        return np.concatenate([values, np.stack(more)]).astype(np.float32)
 
 
-def _compute_strip(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
-    """Return a quantity of rows, and its minimum, mean and best course, shape (19, rows, cols)."""
-    values = _read_values(costs, name, first, last)
-    known = ~np.isnan(values)
-    some = known.any(axis=0)
-    least = np.where(known, values, np.inf).min(axis=0)
-    worth = np.where(known, -values if name == _GREATEST_IS_BEST else values, np.inf)
-    best = ANGLES_DEG[worth.argmin(axis=0)]
-    more = [np.where(some, band, np.nan) for band in (least, _mean(values), best)]
-    return np.concatenate([values, np.stack(more)]).astype(np.float32)
-
-
-def _mean(values: Floats32) -> NDArray[np.float64]:
+def _mean(values: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the mean over the courses that have a value; NaN where none has."""
     known = ~np.isnan(values)
     count = known.sum(axis=0)
@@ -480,20 +480,21 @@ def _iterate_row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
     yield from ((first, min(first + _ROWS_TOGETHER, rows)) for first in range(0, rows, _ROWS_TOGETHER))
 
 
-def _write_nav2(path: Path, costs: CostGrid, name: str, origin_m: tuple[float, float]) -> Nav2Scale:
+def _write_nav2(path: Path, strips: _Strips, name: str, origin_m: tuple[float, float]) -> Nav2Scale:
     """Write the mean over the trusted courses from 0 to `HIGHEST`; return what these two stand for."""
-    means = []
-    for first, last in _iterate_row_strips(costs):
-        trusted = costs.reasons[:, first:last] == 0
-        means.append(_mean(np.where(trusted, _read_values(costs, name, first, last), np.float32(np.nan))))
-    mean = np.concatenate(means)
+    grid = strips.costs.grid
+    mean = np.concatenate(
+        [strips.compute(name, first, last)[_MEAN_BAND - 1] for first, last in _iterate_row_strips(strips.costs)]
+    )
     known = np.isfinite(mean)
     low, high = np.percentile(mean[known], (1.0, 99.0)).tolist() if known.any() else (0.0, 1.0)
     share = (np.where(known, mean, low) - low) / max(high - low, 1e-9)
     cost = np.where(known, np.rint(HIGHEST * np.clip(share, 0.0, 1.0)), LETHAL).astype(np.uint8)
     unit = _QUANTITIES[name]
-    meaning = f"{name} a metre, mean over the courses: 0 is {low:.6g} {unit}, {HIGHEST} is {high:.6g} {unit}, {LETHAL} is not crossed"
-    write_nav2_map(path, cost, costs.grid, origin_m=origin_m, meaning=meaning)
+    meaning = (
+        f"{name} a metre, {AGGREGATION}: 0 is {low:.6g} {unit}, {HIGHEST} is {high:.6g} {unit}, {LETHAL} is not crossed"
+    )
+    write_nav2_map(path, cost, grid, origin_m=origin_m, meaning=meaning)
     return Nav2Scale(low, high)
 
 

@@ -33,7 +33,7 @@ from tcpipe.terrain.sampling import (
     count_corners_on,
     sample_patches,
 )
-from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, list_layers
 
 Floats = NDArray[np.float64]
 
@@ -137,7 +137,7 @@ def check_model(model: CostModel, source: MapReader) -> None:
     """Raise `ModelError` if a map cannot give the model what it was trained on; all differences at once."""
     problems = []
     needed = _make_layout(model).layers
-    there = {**source.layers, **{name: of.layer for name, of in source.banded.items()}}
+    there = list_layers(source, model.patch_m, model.patch_px)
     if missing := [layer for layer in needed if layer not in there]:
         option = f"--{missing[0]}" if missing[0] in LAYERS else f"--layer {missing[0]}=FILE"
         option = "--ortho-bands rgb" if missing[0] in COLOURS else option
@@ -145,12 +145,12 @@ def check_model(model: CostModel, source: MapReader) -> None:
             f"map {source.name}: has no {', '.join(missing)}, which model {model.name} needs; add the map with {option}"
         )
     for name in set(needed) & there.keys() - PAPER_LAYERS.keys():
-        got, wanted = ((of.kind, len(of.bands), of.unit, of.classes) for of in (there[name], model.layers[name]))
-        if got != wanted:
-            described = (f"{of[0]}, {of[1] or 1} bands in {of[2]}" for of in (got, wanted))
-            problems.append(
-                f"map {source.name}: {name} is {' not '.join(described)}, or has other classes: add another raster"
-            )
+        its, wanted = there[name], model.layers[name]
+        if its.signature != wanted.signature:
+            text = f"is {its.signature}, but {wanted.signature} in training"
+            problems.append(f"map {source.name}: {name} {text}; add the raster that the model was trained with")
+        elif its.classes != wanted.classes:
+            problems.append(f"map {source.name}: {name} has other classes than in training; add it with those")
     if "terrain" in needed and "terrain" in source.layers and model.classes != source.classes:
         different = "; ".join(source.classes.differences(model.classes))
         problems.append(

@@ -83,8 +83,33 @@ def find_projection(source: MapReader) -> Projection:
     return find_map_projection(source, "EPSG:4326")
 
 
+_FARTHEST_ORIGIN_M = 100_000.0
+"""From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
+
+
+def find_origin_m(source: MapReader, origin_deg: tuple[float, float] | None) -> tuple[float, float]:
+    """Return a place in the plane of the map's CRS, (0, 0) without one; `UsageError` where it is not near the map."""
+    if origin_deg is None:
+        return 0.0, 0.0
+    x_m, y_m = find_projection(source).forward(np.array([origin_deg]))[0].tolist()
+    x_min, y_min, x_max, y_max = source.grid.bounds_m
+    off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
+    if not off_m <= _FARTHEST_ORIGIN_M:
+        raise UsageError(
+            f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: is {off_m / 1000.0:.0f} km from map {source.name}, expected at most "
+            f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of the origin of the robot's map frame"
+        )
+    return x_m, y_m
+
+
 def compute_path_cost(
-    model: CostModel, source: MapReader, lonlat_deg: Floats, *, where: str, known: Run | None = None
+    model: CostModel,
+    source: MapReader,
+    lonlat_deg: Floats,
+    *,
+    where: str,
+    known: Run | None = None,
+    shortest_m: float | None = None,
 ) -> PathCost:
     """Return what a path costs, by the model as it is or adapted by the metres of a run.
 
@@ -94,14 +119,15 @@ def compute_path_cost(
     lonlat_deg : the path's points, WGS 84, shape (P, 2).
     where : what the path is called in errors.
     known : metres of a run of the robot that is to drive the path.
+    shortest_m : the least length of a path, without it that of a piece.
 
     Raises
     ------
     ModelError, MapError : the map cannot give what the model wants, or cannot be read.
-    PathError : the path is shorter than a piece, or nowhere on the map.
+    PathError : the path is shorter, or nowhere on the map.
     """
     check_model(model, source)
-    pieces = cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where)
+    pieces = cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where, shortest_m=shortest_m)
     frames = pieces.frames(model.chord_m)
     if not count_corners_on(source.grid, compute_footprints(frames, model.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
@@ -113,8 +139,10 @@ def compute_path_cost(
     return _sum_costs(model, source, pieces, said, known)
 
 
-def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
-    """Return the pieces of a path; `PathError` where it is shorter than one."""
+def cut_into_pieces(
+    source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None = None
+) -> Pieces:
+    """Return the pieces of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
     projection = find_projection(source)
     xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
@@ -124,7 +152,7 @@ def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, wh
     if not length_m:
         raise PathError(f"{where}: is one point; expected a path of at least {chord_m:g} m")
     pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)
-    if not pieces.chord_m.size or pieces.chord_m[0] < chord_m * (1.0 - 1e-6):
+    if not pieces.chord_m.size or pieces.chord_m[0] < (shortest_m or chord_m) * (1.0 - 1e-6):
         raise PathError(
             f"{where}: is {length_m * scale:.2f} m long and never {chord_m:g} m from where it starts; "
             f"expected a path of at least {chord_m:g} m"

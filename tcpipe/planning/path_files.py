@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,13 +20,16 @@ from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature,
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.planning.cost_grid import make_survey, read_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, write_pieces
-from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_paths
+from tcpipe.planning.plan import OBJECTIVES, Objective, Plan, PlanTotals, plan_paths
+from tcpipe.planning.search import find_turning
 from tcpipe.store import open_store
 from tcpipe.tables.bounds import Bounds
+from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
 
 
@@ -189,10 +193,16 @@ def _compute_totals(out: Path, key: str) -> TableTotals | None:
 
 _PLAN_VERSION = "1.2"
 
+RISK = 0.95
+"""Probability with which a budget shall suffice, where none is asked for."""
+
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
-    """What is asked: ends as lon, lat [deg], what is to be least, side of a cell [m], and whether unseen ground may be crossed."""
+    """What is asked: ends as lon, lat [deg], what is to be least, side of a cell [m], and whether unseen ground may be crossed.
+
+    ``risk`` is as in `plan_paths`; with ``round_trip`` a way back is planned; ``budget_joule`` is to suffice for both.
+    """
 
     start_deg: tuple[float, float]
     goal_deg: tuple[float, float]
@@ -200,6 +210,8 @@ class PlanRequest:
     cell_size_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
     allow_extrapolation: bool = False
     risk: Annotated[float, Bounds(ge=0.5, le=0.999)] | None = None
+    budget_joule: Annotated[float, Bounds(gt=0)] | None = None
+    round_trip: bool = False
     cost_map: Path | None = None
 
 
@@ -215,6 +227,19 @@ class PlannedPath(PlanTotals):
     """``total`` or ``net``: which energy it is."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanSum:
+    """What the path and the way back take together, and whether a budget suffices."""
+
+    back: PlanTotals | None
+    """Of the way back; None without one."""
+    energy_joule: float
+    energy_interval_joule: tuple[float, float] | None
+    budget_joule: float | None
+    budget_probability: float | None
+    """That the budget suffices; None without a budget, or where some path segment has no cost."""
+
+
 @dataclass(frozen=True, slots=True)
 class PlanOrigin:
     """What a plan's file is made from, and what was found with it."""
@@ -225,11 +250,12 @@ class PlanOrigin:
     order: tuple[Objective, ...]
     """Of ``plans``: the one that was asked for first."""
     picture_sha256: str | None = field(default=None, metadata=LEFT_OUT)
+    together: PlanSum | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
 class PlanFile:
-    """The file of a plan: GeoJSON of one line, and as a foreign member what it is made from (RFC 7946, section 6.1)."""
+    """The file of a plan: GeoJSON of one line and, with a way back, another; as a foreign member what it is made from (RFC 7946, 6.1)."""
 
     features: tuple[LineFeature[PlannedPath], ...]
     tcpipe: PlanOrigin
@@ -246,6 +272,8 @@ class PlanResult:
     status: Literal["done", "unchanged"]
     plans: Mapping[Objective, PlanTotals]
     """By objective, the one that was asked for first."""
+    together: PlanSum | None = None
+    """With a way back or a budget."""
 
     @property
     def lonlat_deg(self) -> NDArray[np.float64]:
@@ -254,24 +282,51 @@ class PlanResult:
 
     @property
     def exit_code(self) -> int:
-        """Return 3 if some of the path that was asked for has no cost, else 0."""
-        return 0 if self.plans[self.objective].complete else 3
+        """Return 3 if some path segment has no cost, or the budget suffices with less than the probability asked for; else 0."""
+        ways = (self.plans[self.objective], *([self.together.back] if self.together and self.together.back else []))
+        return 3 if self._is_budget_too_small or not all(way.complete for way in ways) else 0
+
+    @property
+    def _is_budget_too_small(self) -> bool:
+        probability = None if self.together is None else self.together.budget_probability
+        risk = self.plans[self.objective].risk
+        return probability is not None and risk is not None and probability < risk
 
     def __str__(self) -> str:
         """Return what each path costs and where it is, as plain lines."""
-        lines = [f"least {name}: {format_cost(plan)}" for name, plan in self.plans.items()]
+        lines = [f"least {name}: {format_cost(plan)}{_format_risk(plan)}" for name, plan in self.plans.items()]
+        if self.together is not None:
+            back, budget = self.together.back, self.together.budget_joule
+            lines += [] if back is None else [f"way back: {format_cost(back)}{_format_risk(back)}"]
+            energy = _format_quantity(self.together.energy_joule, self.together.energy_interval_joule, "J")
+            lines += [] if back is None else [f"there and back: {energy}"]
+            if budget is not None and self.together.budget_probability is not None:
+                lines.append(
+                    f"budget of {budget:.0f} J: suffices with probability {self.together.budget_probability:.1%}"
+                )
         lines += format_findings(self._find_doubts())
         same = ": nothing to do: it is made from the same model, map and points" if self.status == "unchanged" else ""
         return clean_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
 
     def _find_doubts(self) -> Iterator[Finding]:
         """Yield what the path segments of the plan show that its cells did not."""
-        asked, path = self.plans[self.objective], Subject("file", self.out.name)
-        yield from find_doubts(asked, path)
-        if not asked.complete:
-            yield make_finding("cells-too-large", path)
-        if asked.negative_steps:
-            yield make_finding("steps-gain-energy", path, step_count=asked.negative_steps)
+        path, together = Subject("file", self.out.name), self.together
+        for asked in (self.plans[self.objective], *([together.back] if together and together.back else [])):
+            yield from find_doubts(asked, path)
+            if not asked.complete:
+                yield make_finding("cells-too-large", path)
+            if asked.negative_steps:
+                yield make_finding("steps-gain-energy", path, step_count=asked.negative_steps)
+        if self._is_budget_too_small:
+            yield make_finding("budget-too-small", path)
+
+
+def _format_risk(plan: PlanTotals) -> str:
+    if plan.risk is None or plan.risk_cost is None or plan.objective == "distance":
+        return ""
+    return (
+        f"; with probability {plan.risk:.1%} at most {plan.risk_cost:.0f} {'J' if plan.objective == 'energy' else 's'}"
+    )
 
 
 def plan(
@@ -302,22 +357,26 @@ def plan(
     made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": drawn}
     key = digest({**made_from, "cost_map": card is not None, "version": _PLAN_VERSION})
     if (found := _read_plans(out, picture, key)) is not None:
-        return PlanResult(request.objective, out, picture, "unchanged", found)
+        return PlanResult(request.objective, out, picture, "unchanged", *found)
     if request.cost_map is None or card is None:
         survey = make_survey(model, source, request.cell_size_m)
     else:
         survey = read_survey(model, source, open_cost_map(request.cost_map, card))
     wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
-    plans = plan_paths(
-        survey, start, goal, wanted, allow_extrapolation=request.allow_extrapolation, risk=request.risk, step=step
+    risk = RISK if request.risk is None and request.budget_joule is not None else request.risk
+    search = partial(plan_paths, survey, allow_extrapolation=request.allow_extrapolation, risk=risk, step=step)
+    plans = search(start, goal, wanted)
+    asked = plans[request.objective]
+    back = search(goal, start, (request.objective,))[request.objective] if request.round_trip else None
+    together = (
+        None if back is None and request.budget_joule is None else _add_up(model, asked, back, request.budget_joule)
     )
-    origin = PlanOrigin(key, {name: found.totals for name, found in plans.items()}, wanted)
+    origin = PlanOrigin(key, {name: found.totals for name, found in plans.items()}, wanted, together=together)
     if picture is not None:
         from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw
 
         draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
         origin = replace(origin, picture_sha256=compute_checksum(picture).sha256)
-    asked = plans[request.objective]
     who = {
         "model": model.name,
         "map": source.name,
@@ -325,9 +384,35 @@ def plan(
         "allow_extrapolation": request.allow_extrapolation,
     }
     who["label_energy"] = model.label_energy
-    path = make_line_feature(asked.lonlat_deg, convert_record(asked.totals, PlannedPath, **who))
-    write_json(out, PlanFile((path,), origin))
-    return PlanResult(request.objective, out, picture, "done", origin.plans)
+    paths = tuple(
+        make_line_feature(way.lonlat_deg, convert_record(way.totals, PlannedPath, **who))
+        for way in (asked, *([back] if back else []))
+    )
+    write_json(out, PlanFile(paths, origin))
+    return PlanResult(request.objective, out, picture, "done", origin.plans, together)
+
+
+def _add_up(model: CostModel, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
+    """Return what a path and the way back take, with the turn between them, and the probability that a budget suffices."""
+    energy, complete = there.totals.energy_joule, there.totals.complete
+    errors = None if there.cost.errors is None else there.cost.errors["energy"]
+    if back is not None:
+        turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+        last, first = (np.diff(way.xy_m, axis=0) for way in (there, back))
+        turn_rad = wrap_to_pi(np.arctan2(*first[0, ::-1]) - np.arctan2(*last[-1, ::-1]))
+        class_id = to_integers(there.cost.pieces, "terrain_class")[-1:].astype(np.uint8)
+        turn = 0.0 if turning is None else float(turning.energy_joule(np.array([turn_rad]), np.zeros(1), class_id)[0])
+        energy, complete = energy + turn + back.totals.energy_joule, complete and back.totals.complete
+        if errors is not None and back.cost.errors is not None:
+            errors = replace(errors, middle=errors.middle + turn) + back.cost.errors["energy"]
+    has_answer = errors is not None and budget_joule is not None and complete
+    return PlanSum(
+        back=None if back is None else back.totals,
+        energy_joule=energy,
+        energy_interval_joule=None if errors is None else errors.interval,
+        budget_joule=budget_joule,
+        budget_probability=errors.compute_probability(budget_joule) if has_answer else None,  # type: ignore[union-attr, arg-type]
+    )
 
 
 def _check_names(out: Path, picture: Path | None) -> None:
@@ -351,7 +436,7 @@ def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
     return card
 
 
-def _read_plans(out: Path, picture: Path | None, key: str) -> dict[Objective, PlanTotals] | None:
+def _read_plans(out: Path, picture: Path | None, key: str) -> tuple[dict[Objective, PlanTotals], PlanSum | None] | None:
     """Return what was found before, if it is made from the same, and whole; else None. `UsageError` for a file that is no plan."""
     if not out.exists():
         return None
@@ -363,4 +448,4 @@ def _read_plans(out: Path, picture: Path | None, key: str) -> dict[Objective, Pl
         return None
     if picture is not None and not (picture.is_file() and compute_checksum(picture).sha256 == about.picture_sha256):
         return None
-    return {name: about.plans[name] for name in about.order}
+    return {name: about.plans[name] for name in about.order}, about.together

@@ -1,4 +1,4 @@
-"""The options of ``tcpipe predict-path``, ``tcpipe plan-path`` and ``tcpipe cost-map``, and of the functions of these names."""
+"""The options of ``tcpipe predict-path``, ``plan-path``, ``cost-map`` and ``route-graph``, and of the functions of these names."""
 
 from __future__ import annotations
 
@@ -11,6 +11,12 @@ from tcpipe.tables.options import CLUSTER, MAP, MODEL, PHYSICS, SPEED, STORE, Op
 
 if TYPE_CHECKING:
     from tcpipe.planning.plan import Objective
+
+
+_ORIGIN = Option(
+    "Origin of the map frame of Nav2, as navsat_transform's datum (default: that of the map's CRS).",
+    ("--origin",), "lonlat",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +81,18 @@ class PlanPathOptions:
             ("--allow-extrapolation",), earlier="--allow-unseen",
         ),
     )  # fmt: skip
+    risk: float | None = option(
+        None,
+        Option(
+            "Minimise what the path does not exceed with this probability (default with --budget: 0.95).",
+            (), Range(0.5, 0.999), "PROBABILITY",
+        ),
+    )  # fmt: skip
+    budget_joule: float | None = option(
+        None,
+        Option("Print the probability that this energy suffices: 300Wh, 500kJ.", ("--budget",), "energy", "ENERGY"),
+    )
+    round_trip: bool = option(False, Option("Plan the way back, too; a budget is for both.", ("--return",)))
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
     store: str | Path = option("tcpipe-store", STORE)
@@ -93,16 +111,27 @@ class CostMapOptions:
     cell_size_m: float = option(
         1.0, Option("Side of a cell.", ("--cell-size",), Range(0.05, 1000.0), "METRES", earlier="--step")
     )
-    origin_deg: tuple[float, float] | None = option(
-        None,
-        Option(
-            "Origin of the frame of the Nav2 maps, as navsat_transform's datum (default: that of the map's CRS).",
-            ("--origin",),
-            "lonlat",
-        ),
-    )
+    origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
     speed_mps: float | None = option(None, SPEED)
     store: str = option("tcpipe-store", STORE)
     cluster: str | None = option(
         None, replace(CLUSTER, about="Dask scheduler whose workers compute it, tcp://host:port (or TCPIPE_CLUSTER).")
     )
+
+
+@dataclass(frozen=True, slots=True)
+class RouteGraphOptions:
+    """Which graph of Nav2's route server gets the costs of which model, on which map."""
+
+    model: str = required(MODEL)
+    _: KW_ONLY
+    graph: str | None = option(
+        None,
+        Option("Graph (GeoJSON, metres); without one, proposed from the runs of the store.", (), "input_file", "FILE"),
+    )
+    out: str = option("route-graph.geojson", Option("Write the graph.", (), "output_file", "FILE"))
+    origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
+    two_way: bool = option(False, Option("Add an edge back for each that has none."))
+    map_name: str | None = option(None, MAP)
+    speed_mps: float | None = option(None, SPEED)
+    store: str = option("tcpipe-store", STORE)

@@ -27,7 +27,7 @@ from tcpipe.terrain.sampling import (
     make_patch_frames,
     sample_patches,
 )
-from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection, list_layers
 
 Shifts = Mapping[str, tuple[float, float, float]]
 """By run: what is added to its positions to find their ground on a map, x and y, and the DRMS of that [m]."""
@@ -166,7 +166,7 @@ def sample_on_maps(
     ------
     TableError, MapError : as `sample_segments`; the maps have not the same layers or classes, or are too far apart.
     """
-    check_same_layers(sources)
+    check_same_layers(sources, config)
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)
     waiting = np.arange(segments.num_rows)
     parts: list[Sampled] = []
@@ -202,37 +202,22 @@ def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader)
     return placed
 
 
-def check_same_layers(sources: Sequence[MapReader]) -> None:
+def check_same_layers(sources: Sequence[MapReader], config: SampleConfig) -> None:
     """Raise `MapError` if the maps have not the same layers and classes: their patches could not be learned from together."""
     first, problems = sources[0], []
-    for other in sources[1:]:
-        its_names, names = ([*source.layers, *source.banded] for source in (other, first))
-        if set(its_names) != set(names):
+    layers, *others = (list_layers(source, config.patch_m, config.patch_px) for source in sources)
+    for other, theirs in zip(sources[1:], others, strict=True):
+        if set(theirs) != set(layers):
             problems.append(
-                f"map {other.name}: has {', '.join(its_names)}, but map {first.name} has {', '.join(names)}; "
+                f"map {other.name}: has {', '.join(theirs)}, but map {first.name} has {', '.join(layers)}; "
                 "maps of one dataset have the same layers"
             )
             continue
-        for name, bands in first.banded.items():
-            got, wanted = (
-                (
-                    len(of.layer.bands),
-                    of.layer.own_px or f"{of.layer.pixel_size_m:.3g} m",
-                    of.layer.unit,
-                    of.layer.stored.name,
-                )
-                for of in (other.banded[name], bands)
-            )
+        for name, layer in layers.items():
+            its = theirs[name]
+            got, wanted = (f"{of.signature}{f', {of.stored}' if of.bands else ''}" for of in (its, layer))
             if got != wanted:
-                problems.append(
-                    f"map {other.name}: {name} has bands, pixel size, unit and type {got}, but {wanted} in map {first.name}"
-                )
-        for name, layer in first.layers.items():
-            its = other.layers[name]
-            if its.kind != layer.kind or its.unit != layer.unit:
-                problems.append(
-                    f"map {other.name}: {name} is {its.kind} [{its.unit}], but {layer.kind} [{layer.unit}] in map {first.name}"
-                )
+                problems.append(f"map {other.name}: {name} is {got}, but {wanted} in map {first.name}")
             elif layer.classes is not None and its.classes is not None and its.classes != layer.classes:
                 different = "; ".join(its.classes.differences(layer.classes))
                 of = "its classes" if name == "terrain" else f"its classes of {name}"

@@ -99,9 +99,17 @@ class Layer:
 
     def at_patch(self, patch_m: float, patch_px: int) -> Layer:
         """Return a layer of several bands with the coarsest patches that keep its resolution; another one as it is."""
-        wanted = min(patch_m / self.pixel_size_m, patch_px) if self.bands else 0.0
-        own_px = next(n for n in range(1, patch_px + 1) if patch_px % n == 0 and n >= wanted - _ROUNDING)
-        return replace(self, own_px=own_px) if self.bands else self
+        if not self.bands:
+            return self
+        wanted = FINE_ENOUGH * min(patch_m / self.pixel_size_m, patch_px)
+        return replace(self, own_px=next(n for n in range(1, patch_px + 1) if patch_px % n == 0 and n >= wanted))
+
+    @property
+    def signature(self) -> str:
+        """What layers of one name have in common wherever patches of them go together, but for classes."""
+        return f"{self.kind} [{self.unit}]" + (
+            f", {len(self.bands)} bands, {self.own_px} px a patch" * bool(self.bands)
+        )
 
     @property
     def nodata(self) -> float:
@@ -121,16 +129,12 @@ class Layer:
         """Return which pixels of the map have data."""
         return np.isfinite(pixels) if self.mapped.kind == "f" else np.asarray(pixels != 0)
 
-    def channel(self, pixels: Pixels) -> NDArray[np.float32]:
-        """Return pixels of patches as a channel of the tensor, in [0, 1]."""
+    @property
+    def channel_of_bytes(self) -> NDArray[np.float32]:
+        """Return what each byte of a layer of bytes becomes in the tensor, in [0, 1], shape (256,)."""
         one = np.float32
-        if self.stored == np.uint8:
-            above = np.maximum(pixels.astype(one) - one(self.low / self.step), one(0.0))
-            return np.asarray(np.minimum(above / one(max((self.high - self.low) / self.step, 1.0)), one(1.0)))
-        scale, offset = self.scaling
-        there = np.equal(pixels, pixels) & (pixels != self.nodata)
-        scaled = np.where(there, pixels, 0).astype(one) * one(scale) + one(offset)
-        return np.where(there, np.clip(scaled, one(0.0), one(1.0)), one(0.0))
+        above = np.maximum(np.arange(256, dtype=one) - one(self.low / self.step), one(0.0))
+        return np.asarray(np.minimum(above / one(max((self.high - self.low) / self.step, 1.0)), one(1.0)))
 
     @property
     def scaling(self) -> tuple[float, float]:
@@ -154,8 +158,8 @@ def find_no_data_value(dtype: np.dtype[np.generic]) -> float:
     return float("nan") if dtype.kind == "f" else 0
 
 
-_ROUNDING = 1e-6
-"""Pixels by which a patch of whole pixels may seem wider."""
+FINE_ENOUGH = 0.95
+"""Share of a layer's resolution that patches keep at least: rounded pixel sizes count as one."""
 
 _BYTE, _STEPS, _FLOAT = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
 

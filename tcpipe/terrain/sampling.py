@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
-from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, group_stacks
+from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import BandReader, MapReader, TilePool, choose_level, group_by_tile, read_window
@@ -37,8 +37,6 @@ def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
 
 _BAND_VALUES = 2_000_000
 """Values of a layer of several bands that are interpolated at once: 8 MB each."""
-
-_WIDER = 1e-6
 
 _MOVED_ROWS = 128
 """Patches moved at once: they stay in the processor's cache on the way."""
@@ -149,35 +147,44 @@ def sample_bands(source: BandReader, frames: PatchFrames, *, patch_m: float, pat
     A patch whose pixels are wider than the layer's is averaged over so many points that none of these is skipped.
     """
     layer, count = source.layer.at_patch(patch_m, patch_px), len(frames.centre_xy_m)
-    parts = max(math.ceil(patch_m / layer.own_px / layer.pixel_size_m - _WIDER), 1)
+    parts = math.ceil(FINE_ENOUGH * patch_m / layer.own_px / layer.pixel_size_m)
     side = layer.own_px * parts
     pixels = map_px_from_patch(frames, source.grid, patch_m=patch_m, patch_px=side)
     out = np.empty((count, *layer.patch_shape(patch_px)), layer.stored)
     together = max(_BAND_VALUES // (len(layer.bands) * side**2), 1)
     row, column = np.mgrid[:side, :side][..., None]
+    beyond = np.array([source.grid.cols, source.grid.rows]) + 1.0
     for group in group_by_tile(source.grid.px_from_xy(frames.centre_xy_m), source):
-        for first in range(0, len(group), together):
-            rows = group[first : first + together]
-            origin, along, down = (pixels[rows, None, None, n : n + 2] for n in (0, 2, 4))
-            found = _interpolate_bands(source, origin + column * along + row * down)
-            cells = found.reshape(len(rows), -1, layer.own_px, parts, layer.own_px, parts)
-            out[rows] = cells.mean(axis=(3, 5))
+        origin, along, down = (pixels[group, None, None, n : n + 2] for n in (0, 2, 4))
+        corners = origin + (side - 1) * (np.arange(2)[:, None, None] * along + np.arange(2)[:, None] * down)
+        corners = np.clip(np.nan_to_num(corners, nan=-2.0), -2.0, beyond).reshape(-1, 2)
+        first, last = np.floor(corners.min(axis=0)).astype(int) - 1, np.ceil(corners.max(axis=0)).astype(int) + 2
+        window = _read_bands(source, *first.tolist(), *last.tolist())
+        for start in range(0, len(group), together):
+            part = slice(start, start + together)
+            px = origin[part] + column * along[part] + row * down[part]
+            found = _interpolate_bands(window, np.clip(np.nan_to_num(px, nan=-2.0), -2.0, beyond) - first)
+            cells = found.reshape(len(found), -1, layer.own_px, parts, layer.own_px, parts)
+            out[group[part]] = cells.mean(axis=(3, 5))
     return out
 
 
-def _interpolate_bands(source: BandReader, px: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return all bands at positions, shape (N, S, S, 2), as (N, bands, S, S); a tap of weight zero need not have data."""
-    low = np.floor(px).astype(np.int64)
-    weight = (px - low).astype(np.float32)
-    high = low + (weight > 0.0)
-    (left, top), (right, bottom) = low.min(axis=(0, 1, 2)).tolist(), high.max(axis=(0, 1, 2)).tolist()
-    limit = source.grid.rows, source.grid.cols
-    window = np.full((bottom - top + 1, right - left + 1, len(source.layer.bands)), np.nan, np.float32)
-    row0, row1, col0, col1 = max(top, 0), min(bottom + 1, limit[0]), max(left, 0), min(right + 1, limit[1])
+def _read_bands(source: BandReader, left: int, top: int, right: int, bottom: int) -> NDArray[np.float32]:
+    """Return a window of a layer that may reach beyond it, where it holds no data, shape (rows, columns, bands)."""
+    window = np.full((bottom - top, right - left, len(source.layer.bands)), np.nan, np.float32)
+    row0, row1 = max(top, 0), min(bottom, source.grid.rows)
+    col0, col1 = max(left, 0), min(right, source.grid.cols)
     if row0 < row1 and col0 < col1:
         there = np.moveaxis(source.read(row0, row1, col0, col1), 0, 2)
         window[row0 - top : row1 - top, col0 - left : col1 - left] = there
-    (x0, y0), (x1, y1) = (np.moveaxis(of - (left, top), 3, 0) for of in (low, high))
+    return window
+
+
+def _interpolate_bands(window: NDArray[np.float32], px: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return all bands at positions in a window, (N, S, S, 2), as (N, bands, S, S); a tap of weight zero need not have data."""
+    low = np.floor(px).astype(np.int64)
+    weight = (px - low).astype(np.float32)
+    (x0, y0), (x1, y1) = (np.moveaxis(of, 3, 0) for of in (low, low + (weight > 0.0)))
     across, along = weight[..., :1], weight[..., 1:]
     upper = window[y0, x0] + across * (window[y0, x1] - window[y0, x0])
     lower = window[y1, x0] + across * (window[y1, x1] - window[y1, x0])

@@ -101,6 +101,12 @@ class MapReader(Protocol):
         """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
 
 
+def list_layers(source: MapReader, patch_m: float, patch_px: int) -> dict[str, Layer]:
+    """Return all layers of a map, those of several bands last, as patches of a size [m] and pixels have them."""
+    banded = {name: of.layer.at_patch(patch_m, patch_px) for name, of in source.banded.items()}
+    return {**source.layers, **banded}
+
+
 def choose_level(source: MapReader, pixel_size_m: float) -> MapReader:
     """Return the map's level whose pixels are nearest below ``pixel_size_m`` [m]: coarse enough not to alias, fine enough to show all."""
     factor = choose_factor(source.factors, source.grid.pixel_size_m, pixel_size_m)
@@ -141,12 +147,9 @@ def read_window(  # noqa: PLR0917
 
 
 class TilePool:
-    """The tiles that are being sampled, side by side in one array for each kind of layer; the least recently used make room.
+    """The tiles that are being sampled, side by side in one array for each kind of layer; the least recently used make room."""
 
-    Of a map of one tile, a layer that is alone of its kind is taken as it is read, without a copy.
-    """
-
-    __slots__ = ("_flat", "_held", "_map", "_stacks", "decoded", "slots", "tile_shape")
+    __slots__ = ("_flat", "_held", "_map", "_stacks", "decoded", "slots")
 
     def __init__(self, source: MapReader) -> None:
         grid, side = source.grid, source.tile_px
@@ -154,8 +157,6 @@ class TilePool:
         self._stacks = group_stacks(source.layers)
         self.slots: NDArray[np.int32] = np.full((-(-grid.rows // side), -(-grid.cols // side)), -1, np.int32)
         """Which of the held tiles is the one in row i and column j; -1 where it is not held."""
-        self.tile_shape = (side, side) if self.slots.size > 1 else (grid.rows, grid.cols)
-        """Rows and columns of a tile."""
         self._held: OrderedDict[tuple[int, int], int] = OrderedDict()
         self._flat: dict[Stack, NDArray[Any]] = {
             stack: np.empty((len(names), 0), STACKS[stack]) for stack, names in self._stacks.items()
@@ -168,7 +169,7 @@ class TilePool:
     def tiles(self) -> Tiles:
         """The held tiles, as the sampling kernel takes them."""
         flat = {str(stack): values.reshape(-1) for stack, values in self._flat.items()}
-        return Tiles(**flat, slots=self.slots, rows=self.tile_shape[0], cols=self.tile_shape[1])
+        return Tiles(**flat, slots=self.slots, rows=self._map.tile_px, cols=self._map.tile_px)
 
     def expect(self, boxes: NDArray[np.int64]) -> None:
         """Have the tiles at hand that any of the boxes touches, as `hold` has them: it is called for parts of them soon."""
@@ -194,30 +195,23 @@ class TilePool:
             self.slots[tile] = slot
 
     def _room(self) -> int:
-        return int(self._flat["relative"].shape[1]) // (self.tile_shape[0] * self.tile_shape[1])
+        return int(self._flat["relative"].shape[1]) // self._map.tile_px**2
 
     def _grow(self, tiles: int) -> None:
         """Make room for so many tiles."""
-        size = tiles * self.tile_shape[0] * self.tile_shape[1]
+        size = tiles * self._map.tile_px**2
         for stack, old in self._flat.items():
             if old.shape[1] < size:
                 self._flat[stack] = np.empty((len(old), size), old.dtype)
                 self._flat[stack][:, : old.shape[1]] = old
 
     def _read(self, tile: tuple[int, int], slot: int) -> None:
-        (high, wide), grid = self.tile_shape, self._map.grid
+        side = self._map.tile_px
         for stack, names in self._stacks.items():
             for row, layer in enumerate(names):
                 self.decoded[layer, *tile] += 1
-                place = self._flat[stack][row, slot * high * wide : (slot + 1) * high * wide]
-                if self.slots.size > 1:
-                    self._map.read_tile(layer, *tile, place.reshape(high, wide))
-                    continue
-                whole = np.ascontiguousarray(self._map.read(layer, 0, grid.rows, 0, grid.cols)).reshape(-1)
-                if len(names) == 1:
-                    self._flat[stack] = whole[None]
-                else:
-                    place[:] = whole
+                place = self._flat[stack][row, slot * side**2 : (slot + 1) * side**2]
+                self._map.read_tile(layer, *tile, place.reshape(side, side))
 
 
 def _list_touched(boxes: NDArray[np.int64], side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:

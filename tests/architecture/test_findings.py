@@ -32,6 +32,7 @@ PRINTERS = {
     "tcpipe/pipeline/report.py",
     "tcpipe/planning/drives.py",
     "tcpipe/planning/path_files.py",
+    "tcpipe/planning/route_graph.py",
 }
 """Modules beside cli/ and report/ that print an answer, or group findings for a page."""
 

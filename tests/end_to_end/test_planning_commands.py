@@ -74,12 +74,53 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
     assert "energy.pgm: has 0 bytes, expected" in _run("verify", "costs", cwd=place, code=1)
 
 
+def test_a_budget_is_for_both_ways_and_comes_with_its_probability(place: Path):
+    plan = ("plan-path", "model", "--from", _FROM, "--to", _TO, "--out", "there.geojson", "--cell-size", "2", "--json")
+    said = json.loads(_run(*plan, "--budget", "1kWh", "--return", "--risk", "0.9", "--quiet", cwd=place))
+    there, together = said["plans"]["energy"], said["together"]
+    assert together["budget_joule"] == 3.6e6
+    assert together["budget_probability"] == pytest.approx(1.0)
+    assert there["risk_cost"] >= there["energy_joule"]
+    assert together["energy_joule"] >= there["energy_joule"] + together["back"]["energy_joule"] - 1e-6
+    ways = [of["geometry"]["coordinates"] for of in json.loads((place / "there.geojson").read_text())["features"]]
+    assert (ways[0][0], ways[0][-1]) == (ways[1][-1], ways[1][0])
+    little = json.loads(_run(*plan, "--budget", f"{0.5 * there['energy_joule']:.0f}J", "--quiet", cwd=place, code=3))
+    assert little["together"]["budget_probability"] < 0.05
+
+
+def test_a_route_graph_gets_the_costs_of_its_edges(place: Path):
+    points = [
+        {"type": "Feature", "properties": {"id": number}, "geometry": {"type": "Point", "coordinates": at}}
+        for number, at in enumerate(([0.0, 0.0], [8.0, 6.0]))
+    ]
+    edge = {"id": 5, "startid": 0, "endid": 1}
+    line = {"type": "LineString", "coordinates": [[0.0, 0.0], [8.0, 6.0]]}
+    features = [*points, {"type": "Feature", "properties": edge, "geometry": line}]
+    (place / "graph.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    command = ("route-graph", "model", "--graph", "graph.geojson", "--out", "costs.geojson", "--origin", _FROM)
+    options = ("--two-way", "--map", "site", "--store", "tcpipe-store", "--json", "--quiet")
+    said = json.loads(_run(*command, *options, cwd=place))
+    assert (said["nodes"], said["edges"], said["one_way_edges"]) == (2, 2, 0)
+    found = json.loads((place / "costs.geojson").read_text())["features"]
+    there, back = (of["properties"]["metadata"] for of in found[2:])
+    assert there["length_m"] == back["length_m"] == pytest.approx(10.0, rel=1e-3)
+    assert there["energy_joule"] != back["energy_joule"]
+    assert there["energy_std_joule"] > 0.0
+    assert "no run with segments on map site" in tcpipe("route-graph", "model", cwd=place, env=_ONE_THREAD).stderr
+    assert "no input for the commanded speed" in tcpipe(*command, "--speed", "1", cwd=place, env=_ONE_THREAD).stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
         (("predict-path", "none", "--path", "path.geojson"), 2, "no such directory"),
         (("predict-path", "model", "--path", "none.geojson"), 2, "no such file"),
         (("predict-path", "model", "--path", "path.geojson", "--out", "pieces.txt"), 2, "ends in .csv"),
+        (
+            ("plan-path", "model", "--from", _FROM, "--to", _TO, "--budget", "300"),
+            2,
+            "expected an energy with its unit",
+        ),
         (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "expected LON,LAT"),
         (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon/lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),

@@ -35,7 +35,7 @@ from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.layers import Layer, join_layers, sort_layers
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.sampling_kernel import compute_morton
-from tcpipe.terrain.tiles import TilePool, choose_level
+from tcpipe.terrain.tiles import TilePool, choose_level, list_layers
 
 logger = logging.getLogger("tcpipe")
 
@@ -203,9 +203,9 @@ def sample_all_segments(
     The results are arrays in files in ``directory``. `TcpipeError` if the map or the segments cannot be used.
     """
     sources = [open_map(*of) for of in maps()]
-    check_same_layers(sources)
-    joined = sort_layers(join_layers([source.all_layers for source in sources]))
-    layers = {name: layer.at_patch(config.patch_m, config.patch_px) for name, layer in joined.items()}
+    check_same_layers(sources, config)
+    found = [list_layers(source, config.patch_m, config.patch_px) for source in sources]
+    layers = sort_layers(join_layers(found))
     spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
     each = spool.sample_bytes
     if len(layers) > len(sources[0].layers):

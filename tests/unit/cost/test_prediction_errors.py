@@ -141,3 +141,24 @@ def test_what_all_labels_have_in_common_adds_up_linearly_along_a_path():
         added = np.sqrt(_width(with_common["energy"], count) ** 2 - _width(without["energy"], count) ** 2)
         assert added == pytest.approx(2.0 * 1.645 * 0.02, rel=0.02)
         assert _width(with_common["duration"], count) == _width(without["duration"], count)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.5])
+def test_a_budget_suffices_as_often_as_its_probability_says_there_and_back(shared):
+    """Drives whose power errs as that of the held-out runs did; the way back is of the same run, so that errors of the run add up."""
+    count, metres = 2000, 150
+    errors = fit_errors(made_residuals(8000, 0.2, shared, seed=1, runs=100))["energy"]
+    predicted, class_id = np.full(metres, 150.0 / 0.8), np.full(metres, 4)
+    total = errors.compute_sum(predicted, class_id) + errors.compute_sum(predicted, class_id)
+    rng = np.random.default_rng(2)
+    level = 0.2 * np.sqrt(shared) * rng.normal(size=count)
+    noise = 0.2 * np.sqrt(1.0 - shared) * rng.normal(size=(count, 2 * metres)).mean(axis=1)
+    taken = 2 * predicted.sum() * (1.0 + level + noise)
+    for probability in (0.2, 0.5, 0.8, 0.95):
+        budget = total.compute_quantile(probability)
+        assert total.compute_probability(budget) == pytest.approx(probability)
+        share = np.mean(taken <= budget)
+        # Without errors of the run, adding the deviations of both ways is careful: no budget is too small.
+        assert share > probability - 0.06 if probability > 0.5 else share < probability + 0.06
+        if shared:
+            assert share == pytest.approx(probability, abs=0.06)

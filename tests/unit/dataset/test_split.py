@@ -206,7 +206,7 @@ def test_batches_that_cannot_be_are_refused_in_a_line(path):
 
 @pytest.mark.parametrize("count", [1, 2, 7, 255])
 def test_every_stored_value_becomes_what_the_layers_say(count):
-    """All bytes of ortho and terrain, all heights, mirrored or not, in one pass or channel by channel: bit for bit the same."""
+    """All bytes of ortho and terrain, all heights, mirrored or not, bit for bit."""
     rng = np.random.default_rng(0)
     pixels = {
         "ortho": np.tile(np.arange(256, dtype=np.uint8), 256).reshape(-1, 16, 16),

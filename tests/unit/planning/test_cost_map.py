@@ -18,6 +18,7 @@ from physics_model import PhysicsModel, energy_joule, power_watt, velocity_mps
 from planning_worlds import plane
 from ruamel.yaml import YAML
 
+from tcpipe.cost.prediction_errors import fit_errors
 from tcpipe.errors import MapError, ModelError, UsageError
 from tcpipe.execution import Outcome
 from tcpipe.formats.bucket_directories import fetch_directory
@@ -77,7 +78,10 @@ def test_every_course_of_every_cell_costs_what_physics_says(made):
 def test_every_tile_is_decoded_once(made):
     source, _ = made
     assert set(source.reads.values()) == {1}
-    assert len(source.reads) == 3 * 16
+    tiles = [
+        of for of in source.reads if of[1] % 64 == 0 and of[2] % 64 == 0
+    ]  # the others are single classes, of cells
+    assert len(tiles) == 3 * 16
 
 
 @pytest.mark.parametrize("strip", [1, 2, 29])
@@ -90,12 +94,12 @@ def test_blocks_hold_every_wanted_cell_once(monkeypatch, strip):
     assert sorted(cells) == np.flatnonzero(wanted).tolist()
 
 
-def test_bands_say_what_they_are_and_the_last_three_sum_up_the_courses(made):
+def test_bands_say_what_they_are_and_the_last_four_sum_up_the_courses(made):
     _, result = made
     with rasterio.open(Path(result.path) / "energy.tif") as dataset:
         assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert dataset.descriptions[:2] == ("course 0.0 deg", "course 26.6 deg")
-        assert dataset.descriptions[16:] == ("min", "mean", "best course, ccw from grid east")
+        assert dataset.descriptions[16:] == ("min", "mean", "best course, ccw from grid east", "std of a metre")
         assert dataset.units[0] == "J/m"
         assert dataset.transform[:6] == (1.0, 0.0, 500_000.0, 0.0, -1.0, 5_200_000.0)
         assert dataset.crs.to_epsg() == 32633
@@ -106,11 +110,33 @@ def test_bands_say_what_they_are_and_the_last_three_sum_up_the_courses(made):
     assert known[16] == known[:16].min()
     assert known[17] == pytest.approx(known[:16].mean(), rel=1e-6)
     assert known[18] == pytest.approx(ANGLES_DEG[known[:16].argmin()], rel=1e-6)
+    errors = fit_errors(MODEL.residuals)["energy"]
+    assert known[19] == pytest.approx(errors.compute_std(known[:16], np.full(16, 4)).mean(), rel=1e-5)
+    assert known[19] == pytest.approx(0.1 * known[17], rel=0.1)  # as its residuals were made
     downhill = np.degrees(np.arctan2(-0.1, -0.2)) % 360.0
     assert abs(known[18] - downhill) < 14.0
     with rasterio.open(Path(result.path) / "velocity.tif") as dataset:
         velocity = dataset.read()[:, 12, 12]
     assert velocity[18] == pytest.approx(ANGLES_DEG[velocity[:16].argmax()])
+
+
+def test_bands_and_nav2_map_sum_up_the_same_courses_and_say_which(tmp_path):
+    """Downhill is steeper than training; the mean, its standard deviation and the Nav2 map leave these courses out."""
+    source = _map(rise_east=0.4)
+    flat = replace(MODEL, training_range=MODEL.training_range | {"slope_rad": (-0.2, 0.5), "relief_m": (0.0, 9.0)})
+    result = make_cost_map(flat, source, tmp_path / "costs", cell_size_m=2.0)
+    with (
+        rasterio.open(tmp_path / "costs" / "energy.tif") as energy,
+        rasterio.open(tmp_path / "costs" / "reasons.tif") as of,
+    ):
+        bands, trusted = energy.read()[:, 5, 5], of.read()[:16, 5, 5] == 0
+    assert 4 < trusted.sum() < 16
+    assert np.isfinite(bands[:16]).all()
+    assert bands[16:18] == pytest.approx([bands[:16][trusted].min(), bands[:16][trusted].mean()])
+    scale, about = result.card.nav2_scale["energy"], (tmp_path / "costs" / "energy.yaml").read_text()
+    assert scale.lowest == pytest.approx(bands[17], rel=1e-3)
+    assert result.card.aggregation == "mean over the courses without a reason"
+    assert result.card.aggregation in about
 
 
 def test_nav2_finds_a_scale_map_with_trees_that_are_lethal(made):

@@ -5,10 +5,10 @@ from dataclasses import replace
 import matplotlib.image
 import numpy as np
 import pytest
-from physics_model import PhysicsModel, energy_joule, velocity_mps
+from physics_model import PhysicsModel, energy_joule, made_residuals, velocity_mps
 from planning_worlds import lonlat, plane
 
-from tcpipe.errors import PathError
+from tcpipe.errors import ModelError, PathError
 from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.picture import draw_plans
 from tcpipe.planning.plan import OBJECTIVES, plan_paths
@@ -86,6 +86,36 @@ def test_no_other_plan_takes_less_of_what_a_plan_is_the_least_of():
         assert [taken[name][at] for at, name in enumerate(OBJECTIVES)] == least
         assert alone.duration_s == plans["time"].totals.duration_s
         assert plans["energy"].totals.finalists >= 4
+
+
+def test_less_risk_is_taken_on_ground_that_the_model_knows_well():
+    """Paved ground (6) needs a little less than grass (4) by prediction, and its held-out samples err by a half."""
+    source = plane(30.0, classes=lambda _, north: np.where(north < 14.0, 6, 4), pixel_size_m=0.2)
+    residuals = made_residuals(800, 0.02, 0.3)
+    residuals["terrain_class"] = np.where(np.arange(800) % 2, 4, 6)
+    error = np.where(np.arange(800) % 2, 1.0, 25.0) * (residuals["power_watt"] / 150.0 - 1.0)
+    residuals["power_watt"] = 150.0 * (1.0 + error)
+    model = replace(FlatModel(), patch_px=8, residuals=residuals)
+    survey = make_survey(model, source, 1.0)
+    survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
+    ends = lonlat(source, (4.0, 12.5), (26.0, 12.5))
+    plain, careful = (plan_paths(survey, *ends, ("energy",), risk=risk)["energy"] for risk in (None, 0.95))
+    assert careful.totals.energy_joule > plain.totals.energy_joule
+    assert careful.totals.risk_cost < plain.cost.errors["energy"].compute_quantile(0.95)
+    assert careful.totals.risk_cost == careful.cost.errors["energy"].compute_quantile(0.95)
+    assert careful.xy_m[:, 1].max() > plain.xy_m[:, 1].max() + 1.0
+    with pytest.raises(ModelError, match="too few held-out samples"):
+        plan_paths(make_survey(replace(model, residuals={}), source, 1.0), *ends, ("energy",), risk=0.9)
+
+
+class FlatModel(PhysicsModel):
+    """Paved ground takes 2 % less than grass."""
+
+    def predict(self, patches, beside=None):
+        velocity = super().predict(patches, beside)[:, 1]
+        middle = patches[:, patches.shape[1] // 2, patches.shape[2] // 2, self.channels.index("terrain")]
+        is_grass = np.rint(middle * (self.classes.count - 1) + 1) == 4
+        return np.stack([np.where(is_grass, 150.0, 147.0), np.ones_like(velocity)], axis=1).astype(np.float32)
 
 
 def test_looking_at_less_of_the_map_finds_the_same_path():

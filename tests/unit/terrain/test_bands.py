@@ -1,11 +1,14 @@
 """Patches of layers with several bands, on a grid of their own: against interpolation point by point."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from map_worlds import random_map
 
+from tcpipe.errors import MapError
+from tcpipe.recipe import SampleConfig
+from tcpipe.stages.sample import check_same_layers
 from tcpipe.terrain.layers import Layer, join_layers, make_banded_layer
 from tcpipe.terrain.sampling import make_patch_frames, sample_patches
 from tcpipe.terrain.target_grid import MapGrid
@@ -67,7 +70,7 @@ def test_pixels_are_what_points_of_the_layer_are(pixel_size_m, patch_px, own_px)
     found = sample_patches(source, where, np.ones(40), patch_m=1.0, patch_px=patch_px)
     assert found.pixels["e"].shape == (40, 3, own_px, own_px)
     assert (found.valid_fraction == 1.0).all()
-    parts = max(int(np.ceil(1.0 / own_px / pixel_size_m - 1e-6)), 1)
+    parts = int(np.ceil(0.95 / own_px / pixel_size_m))
     side = own_px * parts
     for n in range(0, 40, 7):
         fine = np.empty((3, side, side))
@@ -98,7 +101,33 @@ def test_a_patch_without_data_in_one_band_is_not_valid():
     ].all()
 
 
+def test_patches_far_off_the_map_have_no_data():
+    source = random_map()
+    source.banded["e"] = bands_on(source, 0.5)
+    near = frames(source)
+    away = replace(near, centre_xy_m=near.centre_xy_m + np.where(np.arange(40) % 2, 0.0, 3e7)[:, None])
+    found = sample_patches(source, away, np.ones(40), patch_m=1.0, patch_px=40).pixels["e"]
+    assert np.isnan(found[::2]).all()
+    np.testing.assert_array_equal(
+        found[1::2], sample_patches(source, near, np.ones(40), patch_m=1.0, patch_px=40).pixels["e"][1::2]
+    )
+
+
 def test_maps_together_have_the_range_of_both_in_each_band():
     one = make_banded_layer("e", "1", [(0.0, 1.0), (-3.0, 2.0)], "float16", 1.0)
     two = make_banded_layer("e", "1", [(-1.0, 0.5), (0.0, 4.0)], "float16", 1.0)
     assert join_layers([{"e": one}, {"e": two}])["e"].bands == ((-1.0, 1.0), (-3.0, 4.0))
+
+
+def test_maps_whose_bands_make_other_patches_are_refused():
+    one, same, other, fewer = (random_map() for _ in range(4))
+    for source, pixel_size_m, count in ((one, 0.5, 3), (same, 0.4996, 3), (other, 1.0, 3), (fewer, 0.5, 2)):
+        source.banded["e"] = bands_on(source, pixel_size_m, count=count)
+    check_same_layers([one, same], SampleConfig())
+    with pytest.raises(MapError) as error:
+        check_same_layers([one, other, fewer, random_map()], SampleConfig())
+    assert error.value.problems == (
+        "map m: e is continuous [1], 3 bands, 1 px a patch, float32, but continuous [1], 3 bands, 2 px a patch, float32 in map m",
+        "map m: e is continuous [1], 2 bands, 2 px a patch, float32, but continuous [1], 3 bands, 2 px a patch, float32 in map m",
+        "map m: has height, ortho, terrain, but map m has height, ortho, terrain, e; maps of one dataset have the same layers",
+    )
