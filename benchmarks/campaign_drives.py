@@ -180,9 +180,15 @@ def _plain(seed: int, length_m: float) -> tuple[World, DriveSpec]:
     return replace(world, hills=(), waves=()), spec
 
 
+def _slow(seed: int, length_m: float) -> tuple[World, DriveSpec]:
+    """Return a drive over a third of the length with the same robot, at 0.15 m/s."""
+    world, spec = _valley(seed, length_m / 3.0)
+    return world, replace(spec, robot=replace(spec.robot, max_velocity_mps=0.15, max_yaw_rate_radps=0.3))
+
+
 ROUTES: Mapping[str, Callable[[int, float], tuple[World, DriveSpec]]] = {
     "hills": _hills, "straight": _straight, "standing": _standing,
-    "valley": _valley, "plain": _plain, "one turn": _few_turns(1), "two turns": _few_turns(2),
+    "valley": _valley, "plain": _plain, "slow": _slow, "one turn": _few_turns(1), "two turns": _few_turns(2),
 }  # fmt: skip
 """A world and a drive over it by name, from a seed and about how far to drive [m]."""
 

@@ -55,7 +55,7 @@ LIMITS = {
 }
 CLEAN = {1: (0.60, 0.76), 2: (0.91, 0.98)}
 """Shares wanted of the labels of a set of sensors without a fault."""
-LENGTHS = {"plain": 0.002, "valley": 0.005}
+LENGTHS = {"plain": 0.002, "valley": 0.005, "slow": 0.005}
 """By how much the track by wheels alone may differ from their own length."""
 _POWER = ("w", "E")
 """Labels that a current sensor makes."""

@@ -476,6 +476,10 @@ def honest_cells() -> Iterator[HonestCell]:
     """Yield every cell, the clean ones first; none twice."""
     for sensors in _CLEAN_SETS:
         yield HonestCell(sensors, _clean("valley"))
+    for sensors in (*_CLEAN_SETS, "wheels alone"):
+        yield HonestCell(sensors, _clean("slow"), wide=True)
+    coarse = replace(_noise("fixes 1 m over 100 s, slow", 1.0, gauss_markov(1.0, 100.0)), route="slow")
+    yield from (HonestCell(sensors, coarse, wide=True) for sensors in _IN_BOTH)
     for fault, gate in FAULTS:
         yield from (HonestCell(sensors, fault) for sensors in gate)
         beyond = [sensors for sensors in _IN_BOTH if not fault.calibrated and not {*fault.at_fault} & SETS[sensors]]

@@ -6,7 +6,7 @@ A function imports what it needs when it is called: a model of physics needs no 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, overload
 
@@ -27,19 +27,29 @@ def run_train(options: TrainOptions) -> TrainResult:
     ``str`` of the result is what the command prints. Raises `UsageError` where an option is out of its range, or ``out`` holds something
     else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the interrupted training is another one.
     """
+    from tcpipe.formats.recipe_toml import resolve_recipe
     from tcpipe.learning.fitting import FitConfig
-    from tcpipe.learning.training import choose_model_kind
     from tcpipe.learning.training import train as run
     from tcpipe.recipe.checking import from_values
 
-    given = {of.name: value for of in fields(FitConfig) if (value := getattr(options, of.name)) is not None}
+    names = [of.name for of in fields(FitConfig) if of.name != "predictor"]
+    given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features", "layers"})
     if isinstance(layers := given.get("layers"), str):
         given["layers"] = [name.strip() for name in layers.split(",")]
-    given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
-    return run(
-        options.dataset, options.out, config=from_values(FitConfig, given, where="train"), no_resume=options.no_resume
-    )
+    if options.predictor is None:
+        given["model"] = options.model or ("resnet18" if is_network else "auto")
+    config = from_values(FitConfig, {**asdict(resolve_recipe(options.recipe).train), **given}, where="train")
+    result = run(options.dataset, options.out, config=config, no_resume=options.no_resume, predictor=options.predictor)
+    if options.onnx is not None:
+        from tcpipe.formats.atomic import write_atomic_file
+        from tcpipe.learning.models import load_model
+        from tcpipe.learning.onnx_model import export_network
+
+        graph = export_network(load_model(options.out, options.predictor).predictor, str(options.out))
+        with write_atomic_file(Path(options.onnx)) as temporary:
+            temporary.write_bytes(graph)
+    return result
 
 
 train = as_function(TrainOptions, run_train)
@@ -59,6 +69,7 @@ class Evaluate(Protocol):
         baselines: bool = True,
         retrain_ablation: bool = False,
         seed: int = 0,
+        predictor: str | None = None,
     ) -> EvaluationResult: ...
     @overload
     def __call__(
@@ -70,6 +81,7 @@ class Evaluate(Protocol):
         drives: Sequence[str | Path],
         map_name: str | None = None,
         store: str | Path = "tcpipe-store",
+        predictor: str | None = None,
     ) -> DrivesResult: ...
 
 
@@ -91,12 +103,12 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
         runs = None
         if options.drives:
             loaded, source, store = (
-                load_model(model),
+                load_model(model, options.predictor),
                 choose_map(options.store, options.map_name),
                 open_store(options.store),
             )
             runs = [collect_run(loaded, source, find_drive(store, str(log))) for log in options.drives]
-        return evaluate_adaptation(model, dataset, out, options.adapt, runs=runs)
+        return evaluate_adaptation(model, dataset, out, options.adapt, runs=runs, predictor=options.predictor)
     if options.drives:
         from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
@@ -104,7 +116,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
         from tcpipe.planning.drives import evaluate_drives
         from tcpipe.planning.path_files import choose_map
 
-        loaded, data = load_model(model), open_dataset(dataset)
+        loaded, data = load_model(model, options.predictor), open_dataset(dataset)
         check_origin(loaded.card, data, str(model))
         source = choose_map(options.store, options.map_name)
         return evaluate_drives(loaded, data, source, [*map(str, options.drives)], store=options.store, out=out)
@@ -113,7 +125,9 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
     from tcpipe.recipe.checking import from_values
 
     asked = {name: getattr(options, name) for name in ("noise_draws", "baselines", "retrain_ablation", "seed")}
-    return run_evaluation(model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"))
+    return run_evaluation(
+        model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"), predictor=options.predictor
+    )
 
 
 evaluate = cast("Evaluate", as_function(EvaluateOptions, run_evaluate))
@@ -130,7 +144,9 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     from tcpipe.planning.path_files import predict_path as run
 
     source = choose_map(options.store, options.map_name)
-    asked = choose_model(options.model, physics=options.physics_from, speed_mps=options.speed_mps)
+    asked = choose_model(
+        options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
+    )
     known = None
     if options.adapt is not None:
         from tcpipe.planning.drives import collect_run, find_drive
@@ -162,7 +178,9 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
         request = replace(request, cost_map=fetch_directory(options.cost_map))
     source = choose_map(options.store, options.map_name)
     return plan(
-        choose_model(options.model, physics=options.physics_from, speed_mps=options.speed_mps),
+        choose_model(
+            options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
+        ),
         source,
         request,
         out=Path(options.out),

@@ -37,7 +37,7 @@ CARD = ModelCard(
         {"slope_rad": (-0.3, 0.3), "cross_slope_rad": (-0.25, 0.25), "relief_m": (0.0, 0.5)},
     ),
     dataset=TrainedOn("made", "0" * 64, "1.0", {"train": 100}),
-    training=Training("key", FitConfig(), "Adam", {"fitted": 80, "held out": 20}, 3, 2, 0.1, "cpu"),
+    training=Training("key", FitConfig(), "resnet18", "Adam", {"fitted": 80, "held out": 20}, 3, 2, 0.1, "cpu"),
 )
 
 

@@ -170,7 +170,7 @@ def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[CostModel
     from tcpipe.planning.path_files import choose_map
 
     source = choose_map(options.store, options.map_name)
-    return choose_model(options.model, speed_mps=options.speed_mps), source
+    return choose_model(options.model, speed_mps=options.speed_mps, predictor=options.predictor), source
 
 
 @click.command("plan-path")

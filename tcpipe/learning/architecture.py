@@ -67,10 +67,15 @@ def list_weight_forms(shape: Architecture) -> dict[str, ArrayForm]:
     return {name: ("float32", of) for name, of in forms.items()}
 
 
-def check_trainable(shape: Architecture) -> None:
-    """Raise `ModelError` if torch is not installed or the width is no multiple of `BLOCK`."""
+def require_torch() -> None:
+    """Raise `ModelError` if torch is not installed."""
     if find_spec("torch") is None:
         raise ModelError("torch not installed, required to train or use a network: pip install 'tcpipe[train]'")
+
+
+def check_trainable(shape: Architecture) -> None:
+    """Raise `ModelError` if torch is not installed or the width is no multiple of `BLOCK`."""
+    require_torch()
     if shape.width % BLOCK or not BLOCK <= shape.width <= _MOST_WIDTH:
         raise ModelError(
             f"a network of width {shape.width}: expected a multiple of {BLOCK}, from {BLOCK} to {_MOST_WIDTH}"

@@ -45,7 +45,10 @@ CURVES: Mapping[Form, str] = {
 }
 PHYSICS, TREES = "physics", "gradient boosting"
 SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
-BASELINE_OF_KIND = {"boosting": TREES, "physics": PHYSICS}
+BASELINE_OF_KIND: Mapping[str, str] = {str(form): name for form, name in CURVES.items()} | {
+    PHYSICS: PHYSICS,
+    "boosting": TREES,
+}
 """What a baseline is called that would be the model itself."""
 
 _ALIKE = 1.005
@@ -67,7 +70,7 @@ def compare_baselines(
     The baselines are fitted on the training samples of ``data``, centred as the model is, and evaluated on ``sets``, the same samples as
     the predictions ``said`` of the model. ``seed`` is that of the bootstrap.
     """
-    own = BASELINE_OF_KIND.get(ours.card.training.config.model)
+    own = BASELINE_OF_KIND.get(ours.card.training.kind)
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
@@ -86,7 +89,7 @@ def compare_baselines(
 def _select_fitted_samples(train: Split, ours: Model) -> Split:
     """Return the samples that a model of this kind is fitted on: for a network without the fold that stops it."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
-    if not find_kind(ours.card.training.config.model).stops_by_fold:
+    if not find_kind(ours.card.training.kind).stops_by_fold:
         return labelled
     fitted, _ = labelled.fold(ours.card.training.config.fold)
     return fitted if len(fitted) else labelled

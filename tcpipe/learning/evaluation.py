@@ -20,10 +20,9 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import (
+    BASELINE_OF_KIND,
     CURVES,
     OURS,
-    PHYSICS,
-    TREES,
     Trained,
     compare_baselines,
     make_energy_table,
@@ -97,6 +96,7 @@ def evaluate(
     *,
     key: str,
     plant: PlantCosts | None = None,
+    predictor: str | None = None,
 ) -> tuple[Evaluation, pa.Table]:
     """Measure a model on a dataset and return everything that was found, which ``key`` tells from any other evaluation.
 
@@ -109,10 +109,11 @@ def evaluate(
     ------
     ModelError, DatasetError : the model is none or does not fit the dataset, or there is nothing to evaluate on.
     """
-    ours = load_model(model)
+    ours = load_model(model, predictor)
     data = open_dataset(dataset, label=ours.label_energy)
     check_fit(ours.card, data, str(model))
-    fitting, fitted = ours.card.training.config, ours.card.training.samples["fitted"]
+    training = ours.card.training
+    fitting, fitted = replace(training.config, model=training.kind), training.samples["fitted"]
     names = {entry.id: entry.name for entry in ours.classes.classes}
     sets = {name: found for name in SPLITS if len((found := collect_measured(data[name], names)).split)}
     if not sets:
@@ -131,11 +132,11 @@ def evaluate(
             few / fitting.batch_size
         )  # as many steps, not as many epochs
         rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
-        train(dataset, place, config=rules, variant=variant, disposable=True)
-        return load_model(place)
+        train(dataset, place, config=rules, variant=variant, disposable=True, predictor=predictor)
+        return load_model(place, predictor)
 
     ablation = list(_iterate_ablation(ours, sets, config, trained))
-    with_networks = config.baselines and find_kind(fitting.model).stops_by_fold
+    with_networks = config.baselines and find_kind(ours.card.training.kind).stops_by_fold
     energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(
@@ -345,12 +346,12 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
         of = rank_model(found.baselines, subject.name, quantity)
         if of is None:
             continue
-        if of.beats_curves is False:
+        if of.beats_curves is False and found.model.training.kind not in CURVES:
             yield make_finding(f"{name}-no-better-than-curves", subject)
         if quantity == "E" and not of.beats_all:
             best, ratio = of.best.baseline, of.best.rmse_ratio.value or 0.0
-            kind = {TREES: "boosting", PHYSICS: "physics", **dict.fromkeys(CURVES.values(), "boosting")}[best]
-            is_other = of.is_worse and kind != found.model.training.config.model
+            kind = next(kind for kind, baseline in BASELINE_OF_KIND.items() if baseline == best)
+            is_other = of.is_worse and kind != found.model.training.kind
             remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
             names = {"baseline": best}
             yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)

@@ -29,6 +29,7 @@ from tcpipe.learning.evaluation_figures import EvaluatedSamples, select_evaluate
 from tcpipe.learning.evaluation_page import format_leakage, render_evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import load_model, read_model_card
+from tcpipe.learning.own_models import load_own_kind
 from tcpipe.learning.predictions import check_fit, collect_runs
 from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.generations import write_generation
@@ -71,6 +72,7 @@ def run_evaluation(
     *,
     config: EvaluateConfig | None = None,
     plant: PlantCosts | None = None,
+    predictor: str | None = None,
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
 
@@ -84,12 +86,13 @@ def run_evaluation(
     ModelError, DatasetError : as `evaluate`.
     """
     rules = config or EvaluateConfig()
-    key = _make_key(model, dataset, rules, simulated=plant is not None)
+    own = [] if predictor is None else [load_own_kind(predictor).digest]
+    key = _make_key(model, dataset, rules, own, simulated=plant is not None)
     if is_url(out):
         if (known := _read_at_url(str(out), key)) is not None:
             return known
         with write_generation(str(out), JSON) as made:
-            result = run_evaluation(model, dataset, made, config=config, plant=plant)
+            result = run_evaluation(model, dataset, made, config=config, plant=plant, predictor=predictor)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)
     clear(place)
@@ -99,8 +102,8 @@ def run_evaluation(
     ):
         raise UsageError(f"{place}: exists and is no evaluation; it is not changed; give another OUT")
     if not ((place / JSON).is_file() and (place / SAMPLES).is_file()) or read_json(place / JSON).get("key") != key:
-        found, table = evaluate(model, dataset, place, rules, key=key, plant=plant)
-        if _make_key(model, dataset, rules, simulated=plant is not None) != key:
+        found, table = evaluate(model, dataset, place, rules, key=key, plant=plant, predictor=predictor)
+        if _make_key(model, dataset, rules, own, simulated=plant is not None) != key:
             raise StoreError(
                 f"{dataset} or {model}: another call has replaced it in the meantime; run the command again"
             )
@@ -139,7 +142,9 @@ def _read_at_url(url: str, key: str) -> EvaluationResult | None:
     )
 
 
-def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
+def _make_key(
+    model: str | Path, dataset: str | Path, config: EvaluateConfig, own: list[str], *, simulated: bool
+) -> str:
     """Return what tells one evaluation from another."""
     told = [
         seal_document(read_model_card(fetch_directory(model))),
@@ -147,6 +152,7 @@ def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *,
         asdict(config),
         simulated,
         __version__,
+        *own,
     ]
     return digest(told)
 
@@ -187,6 +193,7 @@ def evaluate_adaptation(
     known_m: Sequence[float],
     *,
     runs: Sequence[Run] | None = None,
+    predictor: str | None = None,
 ) -> AdaptationResult:
     """Predict the rest of each run after its first metres are known, and write adaptation.json into the directory ``out``.
 
@@ -199,7 +206,7 @@ def evaluate_adaptation(
     """
     if not known_m or not all(0.0 <= metres < np.inf for metres in known_m):
         raise UsageError(f"adapt: {known_m} are no metres of a run; expected some, as 0, 10, 50")
-    ours = load_model(model)
+    ours = load_model(model, predictor)
     data = open_dataset(dataset, label=ours.label_energy)
     errors = fit_errors(ours.residuals)
     if errors is None:

@@ -124,7 +124,7 @@ def _make_coverage_section(found: Evaluation) -> Section:
         and error.crps is not None
     ]
     training = found.model.training
-    count, is_network = training.samples["held out"], find_kind(training.config.model).stops_by_fold
+    count, is_network = training.samples["held out"], find_kind(training.kind).stops_by_fold
     text = (
         f"Intervals rest on the model's errors on {count} samples of train "
         f"{'that stopped it early, which makes them slightly too small' if is_network else ', each predicted by the other folds'}. The "

@@ -12,48 +12,39 @@ from numpy.typing import NDArray
 from tcpipe.dataset import Split
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.architecture import Loss
+from tcpipe.recipe import TrainConfig
 from tcpipe.tables.bounds import Bounds
 
 Floats = NDArray[np.float32]
 
-ModelKind = Literal["resnet18", "boosting", "physics"]
-"""The paper's network on patches, boosted trees on features of them, or coefficients of physics."""
+ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "residual", "resnet18", "onnx", "own"]
+"""Curves of class and slope, physics, a curve and boosted trees or a small network, the paper's network, a graph, or own code."""
 
 Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 """What every generator of random numbers takes."""
 
 
 @dataclass(frozen=True, slots=True)
-class FitConfig:
-    """How a model is trained; ResNet-18, equation 4 and the learning rate are the paper's.
+class FitConfig(TrainConfig):
+    """How a model is trained: the settings of the recipe, and the choices of a call."""
 
-    A table and physics use only loss, weights, label and beside.
-    """
-
-    model: ModelKind = "resnet18"
+    model: ModelKind | Literal["auto"] = "resnet18"
+    """``auto``: chosen by cross-validation over runs."""
     loss: Loss = "nrmse"
-    epochs: Annotated[int, Bounds(ge=1, le=100_000)] = 100
-    """At most."""
-    patience: Annotated[int, Bounds(ge=1, le=100_000)] = 12
-    """Epochs without a better loss of the held-out fold before training stops."""
-    batch_size: Annotated[int, Bounds(ge=1, le=65_536)] = 64
-    learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 1e-4
     seed: Seed = 0
     """Of weights, shuffles and mirrors."""
     fold: Annotated[int, Bounds(ge=0, le=99)] = 0
     """Of train, for early stopping; the rest is fitted."""
-    mirror: bool = True
-    """Mirror every other patch across its direction of travel."""
     inverse_variance_weights: bool = False
     """Weigh each label by its inverse variance."""
-    width: Annotated[int, Bounds(ge=16, le=512)] = 64
-    """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
     """Energy to train on: total, or net of idle power (less the idle power)."""
     extra_features: bool = False
     """Whether turn and commanded speed of each segment are inputs, too."""
     layers: tuple[str, ...] = ()
     """Channels of the patch; empty: the paper's, as far as the dataset has them."""
+    predictor: str = ""
+    """Digest of the user's own code."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_facts import Description, read_layers
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.predictor import Inputs, find_kind
 from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
 from tcpipe.terrain.classes import ClassTable, TerrainClass
@@ -62,6 +62,8 @@ class Training:
     key: str
     """Hash of dataset and options: the same key, the same training."""
     config: FitConfig
+    kind: ModelKind
+    """Of the model: that of the options, or the one that was chosen."""
     optimizer: str
     samples: Mapping[str, int]
     """``fitted``, and ``held out`` to stop by."""
@@ -142,7 +144,7 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 {%- if includes %}
   The measured power also feeds {{ includes }}.
 {%- endif %}
-- Kind {{ config.model }}: {{ about }}.
+- Kind {{ told.kind }}: {{ about }}.
   Best {{ told.best_epoch }} of {{ told.epochs }} epochs or trees.
   The loss {{ config.loss }} of {{ told.samples["held out"] }} samples that were held out is {{ "%.4f" | format(told.held_out_loss) }}.
 - Trained on {{ told.samples["fitted"] }} samples of {{ dataset.name }}, checksum {{ dataset.sha256 }}.
@@ -170,7 +172,7 @@ def format_readme(card: ModelCard) -> str:
         velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
         extra_features=", ".join(f"{of.name} (usually {of.usual:.3g})" for of in card.extra_features),
         includes="; ".join(map(_escape_markdown, card.label_includes)), robot=card.robot,
-        config=card.training.config, about=find_kind(card.training.config.model).about, told=card.training,
+        config=card.training.config, about=find_kind(card.training.kind).about, told=card.training,
         dataset=dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.training_range.ranges["slope_rad"]),
         relief=" to ".join(f"{value:.2f} m" for value in card.training_range.ranges.get("relief_m", ())) or "not looked at",

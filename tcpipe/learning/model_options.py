@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from tcpipe.tables.options import MAP, MODEL, SEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import MAP, MODEL, PREDICTOR, RECIPE, SEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.dataset.energies import EnergyName
     from tcpipe.learning.architecture import Loss
-    from tcpipe.learning.fitting import ModelKind
+    from tcpipe.recipe import Recipe
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,15 +23,19 @@ class TrainOptions:
     out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
     """The same dataset and options are not trained again."""
     _: KW_ONLY
-    model: ModelKind | None = option(
+    model: Literal["auto", "mean", "linear", "spline", "physics", "boosting", "residual", "resnet18"] | None = option(
         None,
         Option(
-            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and use only --loss, "
-            "--inverse-variance-weights, --label and --extra-features (default: boosting below 20000 samples, "
-            "otherwise, or with an option of the network, resnet18).",
-            kind=("resnet18", "boosting", "physics"),
+            "Curves of class and slope, physics, a curve and boosted trees or a small network on what it leaves, or the paper's network. "
+            "auto: the simplest that predicts other runs as well as the best (default; with an option of the network, resnet18).",
+            kind=("auto", "mean", "linear", "spline", "physics", "boosting", "residual", "resnet18"),
         ),
     )  # fmt: skip
+    predictor: str | None = option(None, PREDICTOR)
+    onnx: str | Path | None = option(
+        None, Option("Also write the network as an ONNX graph.", (), "output_file", "FILE")
+    )
+    recipe: Recipe | str | Path | None = option(None, RECIPE)
     loss: Loss = option(
         "nrmse",
         Option(
@@ -114,6 +118,7 @@ class EvaluateOptions:
         ),
     )  # fmt: skip
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
+    predictor: str | None = option(None, PREDICTOR)
     adapt: Sequence[float] | None = option(
         None,
         Option(

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -32,11 +33,14 @@ from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import EARLIER_SCHEMA_VERSION, KIND, SCHEMA_VERSION, ModelCard, is_current
-from tcpipe.learning.predictor import Predictor, find_kind
+from tcpipe.learning.own_models import OwnKind, load_own_kind, report_errors
+from tcpipe.learning.predictor import Predictor, ask, find_kind
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.terrain.classes import ClassTable
 from tcpipe.terrain.layers import Layer
+
+logger = logging.getLogger("tcpipe")
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -64,13 +68,17 @@ class Model:
     """Of card and weights: what rules its predictions."""
     residuals: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
     """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
+    own: OwnKind | None = None
+    """The user's code."""
 
     @cached_property
     def predictor(self) -> Predictor:
         """Return what predicts: a model of the card's kind, from its arrays; torch is imported for a network."""
         path = self.place / WEIGHTS
+        kind = find_kind(self.card.training.kind) if self.own is None else self.own.kind
         try:
-            return find_kind(self.card.training.config.model).from_arrays(read_arrays(path), self.card.inputs)
+            with report_errors(self.own):
+                return kind.from_arrays(read_arrays(path), self.card.inputs)
         except ModelError as error:
             raise ModelError(
                 *(text if text.startswith(f"{path}: ") else f"{path}: {text}" for text in error.problems)
@@ -163,7 +171,8 @@ class Model:
                 f"{self.name}: patches of shape {patches.shape[1:]}, expected {wanted}: {', '.join(self.channels)}"
             )
         features = fill_unknown(self.card.extra_features, extra_features or empty_extra_features(len(patches)))
-        out = np.asarray(self.predictor.predict(patches, features)).astype(np.float32)
+        with report_errors(self.own):
+            out = ask(self.predictor, patches, features, self.card.outputs).astype(np.float32)
         names = [name.removeprefix("fused_") for name in self.card.outputs]
         if "velocity_mps" in names:
             column = names.index("velocity_mps")
@@ -183,12 +192,13 @@ def write_model(
         write_sealed(directory / CARD, replace(card, checksums=compute_checksums(directory)))
 
 
-def load_model(path: str | Path) -> Model:
+def load_model(path: str | Path, predictor: str | None = None) -> Model:
     """Open a model that ``tcpipe train`` wrote; its network is made when it is first asked.
 
     Parameters
     ----------
     path : its folder, or the URL of one in a bucket.
+    predictor : ``FILE.py[:NAME]`` or entry point of the code of a model that was trained with one; it is run.
 
     Raises
     ------
@@ -202,12 +212,35 @@ def load_model(path: str | Path) -> Model:
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
     if "terrain_class" in residuals:  # of a map without classes: null
         residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(np.float64)).astype(np.uint8)
-    return Model(str(path), card, place, compute_card_checksum(card), residuals)
+    model = Model(str(path), card, place, compute_card_checksum(card), residuals)
+    needs_code = find_kind(card.training.kind) is Predictor
+    return _add_code(model, predictor) if needs_code or predictor is not None else model
 
 
-def choose_model(path: str | Path, *, physics: str | Path | None = None, speed_mps: float | None = None) -> Model:
+def _add_code(model: Model, predictor: str | None) -> Model:
+    """Return the model with the user's code, without which it cannot predict."""
+    training = model.card.training
+    if find_kind(training.kind) is not Predictor:
+        raise UsageError(f"{model.name}: a model of kind {training.kind} needs no code; remove --predictor")
+    if predictor is None:
+        raise UsageError(
+            f"{model.name}: was trained with code of your own, which no folder has: give it with --predictor FILE.py"
+        )
+    own = load_own_kind(predictor)
+    if own.digest != training.config.predictor:
+        logger.warning("%s: has changed since %s was trained with it", predictor, model.name)
+    return replace(model, own=own, checksum=digest([model.checksum, own.digest]))
+
+
+def choose_model(
+    path: str | Path,
+    *,
+    physics: str | Path | None = None,
+    speed_mps: float | None = None,
+    predictor: str | None = None,
+) -> Model:
     """Return a model as `load_model`, with the physics of a dataset and asked for a commanded speed [m/s] where these are given."""
-    model = load_model(path)
+    model = load_model(path, predictor)
     model = model if physics is None else set_physics(model, physics)
     return model if speed_mps is None else set_speed(model, speed_mps)
 
@@ -273,6 +306,7 @@ def _bring_card(found: Mapping[str, Json]) -> dict[str, Json]:
     card = rename_keys(found, EARLIER_MODEL_KEYS)
     config = card["training"]["config"]
     config |= {name: EARLIER_CHOICES.get(config[name], config[name]) for name in ("model", "label")}
+    card["training"]["kind"] = config["model"]
     energy = EARLIER_CHOICES.get(card["label_energy"], card["label_energy"])
     return {**card, "schema_version": SCHEMA_VERSION, "label_energy": energy}
 

@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import Architecture, mean_loss
+from tcpipe.recipe import TrainConfig
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -88,13 +89,7 @@ class ResNet18(nn.Module):
 
     def predict(self, patches: Floats) -> Floats:
         """Return outputs of patches of shape (N, px, px, depth), shape (N, outputs)."""
-        self.eval()
-        out = np.empty((len(patches), self.head.out_features), np.float32)
-        with torch.inference_mode():
-            for first in range(0, len(patches), _TOGETHER):
-                part = slice(first, first + _TOGETHER)
-                out[part] = self(move_to_device(patches[part])).numpy(force=True)
-        return out
+        return _predict(self, patches)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
@@ -115,6 +110,17 @@ class ResNet18(nn.Module):
     def _weights(self) -> dict[str, Any]:
         """Return every weight by torch's name, without the count of batches that no fixed share asks for."""
         return {name: value for name, value in self.state_dict().items() if not name.endswith("num_batches_tracked")}
+
+
+def _predict(network: Any, patches: Floats) -> Floats:
+    """Return outputs of patches of shape (N, px, px, depth), some at a time, shape (N, outputs)."""
+    network.eval()
+    out = np.empty((len(patches), network.head.out_features), np.float32)
+    with torch.inference_mode():
+        for first in range(0, len(patches), _TOGETHER):
+            part = slice(first, first + _TOGETHER)
+            out[part] = network(move_to_device(patches[part])).numpy(force=True)
+    return out
 
 
 def make_resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> ResNet18:
@@ -154,7 +160,9 @@ def move_to_device(patches: Floats) -> Any:
 
 def _pad_images(images: Any, size: int, stride: int) -> Any:
     """Put zeros around images so that a window in steps gives ceil(pixels / stride), as TensorFlow's "same" does."""
-    missing = [max((-(-pixels // stride) - 1) * stride + size - pixels, 0) for pixels in images.shape[:1:-1]]
+    missing = [
+        max((-(-pixels // stride) - 1) * stride + size - pixels, 0) for pixels in map(int, images.shape[:1:-1])
+    ]  # no tensors for ONNX
     return functional.pad(images, [part for pixels in missing for part in (pixels // 2, pixels - pixels // 2)])
 
 
@@ -167,6 +175,57 @@ def _make_weight_name(name: str) -> str:
 def _reorder_axes(value: Any) -> Any:
     """Return a view with the axes that a file has: outputs last."""
     return value.permute(2, 3, 1, 0) if value.ndim == 4 else value.T if value.ndim == 2 else value
+
+
+_FILTERS = 16, 32, 32
+
+
+class SmallNetwork(nn.Module):
+    """Three convolutions with stride 2 and a mean over the patch: patches (N, depth, px, px) to outputs, (N, outputs)."""
+
+    def __init__(self, depth: int, outputs: int, *, seed: int) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            layers: list[nn.Module] = []
+            for filters in _FILTERS:
+                layers += [nn.Conv2d(depth, filters, 3, 2, 1), nn.GroupNorm(4, filters), nn.ReLU()]
+                depth = filters
+            self.layers = nn.Sequential(*layers)
+            self.head = nn.Linear(depth, outputs)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+        self.to(find_device(), memory_format=torch.channels_last)
+
+    def forward(self, images: Any) -> Any:
+        """Return the outputs."""
+        return self.head(self.layers(images).mean((2, 3)))
+
+    def predict(self, patches: Floats) -> Floats:
+        """Return outputs of patches of shape (N, px, px, depth), shape (N, outputs)."""
+        return _predict(self, patches)
+
+    def fit(self, batches: Iterator[tuple[Floats, Floats, Floats]], steps: int, config: TrainConfig) -> None:
+        """Fit outputs to labels by weighted least squares, in so many steps of a batch of patches, labels and weights."""
+        optimizer = torch.optim.AdamW(self.parameters(), weight_decay=config.residual_weight_decay)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.residual_learning_rate, steps)
+        self.train()
+        for _ in range(steps):
+            patches, *others = next(batches)
+            labels, weights = (torch.from_numpy(values).to(find_device()) for values in others)
+            loss = (weights * (self(move_to_device(patches)) - labels) ** 2).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of every weight by torch's name."""
+        return {name: value.numpy(force=True).copy() for name, value in self.state_dict().items()}
+
+    def set_arrays(self, arrays: Arrays) -> None:
+        """Put weights in."""
+        self.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in arrays.items()})
 
 
 _EPSILON = 1e-7

@@ -213,6 +213,52 @@ def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]]) -> tuple[Curves,
     return curves, rest
 
 
+class CurveModel(Predictor):
+    """Power and velocity by class and slope alone."""
+
+    about: ClassVar[str] = "a curve over the slope of each terrain class, nothing else of the patch"
+    optimizer: ClassVar[str] = "least squares"
+    channels: ClassVar[tuple[str, ...]] = ("height",)
+    features: ClassVar[tuple[str, ...] | None] = ()
+    form: ClassVar[Form] = "linear"
+
+    def __init__(self, curves: Curves) -> None:
+        self.curves = curves
+
+    def predict(self, patches: Patches, features: ExtraFeatures) -> Floats:
+        """Return outputs, shape (N, outputs)."""
+        del patches
+        return self.curves.predict(features.slope_rad, features.class_id)
+
+    @classmethod
+    def fit(cls, samples: Samples) -> CurveModel:
+        """Fit a curve of every class."""
+        return cls(fit_curves(cls.form, samples.features.slope_rad, samples.features.class_id, samples.labels))
+
+    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Return the curves by name."""
+        return self.curves.arrays()
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> CurveModel:
+        """Return the model of these curves."""
+        check_arrays(arrays, list_curve_arrays(len(inputs.outputs)))
+        return cls(read_curves(cls.form, arrays)[0])
+
+
+class MeanModel(CurveModel):
+    """A mean of each class."""
+
+    about: ClassVar[str] = "the mean of each terrain class"
+    form: ClassVar[Form] = "mean"
+
+
+class SplineModel(CurveModel):
+    """A natural cubic spline of each class."""
+
+    form: ClassVar[Form] = "spline"
+
+
 def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats) -> Curves:
     """Fit a curve of every class.
 
@@ -232,6 +278,18 @@ def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], label
         mine, off = made[class_id == known], (labels - made @ pooled)[class_id == known]
         own[at] = pooled + np.linalg.pinv(mine.T @ mine + drawn, hermitian=True) @ (mine.T @ off)
     return Curves(form, knots, pooled, classes, own)
+
+
+def cross_fit_curves(
+    slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats, folds: NDArray[np.generic]
+) -> Floats:
+    """Return the predictions of linear curves of the other folds, shape (N, outputs)."""
+    out = np.empty_like(labels)
+    for fold in np.unique(folds):
+        held = folds == fold
+        others = fit_curves("linear", slope_rad[~held], class_id[~held], labels[~held])
+        out[held] = others.predict(slope_rad[held], class_id[held])
+    return out
 
 
 def _evaluate_functions(form: Form, knots_rad: Floats, slope_rad: Floats) -> Floats:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
+from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import compute_loss_factors, mean_loss
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, collect_labels
 
@@ -134,7 +135,7 @@ class Fitted:
 class Predictor(Protocol):
     """A kind of model. Everything but ``predict`` has a default."""
 
-    about: ClassVar[str] = ""
+    about: ClassVar[str] = "code that is given with --predictor"
     """One sentence, for MODEL.md."""
     optimizer: ClassVar[str] = ""
     channels: ClassVar[tuple[str, ...]] = ()
@@ -149,8 +150,9 @@ class Predictor(Protocol):
 
     @classmethod
     def fit(cls, samples: Samples) -> Predictor:
-        """Return the model fitted to samples."""
-        raise NotImplementedError
+        """Return the model fitted to samples; by default it is as it is, and learns nothing."""
+        del samples
+        return cls()
 
     @classmethod
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
@@ -170,11 +172,21 @@ class Predictor(Protocol):
 
 
 KINDS: Mapping[ModelKind, str] = {
+    "mean": "tcpipe.learning.physics_model:MeanModel",
+    "linear": "tcpipe.learning.physics_model:CurveModel",
+    "spline": "tcpipe.learning.physics_model:SplineModel",
     "physics": "tcpipe.learning.physics_model:PhysicsModel",
     "boosting": "tcpipe.learning.table_model:BoostingModel",
+    "residual": "tcpipe.learning.residual_model:ResidualModel",
     "resnet18": "tcpipe.learning.network_model:NetworkModel",
+    "onnx": "tcpipe.learning.onnx_model:OnnxModel",
+    "own": "tcpipe.learning.predictor:Predictor",
 }
 """Class of each kind, simplest first; a class is imported when it is needed."""
+
+
+AUTOMATIC: tuple[ModelKind, ...] = ("mean", "linear", "spline", "physics", "boosting")
+"""Kinds of which one is chosen where none is asked for, simplest first."""
 
 
 def find_kind(name: ModelKind) -> type[Predictor]:
@@ -185,12 +197,18 @@ def find_kind(name: ModelKind) -> type[Predictor]:
 
 def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
     """Fit a model to all samples and, for predictions of each, to the other folds."""
-    began, held_out = time.perf_counter(), np.empty_like(samples.labels)
-    for fold in np.unique(samples.folds):
-        held = samples.folds == fold
-        held_out[held] = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+    began, held_out = time.perf_counter(), cross_predict(kind, samples, samples.folds)
     whole = kind.fit(samples)
     return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, 0.0, len(samples)))
+
+
+def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Floats:
+    """Return predictions of each part of the samples by a model of the others, shape (N, outputs)."""
+    out = np.empty_like(samples.labels)
+    for part in np.unique(parts):
+        held = parts == part
+        out[held] = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+    return out
 
 
 def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
@@ -199,7 +217,15 @@ def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
     together = samples.split.view.form.batch_rows
     for first in range(0, len(samples), together):
         rows = np.arange(first, min(first + together, len(samples)))
-        out[rows] = predictor.predict(samples.split.batch(rows)[0], samples.features.take(rows))
+        out[rows] = ask(predictor, samples.split.batch(rows)[0], samples.features.take(rows), samples.inputs.outputs)
+    return out
+
+
+def ask(predictor: Predictor, patches: Patches, features: ExtraFeatures, outputs: Sequence[str]) -> Labels:
+    """Return predictions of patches, shape (N, outputs); `ModelError` where a model gives something else."""
+    out = np.asarray(predictor.predict(patches, features))
+    if out.shape != (len(patches), len(outputs)):
+        raise ModelError(f"predict returned shape {out.shape}, expected {len(patches)} rows of {', '.join(outputs)}")
     return out
 
 

@@ -33,8 +33,9 @@ from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
 from tcpipe.learning.fitting import TrainingTimes
-from tcpipe.learning.physics_model import Curves, fit_curves, list_curve_arrays, read_curves
+from tcpipe.learning.physics_model import Curves, cross_fit_curves, fit_curves, list_curve_arrays, read_curves
 from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Predictor, Samples
+from tcpipe.recipe import TrainConfig
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
 
 Floats = NDArray[np.float64]
@@ -146,14 +147,15 @@ def _compute_class_shares(values: Patches, class_count: int) -> Floats:
 
 Indices = NDArray[np.uint32]
 
-MOST_ROUNDS = 150
-"""Trees of an output at most; cross-validation over the folds chooses their number."""
 
-_RULES: Mapping[str, str | float | bool] = {
-    "objective": "regression", "metric": "l2", "learning_rate": 0.1, "num_leaves": 15, "max_depth": 6, "min_data_in_leaf": 10,
-    "lambda_l2": 1.0, "use_missing": False, "num_threads": 1, "deterministic": True, "force_col_wise": True, "verbosity": -1,
-}  # fmt: skip
-"""Of LightGBM: small trees; the same bytes on any number of cores; nothing random."""
+def make_rules(config: TrainConfig) -> dict[str, str | float | bool]:
+    """Return the settings of LightGBM: the same bytes on any number of cores; nothing random."""
+    return {
+        "objective": "regression", "metric": "l2", "learning_rate": config.tree_learning_rate, "num_leaves": config.tree_leaves,
+        "max_depth": config.tree_depth, "min_data_in_leaf": config.leaf_samples, "lambda_l2": 1.0, "use_missing": False,
+        "num_threads": 1, "deterministic": True, "force_col_wise": True, "verbosity": -1,
+    }  # fmt: skip
+
 
 _ROWS_TOGETHER = 256
 
@@ -220,7 +222,9 @@ def read_forest(arrays: Mapping[str, NDArray[Any]]) -> Forest:
     return made
 
 
-def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic]) -> tuple[Forest, Floats]:
+def grow(
+    features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic], config: TrainConfig | None = None
+) -> tuple[Forest, Floats]:
     """Fit trees of every output, as many as are best where each fold is predicted by the others; return these predictions, too.
 
     Parameters
@@ -238,23 +242,25 @@ def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.ge
         LightGBM is not installed, or cannot be loaded.
 
     """
+    config = config or TrainConfig()
     lightgbm, held_out, trees = _load_lightgbm(), np.empty(labels.shape), list[tuple[Mapping[str, Any], int]]()
+    rules, most = make_rules(config), config.trees
     for number, (label, weight) in enumerate(zip(labels.T, weights.T, strict=True)):
-        errors, by_fold = np.zeros(MOST_ROUNDS), []
+        errors, by_fold = np.zeros(most), []
         for fold in np.unique(folds):
             held = folds == fold
             told: dict[str, dict[str, list[float]]] = {}
             data = lightgbm.Dataset(features[~held], label[~held], weight=weight[~held])
             other = lightgbm.Dataset(features[held], label[held], weight=weight[held], reference=data)
             by_fold.append((held, lightgbm.train(
-                _RULES, data, MOST_ROUNDS, valid_sets=[other], callbacks=[lightgbm.record_evaluation(told)]
+                rules, data, most, valid_sets=[other], callbacks=[lightgbm.record_evaluation(told)]
             )))  # fmt: skip
             found = told["valid_0"]["l2"]  # ends where nothing can be split
-            errors += weight[held].sum() * np.array(found + found[-1:] * (MOST_ROUNDS - len(found)))
+            errors += weight[held].sum() * np.array(found + found[-1:] * (most - len(found)))
         rounds = int(np.argmin(errors)) + 1
         for held, booster in by_fold:
             held_out[held, number] = booster.predict(features[held], num_iteration=rounds)
-        whole = lightgbm.train(_RULES, lightgbm.Dataset(features, label, weight=weight), rounds)
+        whole = lightgbm.train(rules, lightgbm.Dataset(features, label, weight=weight), rounds)
         trees += [(tree["tree_structure"], number) for tree in whole.dump_model()["tree_info"]]
     return _make_forest(trees), held_out
 
@@ -345,6 +351,7 @@ def fit_table(
     *,
     channels: Sequence[str],
     class_count: int,
+    config: TrainConfig | None = None,
 ) -> tuple[TableModel, Floats]:
     """Fit curves, and trees to the residuals of curves of the other folds; return also each sample's prediction by the other folds.
 
@@ -354,18 +361,15 @@ def fit_table(
     labels, weights : shape (N, outputs).
     folds : of each sample, shape (N,); at least two.
     channels, class_count : what the features are of.
+    config : settings of LightGBM.
 
     Raises
     ------
     ModelError : LightGBM is not installed, or cannot be loaded.
     """
     slope_rad, class_id = find_slope_and_class(features, channels, class_count)
-    told = np.empty_like(labels)
-    for fold in np.unique(folds):
-        held = folds == fold
-        others = fit_curves("linear", slope_rad[~held], class_id[~held], labels[~held])
-        told[held] = others.predict(slope_rad[held], class_id[held])
-    forest, held_out = grow(features, labels - told, weights, folds)
+    told = cross_fit_curves(slope_rad, class_id, labels, folds)
+    forest, held_out = grow(features, labels - told, weights, folds, config)
     curves = fit_curves("linear", slope_rad, class_id, labels)
     return TableModel(curves, forest, tuple(channels), class_count), told + held_out
 
@@ -409,7 +413,12 @@ class BoostingModel(Predictor):
         return cls(table, inputs, Components(**{**_NO_COMPONENTS, **components}))
 
     @classmethod
-    def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
+    def fit(cls, samples: Samples) -> Predictor:
+        """Fit curves and trees."""
+        return cls.fit_folds(samples).predictor
+
+    @classmethod
+    def fit_folds(cls, samples: Samples, job: Job | None = None) -> Fitted:
         """Fit curves and trees, as many trees as are best where each fold is predicted by the others."""
         del job
         began, inputs = time.perf_counter(), samples.inputs
@@ -425,6 +434,7 @@ class BoostingModel(Predictor):
             samples.folds,
             channels=inputs.planes,
             class_count=inputs.class_count,
+            config=samples.config,
         )
         trees = int(np.bincount(table.forest.output).max())
         times = TrainingTimes(time.perf_counter() - began, fed_s, len(samples))

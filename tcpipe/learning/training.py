@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
@@ -17,18 +19,20 @@ from tcpipe.dataset.extra_features import ExtraFeature, available_features, read
 from tcpipe.dataset.tensor import ONE_HOT
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
-from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, has_card
+from tcpipe.formats.bucket_directories import fetch_directory, has_card
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig, ModelKind, Task, TrainingTimes, collect_labels
+from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
 from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, format_readme, is_current
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.learning.network_model import read_checkpoint
+from tcpipe.learning.own_models import load_own_kind, report_errors
 from tcpipe.learning.physics_model import find_idle_power
 from tcpipe.learning.predictor import (
+    AUTOMATIC,
     Fitted,
     Inputs,
     Job,
@@ -36,6 +40,7 @@ from tcpipe.learning.predictor import (
     Predictor,
     Samples,
     compute_held_loss,
+    cross_predict,
     find_held_out,
     find_kind,
 )
@@ -47,9 +52,6 @@ from tcpipe.terrain.sampling import compute_relief_m
 logger = logging.getLogger("tcpipe")
 
 _READ_TOGETHER = 1024
-
-FEW_SAMPLES = 20_000
-"""Training samples below which a network is not expected to do better than a table (ADR-23)."""
 
 _CALLED = {"turn_radpm": "turn (mean_abs_yaw_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
 
@@ -97,14 +99,53 @@ class TrainResult:
         )
 
 
-def choose_model_kind(dataset: str | Path) -> ModelKind:
-    """Choose and log the kind of model that suits the number of training samples."""
-    count = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
-    kind: ModelKind = "boosting" if count < FEW_SAMPLES else "resnet18"
-    than, other = ("fewer than", "resnet18") if kind == "boosting" else ("not fewer than", "boosting")
-    message = "%d training samples, %s %d: tcpipe trains a model of kind %s; to train the other kind: --model %s"
-    logger.info(message, count, than, FEW_SAMPLES, kind, other)
-    return kind
+_MOST_FOLDS, _FEWEST_RUNS = 5, 5
+"""Parts of the runs that are predicted by the others; runs below which their folds are what errs alike."""
+
+
+def choose_kind(data: Dataset, config: FitConfig, variant: Variant) -> ModelKind:
+    """Return the simplest kind that predicts other runs as well as the best one, within a standard error of the difference (ADR-23).
+
+    Each part of the runs is predicted by models of the others; of a single run, each fold. The loss is the squared error of time and of
+    energy, each over its variance.
+    """
+    split = make_training_task(data, config.fold, variant).train
+    runs, folds = (np.unique(split.column(name), return_inverse=True)[1] for name in ("run_id", "fold"))
+    part = runs % _MOST_FOLDS if runs.any() else folds
+    clusters = runs if runs.max() + 1 >= _FEWEST_RUNS else runs * (folds.max() + 1) + folds
+    losses: dict[ModelKind, Array] = {}
+    for name in AUTOMATIC:
+        kind = find_kind(name)
+        samples = make_samples(make_training_task(data, config.fold, variant, kind), config, data, kind)
+        try:
+            losses[name] = _compute_losses(samples, cross_predict(kind, samples, part))
+        except ModelError as error:
+            logger.info("%s is not compared: %s", name, error.problems[0])
+    best = min(losses, key=lambda name: float(losses[name].mean()))
+    chosen = next(name for name, loss in losses.items() if is_within_error(loss - losses[best], clusters))
+    figures = ", ".join(f"{name} {loss.mean() / 2.0:.3f}" for name, loss in losses.items())
+    logger.info(
+        "%s: chooses %s, the simplest within one standard error of the best (%s). Unexplained share of the variance of T and E, "
+        "predicted by other runs: %s. To choose another: --model", data.path, chosen, best, figures,
+    )  # fmt: skip
+    return chosen
+
+
+def _compute_losses(samples: Samples, predicted: Array) -> Array:
+    """Return the squared errors of T and E over their variances, shape (N,)."""
+    if len(samples.inputs.outputs) == 1:
+        return np.asarray(np.square((predicted - samples.labels) / samples.labels.std())[:, 0])
+    said = compute_costs(predicted[:, 0], np.maximum(predicted[:, 1], LEAST_VELOCITY_MPS), 1.0)
+    true = compute_costs(samples.labels[:, 0], samples.labels[:, 1], 1.0)
+    losses = [np.square((said[of] - true[of]) / max(float(true[of].std()), 1e-9)) for of in ("T", "E")]
+    return np.asarray(np.sum(losses, axis=0))
+
+
+def is_within_error(difference: Array, clusters: NDArray[np.int64]) -> bool:
+    """Return whether the mean of differences is no more than its standard error, whose clusters err alike."""
+    sums = np.bincount(clusters, difference - difference.mean())
+    count = int(np.unique(clusters).size)
+    return bool(difference.mean() <= np.sqrt(np.square(sums).sum() * count / max(count - 1, 1)) / difference.size)
 
 
 def train(
@@ -115,6 +156,7 @@ def train(
     variant: Variant | None = None,
     no_resume: bool = False,
     disposable: bool = False,
+    predictor: str | None = None,
 ) -> TrainResult:
     """Train a model on a dataset and write the model folder ``out``, whole or not at all.
 
@@ -126,6 +168,7 @@ def train(
     config : the options.
     variant : what another network than the paper's is trained on.
     no_resume : ignore an earlier state.
+    predictor : code of the user, ``FILE.py[:NAME]`` or an entry point, that is fitted instead of a shipped kind.
     disposable : replace a state that is damaged or of another training, with a warning; otherwise such a state is an error.
 
     Raises
@@ -133,22 +176,14 @@ def train(
     DatasetError, ModelError, UsageError : the dataset has no samples or no weights, or ``out`` or the state is of something else.
     """
     rules, other = config or FitConfig(), variant or Variant()
+    own = None if predictor is None else load_own_kind(predictor)
+    rules = rules if own is None else replace(rules, model=own.model, predictor=own.digest)
     data = open_dataset(dataset, label=rules.label)
-    kind = find_kind(rules.model)
-    if kind.channels and rules.layers:
-        raise UsageError(
-            f"--layers: a model of kind {rules.model} takes the slope and class of a metre, no patch; remove it"
-        )
-    other = replace(other, channels=kind.channels or other.channels or rules.layers)
-    if kind.channels:
-        logger.info(
-            "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, rules.model
-        )
-    elif variant is None:
-        _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
+    other = replace(other, channels=other.channels or rules.layers)
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
-        return _train_into_bucket(dataset, str(out).rstrip("/"), key, rules, other)
+        again = partial(train, dataset, config=rules, variant=other, predictor=predictor)
+        return _train_into_bucket(str(out).rstrip("/"), key, again)
     place = Path(out)
     clear_beside(place)
     checkpoint = _find_checkpoint_path(place)
@@ -156,35 +191,47 @@ def train(
         (known := _read_known_card(place)) is not None
         and known.training.key == key
         and not no_resume
-        and _is_whole(place)
+        and _is_whole(place, predictor)
     ):
         _remove_finished_state(checkpoint, key)
         return _make_result(place, "unchanged", known.training, TrainingTimes())
-    task = make_training_task(data, rules.fold, other)
+    name = choose_kind(data, rules, other) if rules.model == "auto" else rules.model
+    kind = find_kind(name) if own is None else own.kind
+    if kind.channels and rules.layers and rules.model != "auto":
+        raise UsageError(f"--layers: a model of kind {name} takes the slope and class of a metre, no patch; remove it")
+    if kind.channels:
+        logger.info("%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
+    elif variant is None:
+        _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
+    task = make_training_task(data, rules.fold, other, kind)
     _reject_other_files(place)
     if rules.inverse_variance_weights and not other.energy_only:
         _require_deviations(task, data)
     if no_resume or (disposable and checkpoint.exists() and not _can_continue(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
     samples = make_samples(task, rules, data, kind)
-    fitted = kind.fit_folds(samples, Job(str(place), key, checkpoint))
-    card = _make_card(data, task, samples, fitted, key)
+    with report_errors(own):
+        fitted = kind.fit_folds(samples, Job(str(place), key, checkpoint))
+        weights = {name: np.asarray(array) for name, array in kind.to_arrays(fitted.predictor).items()}
+    if own is not None and (missing := int((~find_held_out(fitted.held_out)).sum())):
+        raise ModelError(f"--predictor {predictor}: no finite prediction of {missing} of {len(samples)} samples")
+    card = _make_card(data, samples, fitted, key, name)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.history)
     write_model(
-        place, card=card, weights=fitted.predictor.to_arrays(), residuals=_make_residuals_table(samples, fitted.held_out),
+        place, card=card, weights=weights, residuals=_make_residuals_table(samples, fitted.held_out),
         history="epoch,loss,held_out_loss\n" + history, readme=format_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
     return _make_result(place, "done", card.training, fitted.training_times_s)
 
 
-def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig, other: Variant) -> TrainResult:
+def _train_into_bucket(url: str, key: str, run: Callable[[Path], TrainResult]) -> TrainResult:
     """Train on this machine, and put the model to a URL."""
     known = read_model_card(fetch_directory(url)) if has_card(url) else None
     if known is not None and known.training.key == key:
         return _make_result(url, "unchanged", known.training, TrainingTimes())
     with write_generation(url, CARD) as place:
-        result = train(dataset, place, config=rules, variant=other)
+        result = run(place)
     return replace(result, path=url)
 
 
@@ -207,8 +254,8 @@ def compute_dataset_checksum(card: DatasetCard) -> str:
     return digest(card.checksums)
 
 
-def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
-    """Return labelled samples of train to fit, and the fold of train that stops the fitting.
+def make_training_task(data: Dataset, fold: int, variant: Variant, kind: type[Predictor] = Predictor) -> Task:
+    """Return labelled samples of train to fit a kind of model to, and the fold of train that stops the fitting.
 
     Raises
     ------
@@ -222,8 +269,8 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     if variant.classes:
         wanted &= np.isin(train.column("terrain_class"), variant.classes)
     train = train.take(wanted)
-    if variant.channels:
-        train = train.with_channels(*variant.channels)
+    if channels := kind.channels or variant.channels:
+        train = train.with_channels(*channels)
     if not len(train):
         raise DatasetError(
             f"{data.path}: no labelled samples in split train; check that its region (--split) contains runs"
@@ -339,9 +386,9 @@ def _remove_finished_state(checkpoint: Path, key: str) -> None:
         checkpoint.unlink()
 
 
-def _is_whole(place: Path) -> bool:
+def _is_whole(place: Path, predictor: str | None) -> bool:
     try:
-        load_model(place)
+        load_model(place, predictor)
     except ModelError:
         return False
     return True
@@ -358,22 +405,22 @@ def _require_deviations(task: Task, data: Dataset) -> None:
 
 def _make_result(place: Path | str, status: str, training: Training, times: TrainingTimes) -> TrainResult:
     return TrainResult(
-        path=str(place), status=status, model=training.config.model, samples=training.samples, epochs=training.epochs,
+        path=str(place), status=status, model=training.kind, samples=training.samples, epochs=training.epochs,
         best_epoch=training.best_epoch, held_out_loss=training.held_out_loss, device=training.device, training_times_s=times,
         feeding_share=times.feeding_share,
     )  # fmt: skip
 
 
-def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key: str) -> ModelCard:
+def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: ModelKind) -> ModelCard:
     card, config, inputs = data.card, samples.config, samples.inputs
-    kind, is_held = type(fitted.predictor), find_held_out(fitted.held_out)
-    used, held = task.fit if kind.stops_by_fold else task.train, samples.take(is_held)
+    is_held = find_held_out(fitted.held_out)
+    used, held = samples.split if is_held.all() else samples.split.take(~is_held), samples.take(is_held)
     return ModelCard(
         architecture=Architecture(
             inputs.patch_px,
             len(inputs.planes),
             len(inputs.outputs),
-            config.width if kind.stops_by_fold else 0,
+            0 if is_held.all() else config.width,
             len(inputs.extra_features),
         ),
         channels=inputs.channels,
@@ -397,7 +444,8 @@ def _make_card(data: Dataset, task: Task, samples: Samples, fitted: Fitted, key:
         training=Training(
             key=key,
             config=config,
-            optimizer=kind.optimizer,
+            kind=kind,
+            optimizer=getattr(fitted.predictor, "optimizer", ""),
             samples={"fitted": len(used), "held out": len(held)},
             epochs=fitted.epochs,
             best_epoch=fitted.best_epoch,

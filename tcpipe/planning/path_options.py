@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.options import CLUSTER, MAP, MODEL, PHYSICS, SPEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import CLUSTER, MAP, MODEL, PHYSICS, PREDICTOR, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.planning.plan import Objective
@@ -32,6 +32,7 @@ class PredictPathOptions:
     )
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     adapt: str | Path | None = option(
         None,
         Option(
@@ -95,6 +96,7 @@ class PlanPathOptions:
     round_trip: bool = option(False, Option("Plan the way back, too; a budget is for both.", ("--return",)))
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     store: str | Path = option("tcpipe-store", STORE)
     on_step: Callable[[int, int], None] | None = None
     """Called with how many blocks of how many are done, in each round of the search."""
@@ -113,6 +115,7 @@ class CostMapOptions:
     )
     origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     store: str = option("tcpipe-store", STORE)
     cluster: str | None = option(
         None, replace(CLUSTER, about="Dask scheduler whose workers compute it, tcp://host:port (or TCPIPE_CLUSTER).")
@@ -134,4 +137,5 @@ class RouteGraphOptions:
     two_way: bool = option(False, Option("Add an edge back for each that has none."))
     map_name: str | None = option(None, MAP)
     speed_mps: float | None = option(None, SPEED)
+    predictor: str | None = option(None, PREDICTOR)
     store: str = option("tcpipe-store", STORE)

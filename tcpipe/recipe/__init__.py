@@ -16,6 +16,7 @@ from tcpipe.recipe.sections import (
     SplitConfig,
     TableMapping,
     TimeWindow,
+    TrainConfig,
 )
 
 __all__ = [
@@ -34,4 +35,5 @@ __all__ = [
     "SplitConfig",
     "TableMapping",
     "TimeWindow",
+    "TrainConfig",
 ]

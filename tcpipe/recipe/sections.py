@@ -325,6 +325,43 @@ class CovariateConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class TrainConfig:
+    """Settings of `tcpipe train`; its options override them."""
+
+    epochs: Annotated[int, Bounds(ge=1, le=100_000)] = 100
+    """ResNet-18: most epochs."""
+    patience: Annotated[int, Bounds(ge=1, le=100_000)] = 12
+    """ResNet-18: epochs without a better held-out loss."""
+    batch_size: Annotated[int, Bounds(ge=1, le=65_536)] = 64
+    """ResNet-18."""
+    learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 1e-4
+    """ResNet-18."""
+    width: Annotated[int, Bounds(ge=16, le=512)] = 64
+    """ResNet-18: filters of the first stage, a multiple of 16."""
+    mirror: bool = True
+    """Networks: mirror every other patch."""
+    trees: Annotated[int, Bounds(ge=1, le=10_000)] = 150
+    """Boosting: most trees of an output."""
+    tree_learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 0.1
+    """Boosting (LightGBM)."""
+    tree_leaves: Annotated[int, Bounds(ge=2, le=4096)] = 15
+    """Boosting: num_leaves."""
+    tree_depth: Annotated[int, Bounds(ge=1, le=63)] = 6
+    """Boosting: max_depth."""
+    leaf_samples: Annotated[int, Bounds(ge=1, le=1_000_000)] = 10
+    """Boosting: min_data_in_leaf."""
+    residual_passes: Annotated[int, Bounds(ge=1, le=10_000)] = 30
+    """Residual network: passes over the samples (300 to 2400 steps)."""
+    residual_learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 3e-3
+    """Residual network (AdamW)."""
+    residual_weight_decay: Annotated[float, Bounds(ge=0, le=1)] = 1e-2
+    """Residual network (AdamW)."""
+
+    def __post_init__(self) -> None:
+        validate_fields(self, "train")
+
+
+@dataclass(frozen=True, slots=True)
 class DatasetConfig:
     """Description of the dataset."""
 
@@ -413,6 +450,7 @@ class Recipe:
     split: SplitConfig = field(default_factory=SplitConfig)
     covariates: CovariateConfig = field(default_factory=CovariateConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    train: TrainConfig = field(default_factory=TrainConfig, metadata=LEFT_OUT)
     robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
     """Your own robot profiles by name; a profile with a built-in name replaces the built-in one."""
     power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)

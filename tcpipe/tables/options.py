@@ -72,6 +72,7 @@ SPEED = Option(
     Range(0.0, 100.0, is_open=True),
     "MPS",
 )
+PREDICTOR = Option("Run your own model: FILE.py[:NAME] or entry point.", metavar="CODE")
 DRY_RUN = Option("Say what would be done, and what it would take; do nothing.")
 SEED = Range(0, 2**32 - 1)
 """What every generator of random numbers takes."""

@@ -73,7 +73,7 @@ from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import Recipe, TrainConfig
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 from tcpipe.splits.assignment import SPLITS
@@ -303,7 +303,7 @@ def _merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, se
         raise RecipeError(
             'recipe: split.holdout is "tag"; expected split.holdout_tag too, for example "season" (--holdout tag:season)'
         )
-    return replace(recipe, split=rules)
+    return replace(recipe, split=rules, train=TrainConfig())  # how models are trained is no part of a dataset
 
 
 def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:

@@ -8,7 +8,6 @@ from made_models import CARD, made_comparison
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.learning.baselines import SIMPLEST_FIRST, _group_samples, compare_baselines, describe_ratios, rank_model
-from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Ratio, compute_costs
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictions import Predicted, collect_measured, make_residuals
@@ -31,7 +30,7 @@ def said_by(sets, factor=1.0):
 
 
 def model_of(kind="resnet18"):
-    own = replace(CARD, training=replace(CARD.training, config=FitConfig(model=kind)))
+    own = replace(CARD, training=replace(CARD.training, kind=kind))
     return Model("made", own, None, "0")
 
 

@@ -87,3 +87,19 @@ def test_it_is_evaluated_without_networks(trained, dataset, tmp_path):
     found, _ = evaluate(trained[0], dataset, tmp_path / "evaluation", EvaluateConfig(noise_draws=1), key="key")
     assert list(found.energy) == ["ours"]
     assert not (tmp_path / "evaluation").exists()
+
+
+def test_settings_of_the_recipe_rule_the_trees_and_options_of_the_command_the_network(dataset, tmp_path):
+    (tmp_path / "own.toml").write_text("[train]\ntrees = 3\ntree_leaves = 2\nepochs = 7\n")
+    done = tcpipe(
+        "train", dataset, "model", "--model", "boosting", "--recipe", "own.toml", "--epochs", "9", cwd=tmp_path
+    )
+    assert done.returncode == 0
+    model = load_model(tmp_path / "model")
+    config, forest = model.card.training.config, model.predictor.table.forest
+    assert (config.trees, config.tree_leaves, config.epochs) == (3, 2, 9)
+    assert 1 <= np.bincount(forest.output).max() <= 3
+    assert forest.depth.max() == 1
+    (tmp_path / "own.toml").write_text("[train]\ntrees = 0\n")
+    done = tcpipe("train", dataset, "other", "--recipe", "own.toml", cwd=tmp_path)
+    assert "own.toml: train.trees is 0; expected a whole number from 1 to 10000" in done.stderr

@@ -13,6 +13,7 @@ from tcpipe.learning.table_model import (
     fit_components,
     fit_table,
 )
+from tcpipe.recipe import TrainConfig
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
@@ -56,7 +57,7 @@ def test_a_mirror_changes_nothing():
     assert compute_patch_features(patches[:0], **rules).shape == (0, 16)
 
 
-RULES = {**forest._RULES}
+RULES = forest.make_rules(TrainConfig())
 
 
 def _drawn(count, seed=0):

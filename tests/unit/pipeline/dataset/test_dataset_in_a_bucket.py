@@ -16,7 +16,6 @@ import tcpipe
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket_directories import GENERATIONS
 from tcpipe.formats.place import open_place
-from tcpipe.learning.training import choose_model_kind
 from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
@@ -226,7 +225,6 @@ def test_commands_look_at_a_dataset_in_a_bucket(made, bucket):
     assert verify(URL).problems == (f"{URL}/stray: is no file of this dataset",)
     assert inspect(URL, recipe=Recipe()).samples == inspect(made / "zarr", recipe=Recipe()).samples
     assert inspect(URL, recipe=Recipe()).path == URL
-    assert choose_model_kind(URL) == "boosting"
     assert diff(made / "zarr", URL).same
     sample = tcpipe.open_dataset(URL)["train"].samples["sample_id"][0].as_py()
     assert explain(sample, dataset=URL, store=made / "store") == explain(

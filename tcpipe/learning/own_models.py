@@ -1,0 +1,136 @@
+"""Models of the user's own code, loaded only where a command names them: a class or a function in a file, or an entry point.
+
+A folder of a model never names code; it has arrays, and the digest of the code that made them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import logging
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+from tcpipe.errors import ModelError, TcpipeError, UsageError
+from tcpipe.learning.fitting import ModelKind
+from tcpipe.learning.onnx_model import OnnxModel
+from tcpipe.learning.predictor import Predictor
+
+logger = logging.getLogger("tcpipe")
+
+GROUP = "tcpipe.predictors"
+"""Group of entry points of packages that bring models."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnKind:
+    """A kind of model of the user's own code."""
+
+    source: str
+    """As the user gave it."""
+    digest: str
+    """Of the file's bytes; of a package its name and version."""
+    kind: type[Predictor]
+    model: ModelKind = "own"
+
+
+def load_own_kind(source: str) -> OwnKind:
+    """Return the kind of model that ``FILE.py``, ``FILE.py:NAME`` or the name of an entry point stands for; this runs its code.
+
+    ``FILE.onnx`` is a graph, which is no code.
+
+    Raises
+    ------
+    UsageError : there is no such file, entry point or name.
+    ModelError : the code fails.
+    """
+    if source.endswith(".onnx"):
+        data = _read(source, Path(source))
+        kind = type("Graph", (OnnxModel,), {"graph": data})
+        return OwnKind(source, hashlib.sha256(data).hexdigest(), kind, "onnx")
+    path, name = source, ""
+    if not source.endswith(".py") and ".py:" in source:
+        path, _, name = source.rpartition(":")
+    if path.endswith(".py"):
+        return _load_file(source, Path(path), name)
+    points = {point.name: point for point in entry_points(group=GROUP)}
+    if source not in points:
+        found = ", ".join(sorted(points)) or "none"
+        raise UsageError(
+            f"--predictor {source}: no such entry point of group {GROUP} (there are: {found}); give one, or FILE.py[:NAME]"
+        )
+    point = points[source]
+    with report_errors(source):
+        found = point.load()
+    digest = f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.value
+    return OwnKind(source, digest, _make_kind(found, source))
+
+
+def _read(source: str, path: Path) -> bytes:
+    if not path.is_file():
+        raise UsageError(f"--predictor {source}: there is no file {path}")
+    return path.read_bytes()
+
+
+def _load_file(source: str, path: Path, name: str) -> OwnKind:
+    digest = hashlib.sha256(_read(source, path)).hexdigest()
+    spec = spec_from_file_location(f"tcpipe_own_{digest[:16]}", path.resolve())
+    if spec is None or spec.loader is None:
+        raise UsageError(f"--predictor {source}: not a Python file")
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look for their module there
+    with report_errors(source):
+        spec.loader.exec_module(module)
+    own = {key: of for key, of in vars(module).items() if getattr(of, "__module__", "") == spec.name}
+    models = {
+        key: of for key, of in own.items() if hasattr(of, "predict") or (inspect.isfunction(of) and key == "predict")
+    }
+    if name:
+        models = {name: getattr(module, name)} if hasattr(module, name) else {}
+    if len(models) != 1:
+        wanted = name or "a class with a method predict, or a function predict"
+        raise UsageError(
+            f"--predictor {source}: has {', '.join(models) or 'no ' + wanted}; expected one: name it as {path}:NAME"
+        )
+    return OwnKind(source, digest, _make_kind(next(iter(models.values())), source))
+
+
+def _make_kind(found: Any, source: str) -> type[Predictor]:
+    """Return a class with every method of `Predictor`: those of the user, and the defaults."""
+    if inspect.isclass(found) and hasattr(found, "predict"):
+        return found if Predictor in found.__mro__ else type(found.__name__, (found, Predictor), {})
+    if callable(found):
+        return type("Function", (Predictor,), {"predict": lambda _, patches, features: found(patches, features)})
+    raise UsageError(f"--predictor {source}: neither a class with a method predict nor a function")
+
+
+@contextmanager
+def report_errors(own: OwnKind | str | None) -> Iterator[None]:
+    """Turn what the user's code raises into a `ModelError` that says where; None: no such code runs."""
+    source = own.source if isinstance(own, OwnKind) else own
+    try:
+        yield
+    except TcpipeError:
+        raise
+    except Exception as error:
+        if source is None:
+            raise
+        frames = traceback.extract_tb(error.__traceback__)
+        package = str(Path(__file__).parents[1])
+        in_file = next((frame for frame in reversed(frames) if Path(frame.filename).name == _file_name(source)), None)
+        at = in_file or next(
+            (frame for frame in reversed(frames) if not frame.filename.startswith(package)), frames[-1]
+        )
+        where = f"{at.filename}, line {at.lineno}, in {at.name}"
+        raise ModelError(f"--predictor {source}: {type(error).__name__}: {error} ({where})") from error
+
+
+def _file_name(source: str) -> str:
+    return Path(source if source.endswith(".py") else source.rpartition(":")[0]).name

@@ -1,0 +1,121 @@
+"""The kind that is chosen: the simplest that other runs do not tell from the best; and the kinds that are chosen from."""
+
+import numpy as np
+import pytest
+from installed_command import tcpipe
+
+from tcpipe.dataset import Split, open_dataset
+from tcpipe.dataset.extra_features import read_extra_features
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.models import load_model
+from tcpipe.learning.physics_model import fit_curves
+from tcpipe.learning.training import Variant, choose_kind, is_within_error, train
+
+real_labels = Split.labels.func
+
+
+def noise(split):
+    """Of each sample the same, whatever split it is in."""
+    seeds = split.column("start_ns").astype(np.int64) % 1_000_003
+    return np.array([np.random.default_rng(seed).normal(size=2) for seed in seeds])
+
+
+def everywhere(split):
+    return np.tile([100.0, 0.9], (len(split), 1))
+
+
+def by_class(split):
+    return np.column_stack([100.0 + 10.0 * split.column("terrain_class"), 0.9 - 0.05 * split.column("terrain_class")])
+
+
+def by_slope(split):
+    slope = split.column("slope_rad").astype(np.float64)
+    return by_class(split) + np.column_stack([300.0 * slope, -1.0 * slope])
+
+
+def by_picture(split):
+    """What only the patch shows: how bright the ground is."""
+    bright = (
+        split.patches[..., split.channels.index("ortho")].mean(axis=(1, 2)).astype(np.float64)
+        if "ortho" in split.channels
+        else None
+    )
+    whole = (
+        split.with_channels("ortho").patches[..., 0].mean(axis=(1, 2)).astype(np.float64) if bright is None else bright
+    )
+    return by_slope(split) + np.column_stack([2000.0 * (whole - 0.4), 0.0 * whole])
+
+
+@pytest.fixture
+def labelled(monkeypatch):
+    """Replace the labels of all splits."""
+
+    def replace_labels(form):
+        made = lambda split: (form(split) + noise(split) * [4.0, 0.01]).astype(np.float32)  # noqa: E731
+        monkeypatch.setattr(Split, "labels", property(made))
+
+    return replace_labels
+
+
+@pytest.mark.parametrize(("form", "kind"), [(everywhere, "mean"), (by_slope, "linear")])
+def test_what_follows_a_simple_rule_gets_the_simple_kind(dataset, labelled, form, kind):
+    labelled(form)
+    assert choose_kind(open_dataset(dataset), FitConfig(model="auto"), Variant()) == kind
+
+
+def test_what_only_the_patch_shows_gets_trees(dataset, labelled):
+    pytest.importorskip("lightgbm")
+    labelled(by_picture)
+    assert choose_kind(open_dataset(dataset), FitConfig(model="auto"), Variant()) == "boosting"
+
+
+def test_one_standard_error_is_of_the_clusters():
+    rng = np.random.default_rng(0)
+    clusters = np.repeat(np.arange(10), 20)
+    assert is_within_error(np.zeros(200), clusters)
+    assert not is_within_error(np.full(200, 0.1), clusters)
+    assert is_within_error(np.full(200, -0.1), clusters)
+    own = rng.normal(size=10)[clusters] * 0.3
+    assert is_within_error(own - own.mean() + 0.05, clusters)  # runs differ by more
+    assert not is_within_error(rng.normal(size=200) * 0.3 + 0.1, clusters)
+
+
+def test_the_command_says_what_it_compared_and_chooses_once(dataset, tmp_path):
+    done = tcpipe("train", dataset, "model", cwd=tmp_path)
+    card = load_model(tmp_path / "model").card
+    assert card.training.config.model == "auto"
+    assert f"chooses {card.training.kind}, the simplest within one standard error of the best (" in done.stderr
+    assert "predicted by other runs: mean" in done.stderr
+    again = tcpipe("train", dataset, "model", cwd=tmp_path)
+    assert "nothing to do" in again.stdout
+    assert "chooses" not in again.stderr
+
+
+@pytest.mark.parametrize("kind", ["mean", "linear", "spline"])
+def test_curves_are_models_like_the_others(dataset, tmp_path, kind):
+    train(dataset, tmp_path / "model", config=FitConfig(model=kind))
+    model, data = load_model(tmp_path / "model"), open_dataset(dataset)
+    split, features = data["train"], read_extra_features(data["train"])
+    curves = fit_curves(kind, features.slope_rad, features.class_id, split.labels.astype(np.float64))
+    there = read_extra_features(data["unseen"])
+    said = model.predict(data["unseen"].with_channels("height").patches, there)
+    assert said == pytest.approx(curves.predict(there.slope_rad, there.class_id), rel=1e-6)
+    assert not model.takes_turns
+
+
+def test_a_residual_network_learns_what_the_curve_leaves(dataset, labelled, tmp_path):
+    pytest.importorskip("torch")
+    labelled(by_picture)
+    errors = {}
+    for kind in ("linear", "residual"):
+        train(dataset, tmp_path / kind, config=FitConfig(model=kind))
+        residuals = load_model(tmp_path / kind).residuals
+        assert len(residuals["power_watt"]) == len(open_dataset(dataset)["train"])
+        errors[kind] = np.std(residuals["power_watt"] - residuals["power_predicted_watt"])
+    assert errors["residual"] < 0.7 * errors["linear"]
+    model, split = load_model(tmp_path / "residual"), open_dataset(dataset)["test"]
+    features = read_extra_features(split)
+    said = model.predict(split.patches, features)
+    assert model.predict(split.patches[3:4], features.take(slice(3, 4))) == pytest.approx(said[3:4], rel=1e-4)
+    train(dataset, tmp_path / "again", config=FitConfig(model="residual"))
+    assert (tmp_path / "again" / "weights.npz").read_bytes() == (tmp_path / "residual" / "weights.npz").read_bytes()
