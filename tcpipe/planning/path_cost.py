@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
-from tcpipe.cost.adaptation import Run, adapt, make_metres
+from tcpipe.cost.adaptation import ELSEWHERE_M, Metres, Run, adapt
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
@@ -173,12 +173,15 @@ def _sum_costs(
     if known is not None:
         if errors is None:
             raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
-        predicted = {"duration": duration, "energy": energy}
-        there = make_metres(
-            model.physics, length_m=pieces.arc_m, class_id=class_id, slope_rad=said.slope_rad, turn_rad=turn_rad,
-            predicted=predicted, measured=predicted, distance_m=np.cumsum(pieces.arc_m) - pieces.arc_m,
-        )  # fmt: skip
-        adapted = {name: adapt(errors[name], known.metres[name]).predict(of) for name, of in there.items()}
+        begin_m, rise_m = ELSEWHERE_M + np.cumsum(pieces.arc_m), pieces.arc_m * np.tan(said.slope_rad)
+        adapted = {
+            name: adapt(
+                errors[name],
+                known.metres[name],
+                Metres(of, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad),
+            )
+            for name, of in (("duration", duration), ("energy", energy))
+        }
         duration, energy = adapted["duration"].value, adapted["energy"].value
         (fast, slow), (least, most) = ((of.low, of.high) for of in (adapted["duration"], adapted["energy"]))
         sums = {name: of.total for name, of in adapted.items()}
