@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import Any, Protocol
 
@@ -136,13 +137,15 @@ def group_by_tile(px: NDArray[np.float64], source: Tiled) -> Iterator[NDArray[np
 def read_window(  # noqa: PLR0917
     source: MapReader, layer: str, row0: int, row1: int, col0: int, col1: int
 ) -> NDArray[Any]:
-    """Return a window of a layer that may reach beyond the map, where it holds no data."""
-    dtype = source.layers[layer].mapped
-    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), find_no_data_value(dtype), dtype)
-    top, bottom = max(row0, 0), min(row1, source.grid.rows)
-    left, right = max(col0, 0), min(col1, source.grid.cols)
+    """Return a window of a layer that may reach beyond the map, where it holds no data; (bands, rows, columns) of one of several."""
+    bands = source.banded.get(layer)
+    of, grid = (source.layers[layer], source.grid) if bands is None else (bands.layer, bands.grid)
+    read = partial(source.read, layer) if bands is None else bands.read
+    lead = (len(of.bands),) if of.bands else ()
+    out: NDArray[Any] = np.full((*lead, row1 - row0, col1 - col0), find_no_data_value(of.mapped), of.mapped)
+    top, bottom, left, right = max(row0, 0), min(row1, grid.rows), max(col0, 0), min(col1, grid.cols)
     if top < bottom and left < right:
-        out[top - row0 : bottom - row0, left - col0 : right - col0] = source.read(layer, top, bottom, left, right)
+        out[..., top - row0 : bottom - row0, left - col0 : right - col0] = read(top, bottom, left, right)
     return out
 
 
