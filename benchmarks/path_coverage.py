@@ -1,205 +1,132 @@
-"""How often 90 % intervals of a table model hold what further drives measure: metres, and paths of 10, 30 and 100 m.
+"""How often 90 % intervals hold what further drives measure: metres, and paths of 10, 30 and 100 m; and models adapted to another payload.
 
-    python benchmarks/path_coverage.py [--train 10] [--metres 700] [--further 24] [--trainings 1]
+    python benchmarks/path_coverage.py [--train 10] [--metres 300] [--further 24] [--kind boosting] [--payload 0] [--seed 0]
 
-Drives wander over the paper's simulated site. They are simulated as labels, metre by metre, not as logs: time and energy of the plant
-at 11 points of a metre, with the hidden resistance of the place, a level of the run's own (5 % of the resistance, 2 % of the speed), the
-fluctuation in time, and end points that err by 2 cm, whose errors neighbours share with opposite sign. The table is the one that `train`
-fits, curves and trees; it sees class, slope, its change and cross slope, as of a patch. Its residuals are those of blocks of 10 m, as
-training has them. Coverage is the mean over the further drives, with the 95 % interval of drawing them anew (percentile bootstrap, 2000
-draws); 90 is to lie in it.
+Drives wander over the small site of `tcpipe demo` with the paper's robot. All of it is the product's way: logs are simulated, ingested,
+built into a dataset, a model is trained on the first drives; the further ones, in a store of their own, are predicted on the map as
+`tcpipe evaluate --drive` does. Paths follow one another along a drive. Coverage is of the measured labels, over all drives, with its 95 %
+interval (binomial, clustered by drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the further drives carry so many kg
+more. The second table predicts the rest of each further drive after its first metres adapt the model, beside the mean of these metres.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from dataclasses import dataclass
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, fit_bias_correction, fit_errors
-from tcpipe.learning.table_model import TableModel, fit_table
-from tcpipe.planning.path_cost import cut_path
-from tcpipe.simulation import find_scenario
-from tcpipe.simulation.robot import SimulatedRobot
-from tcpipe.simulation.route import Leg, Wander
-from tcpipe.simulation.world import World
-
-Floats = NDArray[np.float64]
+from tcpipe.cost.adaptation import Run, compare_adaptations, format_adaptations
+from tcpipe.cost.coverage import measure_coverage
+from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.models import Model, load_model
+from tcpipe.learning.training import train
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.maps import add_map
+from tcpipe.planning.drives import collect_run
+from tcpipe.planning.path_files import choose_map
+from tcpipe.recipe import Recipe
+from tcpipe.simulation import SimulatedSite, find_scenario, simulate
+from tcpipe.store import open_store
 
 LENGTHS = (1, 10, 30, 100)
-POINTS = 11
-END_STD_M, RUN_RESISTANCE, RUN_SPEED = 0.02, 0.05, 0.02
-QUANTITIES = ("duration", "energy")
-CHANNELS, CLASS_COUNT = ("height", "terrain"), 7
+KNOWN_M = (0.0, 10.0, 50.0, 100.0)
 
 
-@dataclass(frozen=True)
-class Held:
-    """Share of paths that intervals hold, the 95 % interval of that over drives, and the median half-width [of the prediction]."""
-
-    share: float
-    low: float
-    high: float
-    half_width: float
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Metres of one run, in order: what a table sees, what was measured, and where."""
-
-    run: str
-    features: Floats
-    class_id: NDArray[np.int64]
-    power_watt: Floats
-    velocity_mps: Floats
-    start_ns: NDArray[np.int64]
-    block: NDArray[np.int64]
-
-
-def wandering(world: World, rng: np.random.Generator, metres: float) -> Floats:
-    """Return start and end of consecutive metres [map m], shape (N, 2, 2)."""
-    site = world.site
-    while True:
-        start = (float(rng.uniform(20.0, site.width_m - 20.0)), float(rng.uniform(20.0, site.height_m - 20.0)))
-        if world.terrain_class(np.array(start[0] + site.west_m), np.array(start[1] + site.south_m)) >= 4:
-            plan = Wander(metres, start, odd_manoeuvres=False).plan(world, rng)
-            points = np.array([start, *(at for leg in plan if isinstance(leg, Leg) for at in leg.waypoints_m)])
-            pieces = cut_path(points + np.array([site.west_m, site.south_m]), chord_m=1.0, scale=1.0)
-            return np.stack([pieces.start_xy_m, pieces.end_xy_m], axis=1)[:-1]
-
-
-def drive(world: World, robot: SimulatedRobot, rng: np.random.Generator, *, metres: float, run: str) -> Drive:
-    """Return a drive's labels."""
-    ends = wandering(world, rng, metres)
-    share = np.linspace(0.0, 1.0, POINTS)
-    x, y = (ends[:, 0, axis, None] + (ends[:, 1] - ends[:, 0])[:, axis, None] * share for axis in (0, 1))
-    course = np.arctan2(*(ends[:, 1] - ends[:, 0]).T[::-1])[:, None]
-    east, north = world.gradient(x, y)
-    slope = np.arctan(east * np.cos(course) + north * np.sin(course))
-    cross = np.arctan(north * np.cos(course) - east * np.sin(course))
-    classes = world.terrain_class(x, y)
-    ground = robot.ground_table()[classes]
-    fluctuation = robot.resistance_noise * rng.standard_normal(x.shape) * 0.4
-    resistance = (
-        ground[..., 2] * world.resistance_factor(x, y) * (1.0 + RUN_RESISTANCE * rng.standard_normal() + fluctuation)
+def drive(place: Path, count: int, metres: float, *, payload_kg: float, seed: int) -> SimulatedSite:
+    """Simulate drives over the small site."""
+    site = find_scenario("paper_quick")
+    robot = site.drives[0].robot
+    robot = replace(robot, mass_kg=robot.mass_kg + payload_kg)
+    drives = tuple(
+        replace(spec, name=f"drive_{number:02d}", plan=replace(spec.plan, length_m=metres), robot=robot)
+        for number in range(count)
+        for spec in [site.drives[number % len(site.drives)]]
     )
-    pace = 1.0 + RUN_SPEED * rng.standard_normal()
-    wheel = pace * robot.max_velocity_mps * robot.speed_factor(ground[..., 0], np.sin(slope))
-    velocity = wheel * (1.0 - robot.slip(ground[..., 1], np.sin(slope))) * np.cos(slope)
-    still = np.zeros_like(slope)
-    mechanical = robot.wheel_power_watt(
-        wheel_velocity_mps=wheel,
-        acceleration_mps2=still,
-        yaw_rate_radps=still,
-        slope_rad=slope,
-        rolling_resistance=resistance,
+    return simulate(place, scenario=replace(site, drives=drives), seed=seed)
+
+
+def store_of(place: Path, site: SimulatedSite) -> Path:
+    """Ingest the logs of a site and add its map."""
+    store = place / "store"
+    done = ingest(site.logs, store=store, recipe=replace(Recipe(), robot="husky"))
+    assert done.exit_code == 0, "\n".join(problem for result in done.results for problem in result.problems)
+    add_map("site", store=store, **site.rasters)
+    return store
+
+
+def measure(here: Path, *, given: argparse.Namespace) -> tuple[Model, list[Run]]:
+    """Return a model of some drives, and further drives as it predicts and they measured them."""
+    site = drive(here / "train" / "site", given.train, given.metres, payload_kg=0.0, seed=given.seed)
+    store = store_of(here / "train", site)
+    build_dataset(here / "dataset", store=store, recipe=replace(Recipe(), robot="husky"))
+    train(here / "dataset", here / "model", config=FitConfig(model=given.kind))
+    model = load_model(here / "model")
+    further = drive(
+        here / "further" / "site", given.further, given.metres, payload_kg=given.payload, seed=given.seed + 1000
     )
-    power = robot.propulsion_watt(mechanical, wheel)
-    length = 1.0 + np.diff(END_STD_M * rng.standard_normal(len(x) + 1))  # of ground in what was taken for a metre
-    duration, energy = length * np.mean(1.0 / velocity, axis=1), length * np.mean(power / velocity, axis=1)
-    begun = np.concatenate([[0.0], np.cumsum(duration)[:-1]])
-    shares = np.stack([(classes == k + 1).mean(axis=1) for k in range(CLASS_COUNT)], axis=1)
-    unknown = np.zeros((len(x), 3))  # curvature across, roughness and relief
-    features = np.column_stack([slope.mean(axis=1), np.abs(cross.mean(axis=1)), np.ptp(slope, axis=1), unknown, shares])
-    blocks = np.floor(ends.mean(axis=1) / 10.0).astype(np.int64)
-    under = np.array([np.bincount(row).argmax() for row in classes])
-    return Drive(
-        run, features, under, energy / duration, 1.0 / duration, (begun * 1e9).astype(np.int64), blocks @ [1_000_003, 1]
+    store = store_of(here / "further", further)
+    source = choose_map(store, None)
+    return model, [collect_run(model, source, run) for run in open_store(store).runs()]
+
+
+def coverage_line(quantity: str, length: int, errors: Errors, runs: list[Run]) -> str:
+    """Return how many paths of a length are inside their interval, and how wide that is."""
+    inside, names, widths = [], [], []
+    for run in runs:
+        of = run.metres[quantity]
+        for first in range(0, len(of.predicted) - length + 1, length):
+            rows = slice(first, first + length)
+            said, class_id, measured = of.predicted[rows], of.class_id[rows], float(of.measured[rows].sum())
+            ends = (
+                errors.compute_intervals(said, class_id) if length == 1 else errors.compute_sum_interval(said, class_id)
+            )
+            low, high = (float(np.sum(end)) for end in ends)
+            inside.append(low <= measured <= high)
+            names.append(run.name)
+            widths.append((high - low) / 2.0 / float(np.abs(said).sum()))
+    if not inside:
+        return f"{quantity:8} {length:4d} m: no drive is as long"
+    found = measure_coverage(np.array(inside), np.array(names))
+    verdict = (
+        "undecided"
+        if found.low is None
+        else "90 is inside"
+        if found.low <= COVERAGE <= (found.high or 0.0)
+        else "90 is NOT inside"
     )
-
-
-def trained(drives: list[Drive]) -> tuple[TableModel, dict[str, NDArray[np.generic]]]:
-    """Return a table of all metres, and what the other folds said of each."""
-    features = np.concatenate([of.features for of in drives])
-    labels = np.column_stack(
-        [np.concatenate([getattr(of, name) for of in drives]) for name in ("power_watt", "velocity_mps")]
+    return (
+        f"{quantity:8} {length:4d} m: {found} of {found.samples}: {verdict}; ± {100.0 * float(np.median(widths)):.1f} %"
     )
-    folds = np.random.default_rng(0).permuted(np.arange(5).repeat(200_000))[
-        np.concatenate([of.block for of in drives]) % 1_000_000
-    ]
-    weights = np.ones_like(labels)
-    table, said = fit_table(features, labels, weights, folds, channels=CHANNELS, class_count=CLASS_COUNT)
-    return table, {
-        "run_id": np.concatenate([[of.run] * len(of.block) for of in drives]),
-        "start_ns": np.concatenate([of.start_ns for of in drives]),
-        "terrain_class": np.concatenate([of.class_id for of in drives]),
-        "power_watt": labels[:, 0],
-        "velocity_mps": labels[:, 1],
-        "power_predicted_watt": said[:, 0],
-        "velocity_predicted_mps": said[:, 1],
-    }
-
-
-def held(errors: dict[str, Errors], said: dict[str, Floats], of: Drive) -> Iterator[tuple[str, int, float, float]]:
-    """Yield for each quantity and length what share of a drive's paths an interval holds, and its half-width over the prediction."""
-    true = {"duration": 1.0 / of.velocity_mps, "energy": of.power_watt / of.velocity_mps}
-    for name in QUANTITIES:
-        for metres in LENGTHS:
-            first = range(0, len(of.block) - metres + 1, metres)
-            ends = [
-                errors[name].compute_sum_interval(said[name][k : k + metres], of.class_id[k : k + metres])
-                for k in first
-            ]
-            if metres == 1:
-                ends = list(zip(*errors[name].compute_intervals(said[name], of.class_id), strict=True))
-            measured = np.add.reduceat(true[name], first)[: len(ends)]
-            measured[-1] = true[name][first[-1] : first[-1] + metres].sum()
-            low, high = np.array(ends).T
-            width = float(np.median((high - low) / 2.0 / np.abs(np.add.reduceat(said[name], first))))
-            yield name, metres, float(np.mean((measured >= low) & (measured <= high))), width
-
-
-def coverage(*, train: int, metres: float, further: int, seed: int, sites: int = 1) -> dict[tuple[str, int], Held]:
-    """Return by quantity and length how many paths of further drives are held, over ``sites`` trainings of so many drives each."""
-    found: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    rng = np.random.default_rng(seed)
-    for _ in range(sites):
-        for name, length, share, width in trial(rng, train=train, metres=metres, further=further):
-            found.setdefault((name, length), []).append((share, width))
-    out = {}
-    for key, values in found.items():
-        shares, widths = np.array(values).T
-        draws = shares[rng.integers(0, len(shares), (2000, len(shares)))].mean(axis=1)
-        low, high = np.quantile(draws, (0.025, 0.975)).tolist()
-        out[key] = Held(float(shares.mean()), low, high, float(np.median(widths)))
-    return out
-
-
-def trial(
-    rng: np.random.Generator, *, train: int, metres: float, further: int
-) -> Iterator[tuple[str, int, float, float]]:
-    """Train on drives and yield `held` of further ones."""
-    site = find_scenario("paper")
-    made = [drive(site.world, site.drives[0].robot, rng, metres=metres, run=f"run{k}") for k in range(train + further)]
-    table, residuals = trained(made[:train])
-    centring, errors = fit_bias_correction(residuals), fit_errors(residuals)
-    assert errors is not None
-    for of in made[train:]:
-        power, velocity = centring.apply(*table.predict(of.features).T, of.class_id)
-        yield from held(errors, {"duration": 1.0 / velocity, "energy": power / velocity}, of)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train", type=int, default=10)
-    parser.add_argument("--metres", type=float, default=700.0)
+    parser.add_argument("--metres", type=float, default=300.0)
     parser.add_argument("--further", type=int, default=24)
-    parser.add_argument("--trainings", type=int, default=1)
+    parser.add_argument("--kind", default="boosting")
+    parser.add_argument("--payload", type=float, default=0.0, metavar="KG")
     parser.add_argument("--seed", type=int, default=0)
-    told = parser.parse_args()
-    found = coverage(train=told.train, metres=told.metres, further=told.further, seed=told.seed, sites=told.trainings)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        model, runs = measure(Path(name), given=given)
+    errors = fit_errors(model.residuals)
+    assert errors is not None, "too few samples to train on"
+    metres = np.mean([run.metres["energy"].length_m.sum() for run in runs])
     print(
-        f"{told.trainings} x {told.train} drives of {told.metres:.0f} m to train on, {told.further} further ones each"
+        f"{model.card.training.samples['fitted']} samples of {given.train} drives; {len(runs)} further ones, {metres:.0f} m each"
     )
-    for (name, metres), of in found.items():
-        verdict = "holds 90" if of.low <= 0.9 <= of.high else "does NOT hold 90"
-        percent = [100.0 * value for value in (of.share, of.low, of.high, of.half_width)]
-        print(
-            f"{name:8} {metres:4d} m: {percent[0]:5.1f} % ({percent[1]:.1f} to {percent[2]:.1f}: {verdict}), ± {percent[3]:.1f} %"
-        )
+    for quantity in ("duration", "energy"):
+        for length in LENGTHS:
+            print(coverage_line(quantity, length, errors[quantity], runs))
+    both = {quantity: errors[quantity] for quantity in ("energy", "duration")}
+    known_m = [metres for metres in KNOWN_M if metres <= given.metres / 3.0]
+    print(*format_adaptations(list(compare_adaptations(both, runs, known_m))), sep="\n")
 
 
 if __name__ == "__main__":

@@ -9,8 +9,10 @@ Where no speed is commanded, the track's own stands for it: E is then that of a 
 that E and T without the speed. Held out are, in turn, fifths of the drive and, between two drives, the whole other drive; the mean of the
 held-out block itself, which no model knows, stands beside. R² is one less the squared errors over those of the mean of all metres. 90 %
 intervals, NLL and CRPS come from a second cross-fit inside what is fitted on, so that nothing held out has told them. The floor is what the
-labels' own deviations make of a perfect prediction. Beside the real ones stands a simulated drive of as many metres as the longest (labels,
-no logs: benchmarks/path_coverage.py), of which the class is not told either.
+labels' own deviations make of a perfect prediction.
+
+Between two drives a second table shows physics and trees of the other drive after the first K metres of this one adapt them
+(`tcpipe.cost.adaptation`), on the metres after the largest K, beside the mean of these K metres.
 
 With ``--classes`` the energy per metre of a store's runs by the class of their ground, which is the first word of their names: does the
 class tell the cost? Runs are the unit: the mean over runs, the deviation between them, and how well the mean of the other runs of a class
@@ -23,14 +25,16 @@ import argparse
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from path_coverage import END_STD_M, drive
 
 from tcpipe import ingest
+from tcpipe.cost.adaptation import MODEL, Metres, Run, compare_adaptations
 from tcpipe.cost.physics import ALL, FitSamples, fit_physics
+from tcpipe.cost.prediction_errors import Errors as PredictionErrors
 from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.learning.metrics import (
@@ -43,7 +47,6 @@ from tcpipe.learning.metrics import (
     label_floor,
 )
 from tcpipe.learning.table_model import grow
-from tcpipe.simulation import find_scenario
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats
 
@@ -92,18 +95,6 @@ def forget_speed(of: Metre) -> Metre | None:
     """Return metres whose command is the track's own speed without it; None where one was commanded."""
     is_known = not np.array_equal(of.command, of.velocity)
     return None if is_known else replace(of, command=np.ones_like(of.command))
-
-
-def simulated(metres: int) -> Metre:
-    """Return a simulated drive on all classes, of which none is told."""
-    site = find_scenario("paper")
-    made = drive(site.world, site.drives[0].robot, np.random.default_rng(0), metres=metres + 10.0, run="simulated")
-    still = np.zeros(len(made.block))
-    time = 1.0 / made.velocity_mps
-    std = np.sqrt(2.0) * END_STD_M * time
-    return Metre(
-        made.power_watt, made.velocity_mps, np.tan(made.features[:, 0]), still, still + 1.0, std, std * made.power_watt, made.start_ns
-    ).take(np.arange(len(still)) < metres)  # fmt: skip
 
 
 Predictor = Callable[[Metre], Floats]
@@ -162,6 +153,19 @@ class Told:
 
 def told(fit: Callable[[Metre], Predictor], known: Metre, there: Metre) -> Told:
     """Fit to some metres and predict others; what errors are like is told by folds of the first."""
+    said, found = centred(fit, known, there)
+    nowhere = np.zeros(len(there.power), np.int64)
+    spread = {
+        name: Spread(found[of].compute_std(said[name], nowhere), *found[of].compute_intervals(said[name], nowhere))
+        for name, of in QUANTITIES.items()
+    }
+    return Told({name: said[name] for name in QUANTITIES}, spread)
+
+
+def centred(
+    fit: Callable[[Metre], Predictor], known: Metre, there: Metre
+) -> tuple[dict[str, Floats], dict[str, PredictionErrors]]:
+    """Return what a fit to some metres says of others, and what it states of its errors by folds of the first."""
     folds, held = _folds(len(known.power)), np.empty((len(known.power), 2))
     for fold in np.unique(folds):
         held[folds == fold] = fit(known.take(folds != fold))(known.take(folds == fold))
@@ -172,12 +176,31 @@ def told(fit: Callable[[Metre], Predictor], known: Metre, there: Metre) -> Told:
     }  # fmt: skip
     nowhere, found = np.zeros(len(there.power), np.int64), fit_errors(residuals)
     assert found is not None, "fewer than 20 segments"
-    said = compute_costs(*fit_bias_correction(residuals).apply(*fit(known)(there).T, nowhere), 1.0)
-    spread = {
-        name: Spread(found[of].compute_std(said[name], nowhere), *found[of].compute_intervals(said[name], nowhere))
-        for name, of in QUANTITIES.items()
-    }
-    return Told({name: said[name] for name in QUANTITIES}, spread)
+    return compute_costs(*fit_bias_correction(residuals).apply(*fit(known)(there).T, nowhere), 1.0), found
+
+
+ADAPTED_M = (0, 5, 10, 20, 50, 100)
+
+
+def adapted_lines(name: str, other: str, known: Metre, there: Metre) -> Iterator[str]:
+    """Yield E of a drive's rest by models of another, after its first metres adapt them."""
+    known_m = [metres for metres in ADAPTED_M if 2 * metres <= len(there.power)]
+    ones = np.ones_like(there.power)
+    for model in ("mean", "physics", "boosted trees"):
+        said, errors = centred(MODELS[model], known, there)
+        metres = Metres(
+            said["E"], there.power / there.velocity, np.zeros(len(ones), np.int64), np.cumsum(ones) - 1.0, ones, said["T"],
+            there.rise, there.turn_radpm,
+        )  # fmt: skip
+        runs = [Run(name, {"energy": metres})]
+        for of in compare_adaptations({"energy": errors["energy"]}, runs, known_m):
+            if of.predictor == MODEL or model == "mean":
+                who = model if of.predictor == MODEL else "mean of the known metres"
+                r2 = 1.0 - of.rmse**2 / float(np.var(metres.measured[-of.samples :]))
+                yield (
+                    f"| {name} by {other} | {who} | {of.metres:g} | {of.samples} | {of.rmse:.0f} J | {r2:.2f} "
+                    f"| {of.coverage_percent:.0f} | {of.total_error_percent:.0f} | {'yes' if of.totals_inside else 'no'} |"
+                )
 
 
 def by_blocks(fit: Callable[[Metre], Predictor], of: Metre) -> Told:
@@ -313,7 +336,6 @@ def main() -> None:
         drives[name] = recorded(log, recipe or None)
     real = list(drives)
     drives |= {f"{name}, speed unknown": of for name in real if (of := forget_speed(drives[name])) is not None}
-    drives["simulated"] = simulated(max(len(of.power) for of in drives.values()))
     print(
         "| drive | held out | model | of | RMSE | R² | MAPE [%] (labels) | held by 90 % [%] | NLL [nat] | CRPS |\n"
         + "|---" * 10
@@ -339,6 +361,13 @@ def main() -> None:
                         ),
                         sep="\n",
                     )
+    print(
+        "\n| E of the rest of a drive | model | known [m] | rest [m] | RMSE | R² | held by 90 % [%] | sum off by [%] | held |\n"
+        + "|---" * 9
+        + "|"
+    )
+    for name, other in permutations(real, 2):
+        print(*adapted_lines(name, other, drives[other], drives[name]), sep="\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ SMALLEST = {
     "label_accuracy": Smallest("--scenario tiny", rf"odometer +[+-]?{NUMBER}%"),
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
     "many_runs": Smallest("{out} 3", rf"prune --dry-run, again +{NUMBER} s wall"),
-    "path_coverage": Smallest("--train 2 --metres 100 --further 2", rf"energy +1 m: +{NUMBER} %"),
+    "path_coverage": Smallest("--train 2 --metres 60 --further 1", rf"energy +1 m: +{NUMBER} %"),
     "peers": Smallest(
         "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"
     ),

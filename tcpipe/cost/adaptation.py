@@ -4,11 +4,13 @@ The trained model is the prior. With p what it predicts of the metres of the new
 
     y = p + X b + e,   b ~ N(0, s² (t q)²),   e ~ N(0, s² S (R + r L) S)
 
-The columns of X are in the unit of y: p itself (scale), its mean per metre (offset), and what the robot's physics says that grade and turns
-cost. b is relative to them; a Bayesian linear regression gives it. S are the spreads that the model states of a metre, R the correlation of
-neighbours, L one that falls over 20 m: what a model does not know of new ground. s² has an inverse-gamma prior of mean about 1, so that all
-that is stated has Student's t (Gelman et al., Bayesian Data Analysis, 2013, 14.2). How far the prior reaches, t, and how much of the errors
-is of the ground, r, are not known: all of a small grid are averaged, each with the evidence that the metres give it (ibid., 7.4).
+The columns of X are in the unit of y: p itself (scale), and what a usual metre or second of the run costs times its length (offset),
+predicted duration (idle power), slope (payload; 10 % count as a metre) and turn (0.3 rad count as a metre). b is relative to them; a
+Bayesian linear regression gives it. S are the spreads that the model states of a metre, R the correlation of neighbours, L one that falls
+over tens or hundreds of metres: what a model does not know of new ground; what the known metres show of it counts nearby. s² has an
+inverse-gamma prior of mean about 1, so that all that is stated has Student's t (Gelman et al., Bayesian Data Analysis, 2013, 14.2). How
+far the prior reaches, t, and how much of the errors is of the ground, r and its length, are not known: all of a small grid are averaged,
+each with the evidence that the metres give it (ibid., 7.4).
 """
 
 from __future__ import annotations
@@ -23,7 +25,6 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, SumDistribution
-from tcpipe.tables.facts import PhysicsFit
 
 Floats = NDArray[np.float64]
 
@@ -31,13 +32,17 @@ _PRIOR = 0.05
 """q: standard deviation of a coefficient at the least reach, of what it multiplies."""
 _REACHES = (1.0, 2.0, 4.0, 8.0, 16.0)
 """t."""
-_GROUND_SHARES = (0.0, 0.5, 2.0)
-"""r."""
-_GROUND_M = 20.0
+_GROUNDS = ((0.0, 20.0), (0.5, 20.0), (2.0, 20.0), (0.5, 200.0), (2.0, 200.0), (8.0, 200.0))
+"""r, and the distance over which L falls [m]."""
+_RISE_M, _TURN_RAD = 0.1, 0.3
+"""What costs about as much as a metre."""
 _FREEDOM = 4.0
 """Of the prior of s²: as many metres as it counts."""
 _NEIGHBOUR_M, _MOST_NEIGHBOUR = 1.5, 0.45
 _TAIL = (1.0 + COVERAGE) / 2.0
+
+
+ELSEWHERE_M = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +53,14 @@ class Metres:
     measured: Floats
     class_id: NDArray[np.integer]
     distance_m: Floats
-    """Where each begins, along the run."""
+    """Where each begins, along the run; `ELSEWHERE_M` and more on another way."""
     length_m: Floats
-    physics: Floats
-    """What parts of the robot's physics cost, in the quantity's unit, shape (N, parts)."""
+    duration_s: Floats
+    """Predicted."""
+    rise_m: Floats
+    """Over each, uphill positive."""
+    turn_rad: Floats
+    """Over each, both ways counted."""
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
@@ -68,85 +77,62 @@ class Adapted:
     total: SumDistribution
 
 
-@dataclass(frozen=True, slots=True)
-class _Component:
-    """The regression for one reach and share of the ground."""
+def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
+    """Return what a model says of metres, adapted by others of the same run or robot that were measured; at least one.
 
-    weight: float
-    coefficients: Floats
-    covariance: Floats
-    scale: float
-    """Estimate of s²."""
-    ground_share: float
-
-
-@dataclass(frozen=True, slots=True)
-class Adaptation:
-    """A model's errors on a new run, by the metres that are known of it."""
-
-    errors: Errors
-    per_metre: float
-    freedom: float
-    components: tuple[_Component, ...]
-
-    def predict(self, there: Metres) -> Adapted:
-        """Return what the model says of other metres; where it predicts nothing, NaN, which is in no sum."""
-        known = np.isfinite(there.predicted)
-        if not known.all():
-            parts = self.predict(there.take(known))
-            columns = np.full((3, known.size), np.nan)
-            columns[:, known] = parts.value, parts.low, parts.high
-            return Adapted(columns[0], columns[1], columns[2], parts.total)
-        design, spread = _make_design(there, self.per_metre), self.errors.compute_std(there.predicted, there.class_id)
-        neighbours, ground = (_sum_products(spread, there, of) for of in (_find_neighbour(self.errors), None))
-        weights = np.array([of.weight for of in self.components])
-        values = there.predicted + np.array([design @ of.coefficients for of in self.components])
-        variances, totals = [], []
-        for of in self.components:
-            known = np.einsum("ij,jk,ik->i", design, of.covariance, design)
-            variances.append(of.scale * (known + (1.0 + of.ground_share) * spread**2))
-            summed = design.sum(axis=0)
-            totals.append(of.scale * (summed @ of.covariance @ summed + neighbours + of.ground_share * ground))
-        mean, variance = _mix(weights, values, np.array(variances))
-        total, total_variance = _mix(weights, values.sum(axis=1), np.array(totals))
-        wider = float(stdtrit(self.freedom, _TAIL))
-        common = wider * self.errors.common_share * float(np.abs(mean).sum())
-        half = float(np.hypot(wider * np.sqrt(total_variance), common))
-        low, high = (_widen(end, self.freedom) * np.sqrt(variance) for end in (self.errors.low, self.errors.high))
-        return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half))
-
-
-def adapt(errors: Errors, known: Metres) -> Adaptation:
-    """Return a model's errors, adapted by metres of a run that were measured; at least one."""
-    per_metre = float(np.abs(known.predicted).sum() / known.length_m.sum())
-    design, residual = _make_design(known, per_metre), known.measured - known.predicted
-    spread = errors.compute_std(known.predicted, known.class_id)
-    apart_m = np.abs(known.distance_m[:, None] - known.distance_m)
-    beside = np.eye(len(residual)) + _find_neighbour(errors) * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
-    freedom, found = _FREEDOM + len(residual), []
-    for share in _GROUND_SHARES:
-        noise = spread[:, None] * (beside + share * np.exp(-apart_m / _GROUND_M)) * spread
-        factor = cho_factor(noise, lower=True)
+    Where it predicts nothing, the value is NaN, which is in no sum.
+    """
+    has_cost = np.isfinite(there.predicted)
+    if not has_cost.all():
+        part, columns = adapt(errors, known, there.take(has_cost)), np.full((3, has_cost.size), np.nan)
+        columns[:, has_cost] = part.value, part.low, part.high
+        return Adapted(columns[0], columns[1], columns[2], part.total)
+    whole = float(np.abs(known.predicted).sum())
+    usual = whole / float(known.length_m.sum()), whole / float(known.duration_s.sum())
+    design, design_there, residual = (
+        _make_design(known, *usual),
+        _make_design(there, *usual),
+        known.measured - known.predicted,
+    )
+    spread, spread_there = (errors.compute_std(of.predicted, of.class_id) for of in (known, there))
+    neighbour, apart_m = _find_neighbour(errors), np.abs(known.distance_m[:, None] - known.distance_m)
+    beside = np.eye(len(residual)) + neighbour * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
+    freedom, evidences, values, variances, sums = _FREEDOM + len(residual), [], [], [], []
+    for share, ground_m in _GROUNDS:
+        factor = cho_factor(spread[:, None] * (beside + share * np.exp(-apart_m / ground_m)) * spread, lower=True)
         whitened, solved = cho_solve(factor, design), cho_solve(factor, residual)
         precision, log_noise = design.T @ whitened, 2.0 * float(np.log(np.diag(factor[0])).sum())
+        fades = np.exp(-np.abs(known.distance_m[:, None] - there.distance_m) / ground_m)
+        common = share * spread[:, None] * fades * spread_there
+        shares = cho_solve(factor, common)  # kriging: what is known of the ground beside
+        left, base = design_there - shares.T @ design, there.predicted + shares.T @ residual
+        own = (1.0 + share) * spread_there**2 - np.einsum("ij,ij->j", common, shares)
+        summed = _sum_neighbours(spread_there, there, neighbour) + share * _sum_ground(spread_there, there, ground_m)
+        summed -= float(common.sum(axis=1) @ shares.sum(axis=1))
         for reach in _REACHES:
             prior = np.eye(design.shape[1]) / (_PRIOR * reach) ** 2
             covariance = np.linalg.inv(prior + precision)
             coefficients = covariance @ (whitened.T @ residual)
             misfit = float(residual @ solved - coefficients @ (whitened.T @ residual))
             log_det = log_noise + float(np.linalg.slogdet(prior + precision)[1] - np.linalg.slogdet(prior)[1])
-            evidence = -0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM))
-            found.append(_Component(evidence, coefficients, covariance, (_FREEDOM + misfit) / freedom, share))
-    weights = np.exp([of.weight - max(of.weight for of in found) for of in found])
-    components = (
-        _Component(float(weight), of.coefficients, of.covariance, of.scale, of.ground_share)
-        for weight, of in zip(weights / weights.sum(), found, strict=True)
-    )
-    return Adaptation(errors, per_metre, freedom, tuple(components))
+            evidences.append(-0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM)))
+            scale, over = (_FREEDOM + misfit) / freedom, left.sum(axis=0)
+            values.append(base + left @ coefficients)
+            variances.append(scale * (own + np.einsum("ij,jk,ik->i", left, covariance, left)))
+            sums.append(scale * (summed + over @ covariance @ over))
+    weights = np.exp(np.array(evidences) - max(evidences))
+    weights /= weights.sum()
+    mean, variance = _mix(weights, np.array(values), np.array(variances))
+    total, total_variance = _mix(weights, np.array(values).sum(axis=1), np.array(sums))
+    wider = float(stdtrit(freedom, _TAIL))
+    low, high = (end * wider / _NORMAL * np.sqrt(variance) for end in (errors.low, errors.high))
+    half = np.hypot(wider * np.sqrt(total_variance), wider * errors.common_share * np.abs(mean).sum())
+    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), float(half)))
 
 
-def _make_design(of: Metres, per_metre: float) -> Floats:
-    return np.column_stack([of.predicted, per_metre * of.length_m, np.nan_to_num(of.physics)])
+def _make_design(of: Metres, per_metre: float, per_second: float) -> Floats:
+    alike_m = np.column_stack([of.length_m, of.rise_m / _RISE_M, np.abs(of.turn_rad) / _TURN_RAD])
+    return np.column_stack([of.predicted, per_second * of.duration_s, per_metre * np.nan_to_num(alike_m)])
 
 
 def _find_neighbour(errors: Errors) -> float:
@@ -155,13 +141,16 @@ def _find_neighbour(errors: Errors) -> float:
     return float(np.clip(errors.correlation[at] - errors.correlation[-1], -_MOST_NEIGHBOUR, _MOST_NEIGHBOUR))
 
 
-def _sum_products(spread: Floats, of: Metres, neighbour: float | None) -> float:
-    """Return sum_ij of a_i a_j times the correlation of neighbours, or that of the ground."""
-    gaps_m = np.diff(of.distance_m)
-    if neighbour is not None:
-        return float((spread**2).sum() + 2.0 * neighbour * (spread[1:] * spread[:-1])[gaps_m < _NEIGHBOUR_M].sum())
+def _sum_neighbours(spread: Floats, of: Metres, neighbour: float) -> float:
+    """Return sum_ij of a_i a_j times the correlation R."""
+    products = (spread[1:] * spread[:-1])[np.diff(of.distance_m) < _NEIGHBOUR_M]
+    return float((spread**2).sum() + 2.0 * neighbour * products.sum())
+
+
+def _sum_ground(spread: Floats, of: Metres, ground_m: float) -> float:
+    """Return sum_ij of a_i a_j times the correlation L."""
     total, carried = float((spread**2).sum()), 0.0
-    for fades, before, here in zip(np.exp(-gaps_m / _GROUND_M), spread[:-1], spread[1:], strict=True):
+    for fades, before, here in zip(np.exp(-np.diff(of.distance_m) / ground_m), spread[:-1], spread[1:], strict=True):
         carried = fades * (carried + before)
         total += 2.0 * here * carried
     return total
@@ -171,11 +160,6 @@ def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Fl
     """Return mean and variance of a mixture, over the first axis."""
     mean = np.tensordot(weights, values, 1)
     return mean, np.tensordot(weights, variances + (values - mean) ** 2, 1)
-
-
-def _widen(quantile: float, freedom: float) -> float:
-    """Return a quantile of standardised errors, wider by what Student's t is wider than the normal."""
-    return quantile * float(stdtrit(freedom, _TAIL)) / _NORMAL
 
 
 _NORMAL = 1.6448536269514722
@@ -197,29 +181,6 @@ class Run:
         """Return a hash of what adapts a model."""
         arrays = [getattr(of, field.name) for of in self.metres.values() for field in fields(of)]
         return sha256(b"".join(np.ascontiguousarray(values).tobytes() for values in arrays)).hexdigest()
-
-
-def make_metres(
-    physics: PhysicsFit | None,
-    *,
-    length_m: Floats,
-    class_id: NDArray[np.integer],
-    slope_rad: Floats,
-    turn_rad: Floats,
-    predicted: Mapping[str, Floats],
-    measured: Mapping[str, Floats],
-    distance_m: Floats,
-) -> dict[str, Metres]:
-    """Return metres of a run by quantity; what grade and turns cost in energy is that of the model's own robot, where it is known."""
-    columns = []
-    for term, cause in (("grade", length_m * np.tan(slope_rad)), ("turning", np.abs(turn_rad))):
-        if values := [of.value for of in (physics.terms if physics else ()) if of.term == term]:
-            columns.append(float(np.mean(values)) * cause)
-    nothing = np.empty((len(length_m), 0))
-    parts = {"duration": nothing, "energy": np.column_stack(columns) if columns else nothing}
-    return {
-        name: Metres(predicted[name], measured[name], class_id, distance_m, length_m, parts[name]) for name in predicted
-    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +240,7 @@ def _predict_rest(errors: Errors, known: Metres, rest: Metres, predictor: str) -
     if predictor == MEAN:
         return _predict_mean(known, rest)
     if len(known.predicted):
-        return adapt(errors, known).predict(rest)
+        return adapt(errors, known, rest)
     low, high = errors.compute_intervals(rest.predicted, rest.class_id)
     total = errors.compute_sum(rest.predicted, rest.class_id)
     return Adapted(rest.predicted, low, high, total)

@@ -4,7 +4,8 @@ Estimated are, in this order:
 
 * the **bias** of each terrain class: the ratio of its metres' true and predicted sums, less one, as far as it is beyond chance. With
   b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
-  (James and Stein's positive part; Efron and Morris, JASA 70, 1975). Predictions are multiplied by it, so that they are centred.
+  (James and Stein's positive part; Efron and Morris, JASA 70, 1975), and as far as no single fold of the cross-validation makes it.
+  Predictions are multiplied by it, so that they are centred.
 * the **spread** of one metre, a + c |prediction|, with a factor of the class that few samples hardly move from 1.
 * the **correlation** of two metres of one run by their distance, from the semivariogram g of the errors over their spread
   (Cressie, *Statistics for Spatial Data*, 1993, section 2.4): 1 - g(distance) / g(other runs). A segment's end is the next one's
@@ -197,7 +198,7 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
-    also duration_s of its segment, duration_common_std_s and energy_common_std_joule.
+    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule.
     """
     held = _Held.collect(residuals)
     if held is None:
@@ -239,6 +240,8 @@ class _Held:
     run: Ints
     way_m: Floats
     """Along its run."""
+    fold: Ints
+    """That was held out with it."""
 
     @classmethod
     def collect(cls, residuals: Residuals) -> _Held | None:
@@ -262,7 +265,8 @@ class _Held:
             for p, v in ((power, velocity), (predicted_power, predicted_velocity))
         )
         class_id = np.nan_to_num(residuals["terrain_class"][rows].astype(np.float64)).astype(np.int64)
-        return cls(true, predicted, class_id, of_run, way_m)
+        fold = residuals["fold"][rows].astype(np.int64) if "fold" in residuals else np.zeros(rows.size, np.int64)
+        return cls(true, predicted, class_id, of_run, way_m, fold)
 
 
 def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
@@ -271,17 +275,34 @@ def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
     if np.unique(block).size < _ENOUGH_RUNS:
         block = np.cumsum(np.r_[True, np.diff(held.run) != 0] | (np.arange(predicted.size) % _BLOCK == 0)) - 1
     everywhere, error = _estimate_ratio(predicted, true, block)
+    everywhere = _drop_bias_of_a_fold(everywhere, 0.0, predicted, true, held.fold)
     everywhere *= max(0.0, 1.0 - (error / everywhere) ** 2) if everywhere else 0.0
     value, std = np.full(_CLASSES, everywhere), np.full(_CLASSES, error)
     numbers, counts = np.unique(held.class_id, return_counts=True)
     for number in numbers[counts >= FEWEST].tolist():  # fewer lie in a block or two, which tell no chance
         own = held.class_id == number
         found, chance = _estimate_ratio(predicted[own], true[own], block[own])
-        beyond = found - everywhere
+        beyond = _drop_bias_of_a_fold(found, everywhere, predicted[own], true[own], held.fold[own]) - everywhere
         kept = max(0.0, 1.0 - (chance / beyond) ** 2) if beyond else 0.0
         value[number] = everywhere + kept * beyond
         std[number] = np.sqrt(kept * chance**2 + (1.0 - kept) * error**2)
     return Bias(np.clip(value, -_MOST_BIAS, _MOST_BIAS), std)
+
+
+def _drop_bias_of_a_fold(found: float, usual: float, predicted: Floats, true: Floats, fold: Ints) -> float:
+    """Return how far a bias is from the usual one whichever fold is left out, added to it.
+
+    A fold whose ground the others hardly have is predicted by a model that lacks it; the model of all samples has it, and not that bias.
+    """
+    folds = np.unique(fold)
+    if folds.size < 2:
+        return found
+    others = [fold != of for of in folds]
+    if min(map(np.count_nonzero, others)) < FEWEST:
+        return usual
+    parts = [found, *(_estimate_ratio(predicted[rows], true[rows], fold[rows])[0] for rows in others)]
+    low, high = min(parts) - usual, max(parts) - usual
+    return usual + (low if low > 0.0 else min(0.0, high))
 
 
 def _estimate_ratio(predicted: Floats, true: Floats, block: Ints) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from tcpipe.cost.adaptation import Run, make_metres
+from tcpipe.cost.adaptation import Metres, Run
 from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, fit_errors
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
@@ -101,7 +101,7 @@ class Predicted:
 def make_residuals(train: Split, said: Array) -> Residuals:
     """Return labels and held-out predictions of power and velocity, shape (N, 2), in the columns that a model keeps."""
     labels = train.labels.astype(np.float64)
-    columns = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class")}
+    columns = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class", "fold")}
     for number, (quantity, unit) in enumerate((("power", "watt"), ("velocity", "mps"))):
         columns |= {f"{quantity}_{unit}": labels[:, number], f"{quantity}_predicted_{unit}": said[:, number]}
     return columns
@@ -229,11 +229,14 @@ def collect_runs(model: Model, data: Dataset) -> list[Run]:
         here = columns["run_id"] == run
         of = {name: values[here].astype(np.float64) for name, values in columns.items() if name != "run_id"}
         step_m = np.diff(of["start_ns"]) * 1e-9 * (of["arc_length_m"] / of["measured T"])[:-1]
-        metres = make_metres(
-            model.physics, length_m=of["arc_length_m"], class_id=of["class_id"].astype(np.int64), slope_rad=of["slope_rad"],
-            turn_rad=np.nan_to_num(of["turn_radpm"]) * of["arc_length_m"], distance_m=np.insert(np.cumsum(step_m), 0, 0.0),
-            predicted={CALLED[q]: of[f"predicted {q}"] for q in "TE"}, measured={CALLED[q]: of[f"measured {q}"] for q in "TE"},
-        )  # fmt: skip
+        length_m = of["arc_length_m"]
+        metres = {
+            CALLED[q]: Metres(
+                of[f"predicted {q}"], of[f"measured {q}"], of["class_id"].astype(np.int64), np.insert(np.cumsum(step_m), 0, 0.0),
+                length_m, of["predicted T"], length_m * np.tan(of["slope_rad"]), of["turn_radpm"] * length_m,
+            )
+            for q in "TE"
+        }  # fmt: skip
         found.append(Run(str(run), metres))
     return found
 

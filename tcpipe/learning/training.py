@@ -464,7 +464,7 @@ def _make_residuals_table(samples: Samples, held_out: Labels) -> pa.Table:
     """Return labels and predictions of what was held out, one row a sample."""
     is_held, outputs = find_held_out(held_out), samples.inputs.outputs
     held, said, labels = samples.split.take(is_held), held_out[is_held], samples.labels[is_held]
-    columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class")}
+    columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class", "fold")}
     for number, name in enumerate(("power_watt", "velocity_mps") if len(outputs) > 1 else outputs):
         quantity, _, unit = name.rpartition("_")
         columns[name] = labels[:, number]

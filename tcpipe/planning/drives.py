@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.cost.adaptation import Run, make_metres
+from tcpipe.cost.adaptation import Metres, Run
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.dataset import Dataset
@@ -230,13 +230,20 @@ def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
     turning = None if model.takes_turns else find_turning(model.physics, model.classes)
     turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, said.terrain_class)
     start_xy_m = find_map_projection(source, gnss_crs).forward(read_lonlat_deg(segments, "start"))
-    metres = make_metres(
-        model.physics, length_m=length_m, class_id=said.terrain_class, slope_rad=said.slope_rad, turn_rad=turn_rad,
-        predicted={"duration": duration, "energy": said.power_watt * duration + turn_joule},
-        measured={"duration": to_floats(segments, "duration_s"), "energy": to_floats(segments, energy)},
-        distance_m=np.insert(np.cumsum(np.linalg.norm(np.diff(start_xy_m, axis=0), axis=1)), 0, 0.0),
-    )  # fmt: skip
-    return Run(run.run_id, {name: of.take(good) for name, of in metres.items()})
+    distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start_xy_m, axis=0), axis=1)), 0, 0.0)
+    both = {
+        "duration": (duration, to_floats(segments, "duration_s")),
+        "energy": (said.power_watt * duration + turn_joule, to_floats(segments, energy)),
+    }
+    return Run(
+        run.run_id,
+        {
+            name: Metres(
+                *of, said.terrain_class, distance_m, length_m, duration, length_m * np.tan(said.slope_rad), turn_rad
+            ).take(good)
+            for name, of in both.items()
+        },
+    )
 
 
 def _list_reasons(

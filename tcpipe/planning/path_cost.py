@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +12,14 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
-from tcpipe.cost.adaptation import Run, adapt, make_metres
+from tcpipe.cost.adaptation import ELSEWHERE_M, Metres, Run, adapt
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.rotation import wrap_to_pi
+from tcpipe.path import find_cuts
 from tcpipe.planning.cost_model import (
     CostModel,
     Reason,
@@ -174,12 +173,15 @@ def _sum_costs(
     if known is not None:
         if errors is None:
             raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
-        predicted = {"duration": duration, "energy": energy}
-        there = make_metres(
-            model.physics, length_m=pieces.arc_m, class_id=class_id, slope_rad=said.slope_rad, turn_rad=turn_rad,
-            predicted=predicted, measured=predicted, distance_m=np.cumsum(pieces.arc_m) - pieces.arc_m,
-        )  # fmt: skip
-        adapted = {name: adapt(errors[name], known.metres[name]).predict(of) for name, of in there.items()}
+        begin_m, rise_m = ELSEWHERE_M + np.cumsum(pieces.arc_m), pieces.arc_m * np.tan(said.slope_rad)
+        adapted = {
+            name: adapt(
+                errors[name],
+                known.metres[name],
+                Metres(of, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad),
+            )
+            for name, of in (("duration", duration), ("energy", energy))
+        }
         duration, energy = adapted["duration"].value, adapted["energy"].value
         (fast, slow), (least, most) = ((of.low, of.high) for of in (adapted["duration"], adapted["energy"]))
         sums = {name: of.total for name, of in adapted.items()}
@@ -318,10 +320,6 @@ def write_pieces(path: Path, table: pa.Table) -> None:
                 csv.write_csv(table, temporary)
 
 
-_LEAST_M = 1e-3
-"""A rest shorter than this is the rounding of coordinates, not a piece [m]."""
-
-
 @dataclass(frozen=True, slots=True)
 class Pieces:
     """N pieces of a path, in order.
@@ -356,29 +354,8 @@ def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
     scale : ground metres a map metre; over the some kilometres that a robot drives it is one number to 1e-5.
     """
     points = xy_m[np.r_[True, (np.diff(xy_m, axis=0) != 0.0).any(axis=1)]]
-    cuts = _find_cuts(points.tolist(), chord_m / scale)
+    cuts = find_cuts(points.tolist(), chord_m / scale)
     ends = np.array([(x, y) for x, y, _ in cuts]).reshape(-1, 2)
     arc = np.diff(np.array([length for _, _, length in cuts])) * scale
     chord = np.linalg.norm(np.diff(ends, axis=0), axis=1) * scale
     return Pieces(ends[:-1], ends[1:], chord, arc, scale)
-
-
-def _find_cuts(points: list[list[float]], radius: float) -> list[tuple[float, float, float]]:
-    """Return x, y and length so far of the path's start, of each cut and, if a rest is left, of its end."""
-    (x0, y0), length = points[0], 0.0
-    cuts = [(x0, y0, 0.0)]
-    for (ax, ay), (bx, by) in pairwise(points):
-        side = math.hypot(bx - ax, by - ay)
-        ux, uy = (bx - ax) / side, (by - ay) / side
-        while True:  # the point at s along this side is `radius` from the last cut
-            along, off = (x0 - ax) * ux + (y0 - ay) * uy, (x0 - ax) * uy - (y0 - ay) * ux
-            s = along + math.sqrt(max(radius * radius - off * off, 0.0))
-            if s > side:
-                break
-            x0, y0 = ax + s * ux, ay + s * uy
-            cuts.append((x0, y0, length + s))
-        length += side
-    rest = math.hypot(points[-1][0] - x0, points[-1][1] - y0)
-    if rest > _LEAST_M and length - cuts[-1][2] > _LEAST_M:
-        cuts.append((points[-1][0], points[-1][1], length))
-    return cuts

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.planning.plan import Plan
+from tcpipe.report.colours import CLASS_COLOURS
+from tcpipe.report.pictures import colour_classes, shade_heights
 from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.tiles import MapReader, choose_level, read_window
 
@@ -29,8 +31,6 @@ _INK, _FAINT = "#1d2830", "#7b8893"
 _COLOURS = {"energy": "#d4600c", "time": "#1668b8", "distance": "#4a4f55"}
 _LINES = {"energy": "-", "time": "-", "distance": (0, (5, 2))}
 _PANEL_PX = 900
-_TINTS = ("#b4535f", "#1f5a33", "#5d7f3a", "#93c46c", "#7a4b22", "#dcbc7e", "#a3a8b0")
-"""Of the paper's classes in order: obstacle, tree, vegetation, grass, mud, unpaved, paved; other tables go round."""
 
 _PANEL_WIDTH_IN = 4.4
 _REST_IN = 3.3
@@ -116,7 +116,7 @@ def _crop(source: MapReader, xy_m: Array) -> tuple[float, float, float, float]:
 
 
 class _Backdrop:
-    """The hill: shaded relief under the orthophoto, tinted by class, with contour lines."""
+    """The hill: shaded relief under the orthophoto, tinted by class."""
 
     def __init__(self, source: MapReader, bounds: tuple[float, float, float, float]) -> None:
         left, bottom, right, top = bounds
@@ -129,9 +129,9 @@ class _Backdrop:
         self._height = layers["height"].astype(np.float64) + level.height_reference_m
         pitch = level.grid.pixel_size_m * step
         self._extent = (left, right, bottom, top)
-        self._picture = _blend_picture(layers, _shade_relief(self._height, pitch))
+        self._picture = _blend_picture(layers, shade_heights(self._height, pitch))
         ids = np.unique(layers["terrain"]).tolist() if "terrain" in layers else []
-        self.classes = [(source.classes.name(i), _choose_colour(i)) for i in ids if i]
+        self.classes = [(source.classes.name(i), CLASS_COLOURS[(i - 1) % len(CLASS_COLOURS)]) for i in ids if i]
 
     def height_at(self, xy_m: Array) -> Array:
         """Return the height of the nearest pixel [m], shape (N,)."""
@@ -144,16 +144,6 @@ class _Backdrop:
     def draw(self, axes: Axes) -> None:
         """Draw it."""
         axes.imshow(self._picture, extent=self._extent, interpolation="bilinear")
-        known = self._height[np.isfinite(self._height)]
-        if known.size and np.ptp(known) > 1.0:
-            step = _round_nicely(float(np.ptp(known)) / 14.0)
-            levels = np.arange(np.ceil(known.min() / step) * step, known.max(), step)
-            left, right, bottom, top = self._extent
-            rows, cols = self._height.shape
-            x = left + (np.arange(cols) + 0.5) / cols * (right - left)
-            y = top - (np.arange(rows) + 0.5) / rows * (top - bottom)
-            lines = axes.contour(x, y, self._height, levels=levels, colors="#2b2013", linewidths=0.5, alpha=0.45)
-            axes.clabel(lines, levels[::3], fontsize=6.5, fmt="%g m")
         axes.set_xlim(*self._extent[:2])
         axes.set_ylim(*self._extent[2:])
         axes.set_aspect("equal")
@@ -163,39 +153,15 @@ class _Backdrop:
             spine.set_visible(False)
 
 
-def _choose_colour(class_id: int) -> str:
-    return _TINTS[(class_id - 1) % len(_TINTS)]
-
-
-def _shade_relief(height_m: Array, pixel_size_m: float) -> Array:
-    """Return light from the north-west at 40°, exaggerated to the relief there is, in [0, 1]; NaN without data."""
-    down, right = np.gradient(height_m, pixel_size_m)
-    steep = np.nanpercentile(np.hypot(down, right), 90.0) if np.isfinite(down).any() else 1.0
-    exaggeration = np.clip(0.5 / max(float(steep), 1e-3), 1.0, 6.0)
-    down, right = down * exaggeration, right * exaggeration
-    azimuth, altitude = np.radians(315.0), np.radians(40.0)
-    east, north, up = np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)
-    light = (-right * east + down * north + up) / np.sqrt(1.0 + right**2 + down**2)
-    return np.asarray(np.clip(light, 0.0, 1.0))
-
-
-def _blend_picture(layers: dict[str, Array], light: Array) -> Array:
-    """Return the picture, RGB in [0, 1]; what has no data is white."""
-    grey = np.full(light.shape, 0.7)
-    if "ortho" in layers:
-        ortho = layers["ortho"].astype(np.float64)
-        low, high = np.percentile(ortho[ortho > 0], (2.0, 98.0)) if (ortho > 0).any() else (0.0, 255.0)
-        grey = 0.35 + 0.6 * np.clip((ortho - low) / max(high - low, 1.0), 0.0, 1.0)
+def _blend_picture(layers: dict[str, NDArray[Any]], light: NDArray[np.uint8]) -> Array:
+    """Return the orthophoto under shaded relief, tinted by class, RGB in [0, 1]; what has no data is white."""
+    is_missing = np.any([layers[name] == 0 for name in ("ortho", "terrain") if name in layers], axis=0)
+    grey = layers["ortho"] / 255.0 if "ortho" in layers else np.full(light.shape, 0.7)
     picture = np.repeat(grey[..., None], 3, axis=2)
     if "terrain" in layers:
-        tints = np.array([[1.0, 1.0, 1.0]] + [mpl.colors.to_rgb(_choose_colour(i)) for i in range(1, 256)])
-        tint = tints[layers["terrain"]]
-        picture = picture * 0.45 + tint * 0.55
-    picture = np.clip(picture * (0.45 + 0.75 * light)[..., None], 0.0, 1.0)
-    missing = ~np.isfinite(light) | np.any(
-        [layers[name] == 0 for name in ("ortho", "terrain") if name in layers], axis=0
-    )
-    return np.where(missing[..., None], 1.0, picture)
+        picture = 0.45 * picture + 0.55 * colour_classes(layers["terrain"].astype(np.int64)) / 255.0
+    picture = np.clip(picture * (0.45 + 0.75 * light / 255.0)[..., None], 0.0, 1.0)
+    return np.where((is_missing | ~np.isfinite(layers["height"]))[..., None], 1.0, picture)
 
 
 def _draw_path(axes: Axes, plan: Plan, values: Array, scale: Normalize) -> LineCollection:

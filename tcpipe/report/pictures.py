@@ -90,7 +90,7 @@ def map_overview(source: MapFile) -> NDArray[np.uint8]:
     level, step = _level(source)
     layer = "ortho" if "ortho" in level.layers else "height"
     picture = _thin_layer(level, layer, step)
-    return picture.astype(np.uint8) if layer == "ortho" else _shaded(picture, step * level.grid.pixel_size_m)
+    return picture.astype(np.uint8) if layer == "ortho" else shade_heights(picture, step * level.grid.pixel_size_m)
 
 
 Bounds = tuple[float, float, float, float]
@@ -119,7 +119,7 @@ def draw_ortho(source: MapFile) -> NDArray[np.uint8]:
 def draw_relief(source: MapFile) -> NDArray[np.uint8]:
     """Return a shaded relief, shape (R, C)."""
     level, step = _level(source)
-    return _shaded(_thin_layer(level, "height", step), step * level.grid.pixel_size_m)
+    return shade_heights(_thin_layer(level, "height", step), step * level.grid.pixel_size_m)
 
 
 def draw_classes(source: MapFile) -> NDArray[np.uint8]:
@@ -191,7 +191,7 @@ def _thin_layer(level: MapFile, layer: str, step: int) -> Pixels:
     return np.block(blocks)
 
 
-def _shaded(height_m: NDArray[np.generic], pixel_size_m: float) -> NDArray[np.uint8]:
+def shade_heights(height_m: NDArray[np.generic], pixel_size_m: float) -> NDArray[np.uint8]:
     """Return Lambert shading of a height field lit from the north-west, 45° above the horizon; no data is white."""
     down, right = np.gradient(height_m.astype(float), pixel_size_m)
     light = (1.0 + right / np.sqrt(2.0) + down / np.sqrt(2.0)) / np.sqrt(2.0 * (1.0 + right**2 + down**2))

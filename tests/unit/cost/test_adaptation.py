@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.cost.adaptation import MEAN, MODEL, Metres, Run, adapt, compare_adaptations
+from tcpipe.cost.adaptation import ELSEWHERE_M, MEAN, MODEL, Metres, Run, adapt, compare_adaptations
 from tcpipe.cost.prediction_errors import fit_errors
 
 
@@ -30,8 +30,8 @@ def made_run(rng, metres=300, *, scale=1.0, offset=0.0, payload=0.0):
     slope = 0.1 * np.sin(np.arange(metres) / 15.0 + rng.uniform(0.0, 6.0))
     predicted = 150.0 + 600.0 * slope + rng.normal(0.0, 10.0, metres)
     measured = (scale * predicted + offset + payload * 600.0 * slope) * (1.0 + 0.05 * rng.standard_normal(metres))
-    along = np.arange(metres, dtype=float)
-    return Metres(predicted, measured, np.full(metres, 4), along, np.ones(metres), 600.0 * slope[:, None])
+    along, ones = np.arange(metres, dtype=float), np.ones(metres)
+    return Metres(predicted, measured, np.full(metres, 4), along, ones, ones, slope, 0.0 * ones)
 
 
 CHANGES = {"same": {}, "heavier": {"payload": 0.4}, "another robot": {"scale": 1.5, "offset": -20.0}}
@@ -39,19 +39,22 @@ CHANGES = {"same": {}, "heavier": {"payload": 0.4}, "another robot": {"scale": 1
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_an_adapted_model_is_better_and_its_intervals_cover(change):
-    """90 % of metres and of sums after 50 m, of 60 runs (a share of 60 has a deviation of 4 %); the error falls to that of the noise."""
+    """At least 90 % of metres and of sums after 50 m, less the chance of 60 runs; the error falls to that of the noise.
+
+    They are somewhat too wide here: that the ground of the rest is that of the known metres is not known from 50 m.
+    """
     rng, errors = np.random.default_rng(1), made_errors()
     runs = [Run(str(number), {"energy": made_run(rng, **change)}) for number in range(60)]
     found = {(of.metres, of.predictor): of for of in compare_adaptations({"energy": errors}, runs, (0, 10, 50))}
     plain, some, much = (found[metres, MODEL] for metres in (0, 10, 50))
     assert {(of.runs, of.samples) for of in found.values()} == {(60, 60 * 250)}
-    assert 86.0 <= much.coverage_percent <= 97.0
+    assert 86.0 <= much.coverage_percent <= 99.0
     assert much.totals_inside >= 48
     if change:
         assert plain.coverage_percent < 60.0  # what is not adapted is sure of itself, and wrong
         assert much.rmse < 0.7 * plain.rmse
         assert much.rmse < some.rmse
-        assert much.rmse < 0.8 * found[50, MEAN].rmse
+        assert much.rmse < 0.5 * found[50, MEAN].rmse
     else:
         assert much.rmse < 1.03 * plain.rmse  # nothing is lost where nothing is to be adapted
 
@@ -60,8 +63,8 @@ def test_a_long_run_leaves_the_least_squares_fit():
     """With very many metres the prior counts nothing: numpy's own least squares, weighted by the spreads, says the same."""
     errors, known = made_errors(), made_run(np.random.default_rng(3), 1500, scale=1.4, offset=15.0, payload=0.2)
     errors = replace(errors, correlation=np.zeros_like(errors.correlation))
-    adapted = adapt(errors, known).predict(known).value
-    design = np.column_stack([known.predicted, known.length_m, known.physics])
+    adapted = adapt(errors, known, replace(known, distance_m=known.distance_m + ELSEWHERE_M)).value
+    design = np.column_stack([known.predicted, known.length_m, known.rise_m])
     spread = errors.compute_std(known.predicted, known.class_id)
     by_hand = design @ np.linalg.lstsq(design / spread[:, None], known.measured / spread, rcond=None)[0]
     np.testing.assert_allclose(adapted, by_hand, rtol=0.01)
@@ -71,7 +74,7 @@ def test_one_metre_hardly_moves_the_model():
     errors, run = made_errors(), made_run(np.random.default_rng(4))
     first = run.take(np.arange(300) < 1)
     odd = replace(first, measured=first.predicted * 1.1)
-    ratio = adapt(errors, odd).predict(run).value / run.predicted
+    ratio = adapt(errors, odd, run).value / run.predicted
     assert 1.0 < ratio.mean() < 1.08
 
 

@@ -66,6 +66,19 @@ def test_the_few_samples_of_a_class_err_alike_and_make_no_bias_of_it():
     assert power[0] == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.parametrize(("is_everywhere", "power_ratio"), [(True, 1.25), (False, 1.0)])
+def test_a_bias_of_the_only_fold_with_a_class_is_none_of_the_model(is_everywhere, power_ratio):
+    """Forty metres of a class, all but three in one fold: what the other folds say of it there is not what the model of all folds says."""
+    residuals = made_residuals(1000, sigma=0.02)
+    fold = np.arange(1000) // 8 % 5
+    of_class = np.flatnonzero(fold < 5 if is_everywhere else fold == 0)[:37]
+    rows = np.concatenate([of_class, np.flatnonzero(fold > 0)[-3:]])
+    is_class = np.isin(np.arange(1000), rows)
+    few = {**residuals, "fold": fold, "terrain_class": np.where(is_class, 7, 4).astype(np.uint8)}
+    power, _ = fit_bias_correction(_with_power(few, 1.25, is_class)).apply(np.ones(1), np.ones(1), np.array([7]))
+    assert power[0] == pytest.approx(power_ratio, abs=0.03)
+
+
 def test_an_end_that_two_metres_share_is_an_error_of_neither_together():
     """Where one metre is too long its neighbour is too short: ten in a row err like the two outer ends alone."""
     residuals, rng = made_residuals(8000), np.random.default_rng(1)

@@ -133,7 +133,7 @@ def test_one_rule_centres_every_predictor(sets, is_of_energy):
     train = data["train"]
     factor = np.where(train.column("terrain_class") == 4, 1.2, 1.0)
     said = np.column_stack([train.labels[:, 0] * factor, train.labels[:, 1]]).astype(float)
-    residuals = make_residuals(train, said)
+    residuals = {name: values for name, values in make_residuals(train, said).items() if name != "fold"}
     test = parts["test"]
     again = np.where(test.class_ids == 4, 1.2, 1.0)
     outputs = np.column_stack([test.costs["w"] * again, test.costs["v"]])
