@@ -200,7 +200,8 @@ def train(
     if kind.channels and rules.layers and rules.model != "auto":
         raise UsageError(f"--layers: a model of kind {name} takes the slope and class of a metre, no patch; remove it")
     if kind.channels:
-        logger.info("%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
+        level = logging.WARNING if rules.layers else logging.INFO
+        logger.log(level, "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
     elif variant is None:
         _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
     task = make_training_task(data, rules.fold, other, kind)

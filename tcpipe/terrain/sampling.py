@@ -26,7 +26,7 @@ from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
-from tcpipe.terrain.tiles import BandReader, MapReader, TilePool, choose_level, group_by_tile, read_window
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -125,8 +125,8 @@ def sample_patches(
         for stack, names in stacks.items()
         for number, name in enumerate(names)
     }
-    for name, source_bands in level.banded.items():
-        found[name] = sample_bands(source_bands, frames, patch_m=patch_m, patch_px=patch_px)
+    for name in level.banded:
+        found[name] = _sample_bands(level, name, frames, patch_m=patch_m, patch_px=patch_px)
         known = np.isfinite(found[name]).mean(axis=(1, 2, 3)) if chord_m.size else stats[:, 3]
         stats[:, 3] = np.minimum(stats[:, 3], known)
     return Patches(
@@ -141,12 +141,13 @@ def sample_patches(
     )
 
 
-def sample_bands(source: BandReader, frames: PatchFrames, *, patch_m: float, patch_px: int) -> NDArray[Any]:
+def _sample_bands(level: MapReader, name: str, frames: PatchFrames, *, patch_m: float, patch_px: int) -> NDArray[Any]:
     """Return patches of all bands of a layer, bilinear, shape (N, bands, own px, own px); NaN where a tap has no data.
 
     A patch whose pixels are wider than the layer's is averaged over so many points that none of these is skipped.
     """
-    layer, count = source.layer.at_patch(patch_m, patch_px), len(frames.centre_xy_m)
+    source, count = level.banded[name], len(frames.centre_xy_m)
+    layer = source.layer.at_patch(patch_m, patch_px)
     parts = math.ceil(FINE_ENOUGH * patch_m / layer.own_px / layer.pixel_size_m)
     side = layer.own_px * parts
     pixels = map_px_from_patch(frames, source.grid, patch_m=patch_m, patch_px=side)
@@ -159,7 +160,8 @@ def sample_bands(source: BandReader, frames: PatchFrames, *, patch_m: float, pat
         corners = origin + (side - 1) * (np.arange(2)[:, None, None] * along + np.arange(2)[:, None] * down)
         corners = np.clip(np.nan_to_num(corners, nan=-2.0), -2.0, beyond).reshape(-1, 2)
         first, last = np.floor(corners.min(axis=0)).astype(int) - 1, np.ceil(corners.max(axis=0)).astype(int) + 2
-        window = _read_bands(source, *first.tolist(), *last.tolist())
+        (left, top), (right, bottom) = first.tolist(), last.tolist()
+        window = np.moveaxis(read_window(level, name, top, bottom, left, right), 0, 2).astype(np.float32, order="C")
         for start in range(0, len(group), together):
             part = slice(start, start + together)
             px = origin[part] + column * along[part] + row * down[part]
@@ -167,17 +169,6 @@ def sample_bands(source: BandReader, frames: PatchFrames, *, patch_m: float, pat
             cells = found.reshape(len(found), -1, layer.own_px, parts, layer.own_px, parts)
             out[group[part]] = cells.mean(axis=(3, 5))
     return out
-
-
-def _read_bands(source: BandReader, left: int, top: int, right: int, bottom: int) -> NDArray[np.float32]:
-    """Return a window of a layer that may reach beyond it, where it holds no data, shape (rows, columns, bands)."""
-    window = np.full((bottom - top, right - left, len(source.layer.bands)), np.nan, np.float32)
-    row0, row1 = max(top, 0), min(bottom, source.grid.rows)
-    col0, col1 = max(left, 0), min(right, source.grid.cols)
-    if row0 < row1 and col0 < col1:
-        there = np.moveaxis(source.read(row0, row1, col0, col1), 0, 2)
-        window[row0 - top : row1 - top, col0 - left : col1 - left] = there
-    return window
 
 
 def _interpolate_bands(window: NDArray[np.float32], px: NDArray[np.float64]) -> NDArray[np.float32]:

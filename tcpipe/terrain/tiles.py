@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import Any, Protocol
 
@@ -24,20 +25,16 @@ _STRIP_TILES = CACHED_TILES // 3 - 3
 """Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
 
 
-class Tiled(Protocol):
-    """Pixels in tiles that are cheap to read."""
+class BandReader(Protocol):
+    """A layer of several bands on a grid of its own."""
 
     @property
     def grid(self) -> MapGrid:
-        """Where the pixels lie."""
+        """Where its pixels lie."""
 
     @property
     def tile_px(self) -> int:
-        """Side of the square tiles, aligned with pixel (0, 0)."""
-
-
-class BandReader(Tiled, Protocol):
-    """A layer of several bands on a grid of its own."""
+        """As of `MapReader`."""
 
     @property
     def layer(self) -> Layer:
@@ -119,7 +116,7 @@ def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
     return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 
 
-def group_by_tile(px: NDArray[np.float64], source: Tiled) -> Iterator[NDArray[np.int64]]:
+def group_by_tile(px: NDArray[np.float64], source: MapReader | BandReader) -> Iterator[NDArray[np.int64]]:
     """Yield the indices of pixel positions, shape (N, 2), by tile; within a tile in Z-order.
 
     Tiles come row by row inside strips narrow enough that a tile is still held when the rows above and below want it.
@@ -136,13 +133,15 @@ def group_by_tile(px: NDArray[np.float64], source: Tiled) -> Iterator[NDArray[np
 def read_window(  # noqa: PLR0917
     source: MapReader, layer: str, row0: int, row1: int, col0: int, col1: int
 ) -> NDArray[Any]:
-    """Return a window of a layer that may reach beyond the map, where it holds no data."""
-    dtype = source.layers[layer].mapped
-    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), find_no_data_value(dtype), dtype)
-    top, bottom = max(row0, 0), min(row1, source.grid.rows)
-    left, right = max(col0, 0), min(col1, source.grid.cols)
+    """Return a window of a layer that may reach beyond the map, where it holds no data; (bands, rows, columns) of one of several."""
+    bands = source.banded.get(layer)
+    of, grid = (source.layers[layer], source.grid) if bands is None else (bands.layer, bands.grid)
+    read = partial(source.read, layer) if bands is None else bands.read
+    lead = (len(of.bands),) if of.bands else ()
+    out: NDArray[Any] = np.full((*lead, row1 - row0, col1 - col0), find_no_data_value(of.mapped), of.mapped)
+    top, bottom, left, right = max(row0, 0), min(row1, grid.rows), max(col0, 0), min(col1, grid.cols)
     if top < bottom and left < right:
-        out[top - row0 : bottom - row0, left - col0 : right - col0] = source.read(layer, top, bottom, left, right)
+        out[..., top - row0 : bottom - row0, left - col0 : right - col0] = read(top, bottom, left, right)
     return out
 
 

@@ -144,7 +144,9 @@ def build_map(
             _write_layers(writer, layers, grid)
             for of in banded.values():
                 of.write(writer)
-            every = layers | {role: of.find_sparsest() for role, of in banded.items()}
+            every = layers | {
+                role: min(of.bands, key=lambda band: band.tally.pixels) for role, of in banded.items()
+            }  # of several bands that with the least data counts
             _refuse_empty(every)
             sides_m = {role: of.grid.pixel_size_m for role, of in banded.items()}
             facts = _make_facts(grid, every, sides_m, origin, inputs or MapInputs())
@@ -177,10 +179,6 @@ class BandedLayer:
         layer, pixel_size_m = self.bands[0].layer, self.grid.pixel_size_m
         ranges = [(band.tally.low, band.tally.high) for band in self.bands]
         return make_banded_layer(layer.name, layer.unit, ranges, self.dtype, pixel_size_m)
-
-    def find_sparsest(self) -> RasterLayer:
-        """Return the band with the fewest pixels that have data."""
-        return min(self.bands, key=lambda band: band.tally.pixels)
 
 
 def _place_bands(of: RasterLayer, grid: MapGrid, name: str) -> BandedLayer:

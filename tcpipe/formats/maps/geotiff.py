@@ -240,7 +240,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
                 affine=tuple(dataset.transform)[:6],
                 rows=dataset.height,
                 cols=dataset.width,
-                kind=f"{many}{dataset.dtypes[bands[0] - 1]} ({_shorten(colours)}{', ' if unit else ''}{unit})",
+                kind=f"{many}{dataset.dtypes[bands[0] - 1]} ({colours[:80]}{', ' if unit else ''}{unit})",
                 findings=(*unusual, *ignored),
                 names=read_value_names(_describe_as_vrt(dataset), bands[0]) if use == "classes" else {},
                 source=source,
@@ -416,7 +416,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
     most = MAX_BANDS if use == "numbers" else 1
     if not 1 <= len(plain) <= most or len(kinds) > 1:
         wanted = "one" if most == 1 else f"1 to {most} of one type"
-        raise MapError(f"{path}: {role} has {dataset.count} bands ({_shorten(names)}), expected {wanted}")
+        raise MapError(f"{path}: {role} has {dataset.count} bands ({names[:80]}), expected {wanted}")
     kind = kinds.pop()
     wanted = "metres" if use == "metres" else "numbers"
     if use != "classes" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
@@ -427,10 +427,6 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
     if use == "classes" and kind.kind not in "iu":
         raise MapError(f"{path}: {role} is {kind}, expected integer class values")
     return tuple(plain), ()
-
-
-def _shorten(names: str) -> str:
-    return names if len(names) < 80 else f"{names[:80]} …"
 
 
 def _fits_half(dataset: Any, bands: tuple[int, ...], scale: tuple[float, float]) -> bool:
