@@ -253,7 +253,8 @@ page for the code, or for words such as dropout, lever arm, time offset, drift, 
 An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
 unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
 ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect STORE/runs/RUN` lists all
-findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
+findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints;
+of a suspect sensor it also prints the line that excludes it by name.
 """
 
 
@@ -266,6 +267,10 @@ def _findings() -> str:
     return "\n".join(parts)
 
 
+_EXCLUSION = "To exclude it by name"
+"""A remedy of many findings, which the page states once."""
+
+
 def _finding(code: str, entry: Entry) -> str:
     more: list[str] = [entry.severity, *([entry.action] if entry.action != "kept" else [])]
     more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
@@ -275,7 +280,7 @@ def _finding(code: str, entry: Entry) -> str:
     lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
     remedies = [
         *([_sentence(entry.advice)] if entry.advice else []),
-        *(f"{text}: …" for text in entry.remedies.values()),
+        *(f"{text}: …" for text in entry.remedies.values() if text != _EXCLUSION),
     ]
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())

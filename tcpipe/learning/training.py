@@ -415,13 +415,15 @@ def _make_result(place: Path | str, status: str, training: Training, times: Trai
 def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: ModelKind) -> ModelCard:
     card, config, inputs = data.card, samples.config, samples.inputs
     is_held = find_held_out(fitted.held_out)
-    used, held = samples.split if is_held.all() else samples.split.take(~is_held), samples.take(is_held)
+    is_network = getattr(fitted.predictor, "stops_by_fold", False)
+    used = samples.split.take(samples.folds != config.fold) if is_network else samples.split
+    held = samples.take(is_held)
     return ModelCard(
         architecture=Architecture(
             inputs.patch_px,
             len(inputs.planes),
             len(inputs.outputs),
-            0 if is_held.all() else config.width,
+            config.width if is_network else 0,
             len(inputs.extra_features),
         ),
         channels=inputs.channels,
