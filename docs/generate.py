@@ -96,6 +96,7 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
         next(word for word in names.split() if word.startswith("--")) for names in also if "--help" not in names
     ]
     body = formatter.getvalue().rstrip() + (f"\n\nAlso: {', '.join(long_names)}" if long_names else "")
+    body = body.replace(" [OPTIONS]", "", 1)
     return f"## tcpipe {context.info_name}\n\n```\n{body}\n```\n"
 
 
@@ -321,7 +322,8 @@ def _robots() -> str:
         only += ("in place of those above" if source.fallback else None,)
         counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
         drawn = source.sign.removeprefix("drawn_")
-        fields = f"{source.voltage} | {counter or source.current}{', with ' + source.other_loads if source.other_loads else ''}"
+        loads = source.other_loads.partition(" (")[0]
+        fields = f"{source.voltage} | {counter or source.current}{', with ' + loads if loads else ''}"
         averaged = "found from motion" if source.averaging_unknown else "yes" if source.averaged else "no"
         cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.open_questions)
         power += f"| {' | '.join(cells)} |\n"
