@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Residuals
 from tcpipe.dataset import Dataset, Split
-from tcpipe.dataset.extra_features import read_extra_features
+from tcpipe.dataset.extra_features import available_features, read_extra_features
 from tcpipe.errors import DatasetError, ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult
+from tcpipe.learning.fitting import ModelKind, Task
 from tcpipe.learning.metrics import (
     ALL,
     FEWEST_GROUPS,
     LEAST,
-    Array,
     Errors,
     Spread,
     compare_errors,
@@ -30,36 +28,24 @@ from tcpipe.learning.metrics import (
     compute_errors_by_class,
 )
 from tcpipe.learning.models import Model
-from tcpipe.learning.physics_model import Form, find_idle_power, fit_curves, fit_physics_model
 from tcpipe.learning.predictions import Measured, Predicted, make_residuals, predict_costs, predict_spreads
-from tcpipe.learning.predictor import find_kind
-from tcpipe.learning.training import Variant
+from tcpipe.learning.predictor import Fitted, Job, Samples, find_kind, predict_samples
+from tcpipe.learning.training import Variant, make_samples
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
 
-CURVES: Mapping[Form, str] = {
+CURVES: Mapping[ModelKind, str] = {
     "mean": "mean per class",
     "linear": "class and slope, linear",
     "spline": "class and slope, spline",
 }
 PHYSICS, TREES = "physics", "gradient boosting"
-SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
-BASELINE_OF_KIND: Mapping[str, str] = {str(form): name for form, name in CURVES.items()} | {
-    PHYSICS: PHYSICS,
-    "boosting": TREES,
-}
-"""What a baseline is called that would be the model itself."""
+BASELINES: Mapping[ModelKind, str] = {**CURVES, "physics": PHYSICS, "boosting": TREES}
+"""What each kind of model is called as a baseline, simplest first."""
 
 _ALIKE = 1.005
 """Ratio up to which errors are the same: by digits of rounding nobody is better."""
-
-Predict = Callable[[Split], Array]
-"""Power [W] and velocity [m/s] of the samples of a split, shape (N, 2)."""
-
-
-Fit = Callable[[Split], tuple[Predict, Array | None]]
-"""From training samples to a predictor; and what the other folds say of each of them, where that comes with it."""
 
 
 def compare_baselines(
@@ -70,24 +56,32 @@ def compare_baselines(
     The baselines are fitted on the training samples of ``data``, centred as the model is, and evaluated on ``sets``, the same samples as
     the predictions ``said`` of the model. ``seed`` is that of the bootstrap.
     """
-    own = BASELINE_OF_KIND.get(ours.card.training.kind)
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
         return [], [make_finding("baseline-missing", Subject("model", "baselines"), names=names)]
-    fitted, lacking = _fit_baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
-    logger.info("baselines: %s, fitted on %d samples", ", ".join(fitted), len(train))
-    found, block_m = list[BaselineResult](), data.card.recipe.split.block_m
-    for split, part in sets.items():
-        class_ids = read_extra_features(part.split).class_id
-        for name, (predict, residuals) in fitted.items():
-            theirs = Predicted.centre(residuals, predict(part.split), class_ids, ours.chord_m)
+    found, lacking, block_m = list[BaselineResult](), list[Finding](), data.card.recipe.split.block_m
+    for kind, name in BASELINES.items():
+        if kind == ours.card.training.kind:
+            continue
+        try:
+            samples, fitted = _fit_baseline(kind, ours, data, train)
+        except ModelError as error:
+            names = {"error": error.problems[0]}
+            lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
+            continue
+        residuals = make_residuals(samples.split, fitted.held_out.astype(np.float64))
+        logger.info("baseline %s: fitted on %d samples", name, len(samples))
+        for split, part in sets.items():
+            there = part.split.with_channels(*samples.inputs.channels)
+            outputs = predict_samples(fitted.predictor, replace(samples, split=there))
+            theirs = Predicted.centre(residuals, outputs, read_extra_features(there).class_id, ours.chord_m)
             found += compare_with_baseline(name, split, part, said[split], theirs, block_m=block_m, seed=seed)
     return found, lacking
 
 
 def _select_fitted_samples(train: Split, ours: Model) -> Split:
-    """Return the samples that a model of this kind is fitted on: for a network without the fold that stops it."""
+    """Return the labelled samples that a model was fitted to: for a network without the fold that stops it."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
     if not find_kind(ours.card.training.kind).stops_by_fold:
         return labelled
@@ -95,78 +89,20 @@ def _select_fitted_samples(train: Split, ours: Model) -> Split:
     return fitted if len(fitted) else labelled
 
 
-def _fit_baselines(
-    train: Split, ours: Model, wanted: Sequence[str]
-) -> tuple[dict[str, tuple[Predict, Residuals]], list[Finding]]:
-    """Return the baselines by name, with their held-out predictions, and a finding for each that cannot be fitted."""
-    fits: dict[str, Fit] = {name: partial(_fit_curves, form) for form, name in CURVES.items()}
-    fits |= {PHYSICS: _fit_physics, TREES: partial(_fit_trees, ours)}
-    found, lacking = dict[str, tuple[Predict, Residuals]](), list[Finding]()
-    for name in wanted:
-        try:
-            predict, said = fits[name](train)
-            found[name] = predict, make_residuals(train, _cross_fit(fits[name], train) if said is None else said)
-        except ModelError as error:
-            names = {"error": error.problems[0]}
-            lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
-    return found, lacking
-
-
-def _cross_fit(fit: Fit, train: Split) -> Array:
-    """Return what is said of each sample by a fit to the other folds; NaN where these are too few, which centres nothing."""
-    said, folds = np.full((len(train), 2), np.nan), train.column("fold")
-    for fold in np.unique(folds):
-        held = folds == fold
-        with suppress(ModelError):
-            said[held] = np.nan if held.all() else fit(train.take(~held))[0](train.take(held))
-    return said
-
-
-def _fit_curves(form: Form, train: Split) -> tuple[Predict, None]:
-    features = read_extra_features(train)
-    curves = fit_curves(form, features.slope_rad, features.class_id, train.labels.astype(np.float64))
-
-    def predict(split: Split) -> Array:
-        there = read_extra_features(split)
-        return curves.predict(there.slope_rad, there.class_id)
-
-    return predict, None
-
-
-def _fit_physics(train: Split) -> tuple[Predict, None]:
-    fitted = fit_physics_model(
-        read_extra_features(train), train.labels.astype(np.float64), idle_watt=find_idle_power(train)
-    )
-    return lambda split: fitted.predict(np.empty(0, np.float32), read_extra_features(split)), None
-
-
-def _fit_trees(ours: Model, train: Split) -> tuple[Predict, Array]:
-    """Return trees over features of all layers, and of the turn."""
-    from tcpipe.learning.table_model import compute_features, fit_table  # noqa: PLC0415  numba loads with it
-
-    folds, labels = train.column("fold"), train.labels.astype(np.float64)
-    if len(np.unique(folds)) < 2:
+def _fit_baseline(name: ModelKind, ours: Model, data: Dataset, train: Split) -> tuple[Samples, Fitted]:
+    """Return a kind of model fitted to samples; it knows the turn, and no other extra feature."""
+    kind, config = find_kind(name), replace(ours.card.training.config, model=name, extra_features=False)
+    train = train.with_channels(*kind.channels) if kind.channels else train
+    samples = make_samples(Task(train, train, train, train.label_columns), config, data, kind)
+    turn = tuple(of for of in available_features(samples.features) if of.name == "turn_radpm")
+    samples = replace(samples, inputs=replace(samples.inputs, extra_features=turn))
+    if len(np.unique(samples.folds)) > 1:
+        return samples, kind.fit_folds(samples, Job(name, "", Path()))
+    if name == "boosting":
         raise ModelError(
             f"{len(train)} training samples are in one fold, expected two or more, to choose the number of trees"
         )
-
-    def features(split: Split) -> Array:
-        return np.column_stack(
-            [
-                compute_features(split, ours.patch_m, ours.classes.count),
-                np.nan_to_num(read_extra_features(split).turn_radpm),
-            ]
-        )
-
-    model, said = fit_table(
-        features(train),
-        labels,
-        np.ones_like(labels),
-        folds,
-        channels=train.view.form.planes,
-        class_count=ours.classes.count,
-    )
-    return lambda split: model.predict(features(split)), said
+    return samples, Fitted(kind.fit(samples), np.full_like(samples.labels, np.nan))
 
 
 def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
