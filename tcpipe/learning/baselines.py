@@ -11,16 +11,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.cost.prediction_errors import Residuals
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import available_features, read_extra_features
 from tcpipe.errors import DatasetError, ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult
-from tcpipe.learning.fitting import ModelKind, Task
+from tcpipe.learning.fitting import FitConfig, ModelKind, Task
 from tcpipe.learning.metrics import (
     ALL,
     FEWEST_GROUPS,
     LEAST,
+    Array,
     Errors,
     Spread,
     compare_errors,
@@ -28,21 +30,23 @@ from tcpipe.learning.metrics import (
     compute_errors_by_class,
 )
 from tcpipe.learning.models import Model
+from tcpipe.learning.physics_model import Form
 from tcpipe.learning.predictions import Measured, Predicted, make_residuals, predict_costs, predict_spreads
-from tcpipe.learning.predictor import Fitted, Job, Samples, find_kind, predict_samples
+from tcpipe.learning.predictor import AUTOMATIC, Job, Predictor, Samples, find_kind, predict_samples
 from tcpipe.learning.training import Variant, make_samples
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
 
-CURVES: Mapping[ModelKind, str] = {
+CURVES: Mapping[Form, str] = {
     "mean": "mean per class",
     "linear": "class and slope, linear",
     "spline": "class and slope, spline",
 }
 PHYSICS, TREES = "physics", "gradient boosting"
-BASELINES: Mapping[ModelKind, str] = {**CURVES, "physics": PHYSICS, "boosting": TREES}
-"""What each kind of model is called as a baseline, simplest first."""
+SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
+BASELINE_OF_KIND: Mapping[ModelKind, str] = dict(zip(AUTOMATIC, SIMPLEST_FIRST, strict=True))
+"""What a baseline is called that would be the model itself."""
 
 _ALIKE = 1.005
 """Ratio up to which errors are the same: by digits of rounding nobody is better."""
@@ -56,32 +60,25 @@ def compare_baselines(
     The baselines are fitted on the training samples of ``data``, centred as the model is, and evaluated on ``sets``, the same samples as
     the predictions ``said`` of the model. ``seed`` is that of the bootstrap.
     """
+    own = BASELINE_OF_KIND.get(ours.card.training.kind)
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
         return [], [make_finding("baseline-missing", Subject("model", "baselines"), names=names)]
-    found, lacking, block_m = list[BaselineResult](), list[Finding](), data.card.recipe.split.block_m
-    for kind, name in BASELINES.items():
-        if kind == ours.card.training.kind:
-            continue
-        try:
-            samples, fitted = _fit_baseline(kind, ours, data, train)
-        except ModelError as error:
-            names = {"error": error.problems[0]}
-            lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
-            continue
-        residuals = make_residuals(samples.split, fitted.held_out.astype(np.float64))
-        logger.info("baseline %s: fitted on %d samples", name, len(samples))
-        for split, part in sets.items():
-            there = part.split.with_channels(*samples.inputs.channels)
-            outputs = predict_samples(fitted.predictor, replace(samples, split=there))
-            theirs = Predicted.centre(residuals, outputs, read_extra_features(there).class_id, ours.chord_m)
+    fitted, lacking = _fit_baselines(train, data, [name for name in SIMPLEST_FIRST if name != own])
+    logger.info("baselines: %s, fitted on %d samples", ", ".join(fitted), len(train))
+    found, block_m = list[BaselineResult](), data.card.recipe.split.block_m
+    for split, part in sets.items():
+        class_ids = read_extra_features(part.split).class_id
+        for name, (samples, predictor, residuals) in fitted.items():
+            there = replace(samples, split=part.split.with_channels(*samples.inputs.channels))
+            theirs = Predicted.centre(residuals, predict_samples(predictor, there), class_ids, ours.chord_m)
             found += compare_with_baseline(name, split, part, said[split], theirs, block_m=block_m, seed=seed)
     return found, lacking
 
 
 def _select_fitted_samples(train: Split, ours: Model) -> Split:
-    """Return the labelled samples that a model was fitted to: for a network without the fold that stops it."""
+    """Return the samples that a model of this kind is fitted on: for a network without the fold that stops it."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
     if not find_kind(ours.card.training.kind).stops_by_fold:
         return labelled
@@ -89,20 +86,33 @@ def _select_fitted_samples(train: Split, ours: Model) -> Split:
     return fitted if len(fitted) else labelled
 
 
-def _fit_baseline(name: ModelKind, ours: Model, data: Dataset, train: Split) -> tuple[Samples, Fitted]:
-    """Return a kind of model fitted to samples; it knows the turn, and no other extra feature."""
-    kind, config = find_kind(name), replace(ours.card.training.config, model=name, extra_features=False)
-    train = train.with_channels(*kind.channels) if kind.channels else train
-    samples = make_samples(Task(train, train, train, train.label_columns), config, data, kind)
-    turn = tuple(of for of in available_features(samples.features) if of.name == "turn_radpm")
-    samples = replace(samples, inputs=replace(samples.inputs, extra_features=turn))
-    if len(np.unique(samples.folds)) > 1:
-        return samples, kind.fit_folds(samples, Job(name, "", Path()))
-    if name == "boosting":
-        raise ModelError(
-            f"{len(train)} training samples are in one fold, expected two or more, to choose the number of trees"
-        )
-    return samples, Fitted(kind.fit(samples), np.full_like(samples.labels, np.nan))
+def _fit_baselines(
+    train: Split, data: Dataset, wanted: Sequence[str]
+) -> tuple[dict[str, tuple[Samples, Predictor, Residuals]], list[Finding]]:
+    """Return the baselines by name, with their held-out predictions, and a finding for each that cannot be fitted."""
+    found, lacking = dict[str, tuple[Samples, Predictor, Residuals]](), list[Finding]()
+    for kind, name in ((kind, name) for kind, name in BASELINE_OF_KIND.items() if name in wanted):
+        try:
+            samples, predictor, said = _fit_baseline(find_kind(kind), train, data)
+            found[name] = samples, predictor, make_residuals(train, said)
+        except ModelError as error:
+            names = {"error": error.problems[0]}
+            lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
+    return found, lacking
+
+
+def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[Samples, Predictor, Array]:
+    """Return a fitted kind, and what the other folds say of each sample; NaN where these are too few, which centres nothing."""
+    turn = tuple(of.name for of in available_features(read_extra_features(train)) if of.name == "turn_radpm")
+    if kind.features is None:  # trees take the turn, but not the commanded speed
+        kind = type(kind.__name__, (kind,), {"features": turn})
+    split = train.with_channels(*kind.channels) if kind.channels else train
+    samples = make_samples(Task(split, split, split, split.label_columns), FitConfig(), data, kind)
+    try:
+        fitted = kind.fit_folds(samples, Job("", "", Path()))
+    except ModelError:
+        return samples, kind.fit(samples), np.full(samples.labels.shape, np.nan)
+    return samples, fitted.predictor, fitted.held_out.astype(np.float64)
 
 
 def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:

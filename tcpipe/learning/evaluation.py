@@ -20,7 +20,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import (
-    BASELINES,
+    BASELINE_OF_KIND,
     CURVES,
     OURS,
     Trained,
@@ -350,7 +350,7 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
             yield make_finding(f"{name}-no-better-than-curves", subject)
         if quantity == "E" and not of.beats_all:
             best, ratio = of.best.baseline, of.best.rmse_ratio.value or 0.0
-            kind = next(kind for kind, baseline in BASELINES.items() if baseline == best)
+            kind = next(kind for kind, baseline in BASELINE_OF_KIND.items() if baseline == best)
             is_other = of.is_worse and kind != found.model.training.kind
             remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
             names = {"baseline": best}
