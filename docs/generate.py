@@ -66,12 +66,9 @@ _COMMON = "Every command has `--help`; `Also:` lists which of the others it has.
 
 
 def _shared_options(contexts: Sequence[click.Context]) -> dict[str, str]:
-    """Return the options, with their help, that at least four commands have in the same words."""
+    """Return the options, with their help, that several commands have in the same words."""
     records = Counter(record for context in contexts for record in _option_records(context))
-    return {names: text for (names, text), commands in records.items() if commands >= _COMMANDS}
-
-
-_COMMANDS = 4
+    return {names: text for (names, text), commands in records.items() if commands > 1}
 
 
 def _option_records(context: click.Context) -> list[tuple[str, str]]:
