@@ -61,10 +61,8 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
 
     A second call with the same files and options does nothing.
 
-    Raises
-    ------
-    MapError, StoreError
-        When a raster cannot be had or placed, the classes are not the store's, or the store cannot be written: the store is as it was.
+    Raises `MapError`, `StoreError`: a raster cannot be had or placed, the classes are not the store's, or the store cannot be written: the
+    store is as it was.
     """
     name, layers, categorical = options.name, options.layers or {}, options.categorical or {}
     _refuse_layers(layers, categorical, ortho=bool(options.ortho or options.stac), ortho_bands=options.ortho_bands)

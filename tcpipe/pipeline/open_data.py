@@ -41,9 +41,7 @@ class MapPlan:
 def plan_open_data(options: AddMapOptions) -> MapPlan:
     """Return what `tcpipe.add_map` with these options would take from its catalogue; only heads of rasters are read.
 
-    Raises
-    ------
-    UsageError, MapError, StoreError : there is no catalogue, no run or no raster, or what there is cannot be used.
+    Raises `UsageError`, `MapError`, `StoreError`: there is no catalogue, no run or no raster, or what there is cannot be used.
     """
     if options.stac is None:
         raise UsageError("--dry-run: says what --stac would take; give --stac, too")

@@ -50,9 +50,7 @@ def propose_recipe(
 ) -> ProposedRecipe:
     """Return the recipe for a log, or the first of a folder's, or the tables in a folder, whatever recipe there is.
 
-    Raises
-    ------
-    LogError, UsageError : there is nothing to read.
+    Raises `LogError`, `UsageError`: there is nothing to read.
     """
     path = path if is_url(path) else Path(path)
     if isinstance(path, Path) and (is_store(path) or (path / "dataset.json").is_file()):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import PatchFiles, find_rows_in_files, open_patches, read_samples
+from tcpipe.formats.dataset_files import PatchFiles, find_places_in_files, open_patches, read_samples
 from tcpipe.formats.json_files import Json
 from tcpipe.report.pictures import ACROSS, colour_classes, colour_heights, encode_picture, make_picture_uri, make_sheet
 from tcpipe.tables.columns import to_floats
@@ -73,9 +73,7 @@ class _Patches:
 def _open_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
     files = open_patches(directory, card)
     splits = samples.column("split").to_numpy(zero_copy_only=False)
-    place = np.empty(samples.num_rows, dtype=np.int64)
-    for name, rows in find_rows_in_files(card, splits).items():
-        place[splits == name] = rows
+    place = find_places_in_files(card, splits)
     piece = np.searchsorted(files.starts, place, side="right") - 1
     return _Patches(files, place, piece, choose_thinning(card.patch_px))
 
@@ -124,9 +122,7 @@ def find_picture_folder(card: DatasetCard) -> tuple[str, int]:
 def iterate_pictures(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
     """Yield file name and content of the pictures of all patches, in the order of the samples.
 
-    Raises
-    ------
-    DatasetError : they cannot be read.
+    Raises `DatasetError`: they cannot be read.
     """
     samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
     patches = _open_patches(directory, card, samples)

@@ -216,8 +216,9 @@ def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
 
 
 def _make_label_sections(samples: pa.Table) -> list[Section]:
-    plots = label_histograms(samples, "samples") if samples.num_rows else []
-    return [Section("Labels", "One value per sample.", plots=plots)] if samples.num_rows else []
+    if not samples.num_rows:
+        return []
+    return [Section("Labels", "One value per sample.", plots=label_histograms(samples, "samples"))]
 
 
 def _draw_distances(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:

@@ -71,6 +71,10 @@ class RasterSpec:
     terrain_shift_m: tuple[float, float] = (0.017, 0.008)
 
 
+_COARSE = RasterSpec(0.1, 0.12, 0.1)
+_WESTERN_HALF = ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0))
+
+
 @dataclass(frozen=True, slots=True)
 class Scenario:
     """A site with its drives."""
@@ -158,7 +162,7 @@ def _make_paper_quick() -> Scenario:
         for number, start in enumerate(starts, 1)
     )  # fmt: skip
     world = replace(make_small_world(), surface=make_paper_surface(), resistance=site.world.resistance)
-    return Scenario("paper_quick", world, drives, _WEST, RasterSpec(0.1, 0.12, 0.1))
+    return Scenario("paper_quick", world, drives, _WEST, _COARSE)
 
 
 def _make_demo() -> Scenario:
@@ -168,9 +172,7 @@ def _make_demo() -> Scenario:
         name="demo",
         world=_make_visible_world(),
         drives=(
-            DriveSpec(
-                "husky_2023-11-14_a", Wander(170.0, (110.0, 30.0)), (110.0, 30.0), "mcap", HUSKY_ROS2, Sensors(), faults
-            ),
+            DriveSpec("husky_2023-11-14_a", Wander(170.0, (110.0, 30.0)), (110.0, 30.0), faults=faults),
             DriveSpec(
                 "husky_2023-11-14_b", Wander(170.0, (90.0, 55.0)), (90.0, 55.0), "bag", HUSKY_ROS1, pose_only, faults
             ),
@@ -180,17 +182,14 @@ def _make_demo() -> Scenario:
 
 
 def _make_hills12() -> Scenario:
-    sensors = replace(Sensors(), imu=Imu(rate_hz=200.0))
     drive = DriveSpec(
         "hills12",
         Wander(500.0, (14.0, 34.0), climbing=0.5),
         (14.0, 34.0),
-        "mcap",
-        Recorder("ros2", "clearpath_power"),
-        sensors,
-        Faults.every(),
+        sensors=replace(Sensors(), imu=Imu(rate_hz=200.0)),
+        faults=Faults.every(),
     )
-    return Scenario("hills12", make_small_world(), (drive,), region_m=_WEST)
+    return Scenario("hills12", make_small_world(), (drive,), _WEST)
 
 
 def make_tiny(
@@ -215,8 +214,7 @@ def make_tiny(
         "tiny", plan, (14.0, 34.0), container, recorder, sensors if sensors is not None else Sensors(),
         faults if faults is not None else Faults(),
     )  # fmt: skip
-    region = ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0))
-    return Scenario("tiny", make_small_world(), (drive,), region, RasterSpec(0.1, 0.12, 0.1))
+    return Scenario("tiny", make_small_world(), (drive,), _WESTERN_HALF, _COARSE)
 
 
 def _make_manoeuvres() -> Scenario:
@@ -234,13 +232,8 @@ def _make_manoeuvres() -> Scenario:
         Leg(((20.0, 56.0),), command=0.5),
         Pause(2.0),
     )
-    drive = DriveSpec("manoeuvres", plan, (14.0, 34.0), "mcap", HUSKY_ROS2, Sensors(), Faults())
     return Scenario(
-        "manoeuvres",
-        make_small_world(),
-        (drive,),
-        ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0)),
-        RasterSpec(0.1, 0.12, 0.1),
+        "manoeuvres", make_small_world(), (DriveSpec("manoeuvres", plan, (14.0, 34.0)),), _WESTERN_HALF, _COARSE
     )
 
 

@@ -31,15 +31,12 @@ from tcpipe.tables.levels import STREAMS, Sensor, Streams
 def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Profiles) -> Streams:
     """Return the streams of a log.
 
+    Raises `RoleError`: a role cannot be decided, or no topic measures motion; `RecipeError`: no profile has the robot's name.
+
     Parameters
     ----------
     config : topics, extrinsics, clocks and power, where the log does not say.
     robot : profile name; None finds it by message types and topic names.
-
-    Raises
-    ------
-    RoleError : a role cannot be decided, or no topic measures motion.
-    RecipeError : no profile has the robot's name.
     """
     # 1. Which topic is used as which role, from the topic list alone.
     assignment = decide_roles(config, log.topics.values(), robot, known=known)
