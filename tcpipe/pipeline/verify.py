@@ -202,7 +202,7 @@ def _verify_samples(directory: Path, card: DatasetCard) -> Iterator[CheckResult]
     yield from (f"{where}: {problem}" for problem in _find_wrong_joins(samples, card))
     for key, value in measure_samples(samples.select(CARD_COLUMNS), has_terrain="terrain" in card.layers).items():
         told = getattr(card, key)
-        if told != value and not (told is None and key == "doubtful"):  # before data model 1.2 nobody counted them
+        if told != value:
             yield f"{directory / CARD}: {key} is {to_plain(told)}, but the samples give {to_plain(value)}"
     yield from (f"{directory / CARD}: {problem}" for problem in _find_wrong_runs(samples, card))
     used_m = math.fsum(to_floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])

@@ -55,10 +55,14 @@ class _Patches:
         return _join_colours({layer: np.concatenate(parts)[back] for layer, parts in stacks.items()})
 
     def select(self, samples: pa.Table) -> NDArray[np.int64]:
-        """Return up to `MOST_PATCHES` rows, rising, taken in turn from each split, class and 5° of slope: always the same ones."""
-        pieces = np.unique(self.piece)
+        """Return up to `MOST_PATCHES` rows, rising, taken in turn from each split, class and 5° of slope: always the same ones.
+
+        ``samples`` are the first ones of the dataset.
+        """
+        piece = self.piece[: samples.num_rows]
+        pieces = np.unique(piece)
         pieces = pieces[np.unique(np.linspace(0, len(pieces) - 1, _MOST_PIECES).astype(int))]
-        rows = np.flatnonzero(np.isin(self.piece, pieces))
+        rows = np.flatnonzero(np.isin(piece, pieces))
         near = samples.take(rows)
         slope = np.floor(np.degrees(to_floats(near, "slope_rad")) / 5.0).tolist()
         names = (near.column(name).to_pylist() for name in ("split", "terrain_name"))
@@ -78,16 +82,16 @@ def _open_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Pat
     return _Patches(files, place, piece, choose_thinning(card.patch_px))
 
 
-def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int32]) -> Json:
-    """Return sheets of patches by layer and the rows of the page that they belong to (``row_of`` each sample, (T,)).
+def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, count: int) -> Json:
+    """Return sheets of patches by layer and the samples that they belong to, all among the first ``count``.
 
     `DatasetError` if they cannot be read.
     """
     if not samples.num_rows:
         return None
     patches = _open_patches(directory, card, samples)
-    rows = patches.select(samples)
-    return make_sheets(row_of[rows].tolist(), patches.read(rows), patches.files)
+    rows = patches.select(samples.slice(0, count))
+    return make_sheets(rows.tolist(), patches.read(rows), patches.files)
 
 
 def choose_thinning(patch_px: int) -> int:

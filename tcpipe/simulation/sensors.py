@@ -77,6 +77,10 @@ class Gnss:
     clock_offset_s: float = 0.25
 
 
+EXACT_GNSS = Gnss(std_m=0.015, vertical_std_m=0.025, lasting_std_m=(0.0, 0.0), stated_off_m=0.0)
+"""White noise, and an antenna where the log states it: kinder than real receivers."""
+
+
 @dataclass(frozen=True, slots=True)
 class Doppler:
     """The receiver's own velocity: east, north, up of its antenna."""
