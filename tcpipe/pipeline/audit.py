@@ -14,8 +14,7 @@ from tcpipe.fusion.withheld import WithheldScore, score_comparisons
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse_inputs import name_pose
-from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import find_read_config
+from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.stages.withheld import compare_withheld
 from tcpipe.store import is_store, run_at
 from tcpipe.tables.levels import Streams

@@ -38,9 +38,8 @@ from tcpipe.pipeline.calls import (
     start_stopwatch,
     stored_bytes,
 )
-from tcpipe.pipeline.claims import hold_claims
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_queue import Item, LogQueue
+from tcpipe.pipeline.log_queue import Item, LogQueue, hold_claims
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,

@@ -133,8 +133,7 @@ def _read(
     store: Store, run_id: str, before: RunJson | None, log: AnyLog, task: IngestTask, *, sha256: str
 ) -> tuple[Streams, RunJson]:
     """Return L1 and what is known of its log; from the store what was made with the same read settings."""
-    from tcpipe.stages.read import read_run  # noqa: PLC0415
-    from tcpipe.stages.read_roles import find_read_config  # noqa: PLC0415
+    from tcpipe.stages.read import find_read_config, read_run  # noqa: PLC0415  kernels load only when there is work
 
     key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
     if before and before.message_definitions == task.definitions and not task.force:

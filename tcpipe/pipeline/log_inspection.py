@@ -24,7 +24,7 @@ from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
 from tcpipe.robots import Profiles
 from tcpipe.stages.proposals import find_proposals
-from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.stages.read import decide_roles, find_read_config
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings

@@ -29,8 +29,7 @@ from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_logs_at
 from tcpipe.recipe import ReadConfig, Recipe, Role
-from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.stages.read import decide_roles, find_read_config, read_run
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
 from tcpipe.tables.findings import Finding, Subject, Verdict, judge, make_finding, read_threshold, sort_findings

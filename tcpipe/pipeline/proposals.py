@@ -35,7 +35,7 @@ from tcpipe.recipe.suggestions import (
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.proposals import find_proposals
-from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.stages.read import decide_roles, find_read_config
 from tcpipe.stages.read_sources import place_frames
 from tcpipe.store import is_store
 from tcpipe.tables.findings import Finding
