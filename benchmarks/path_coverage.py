@@ -6,7 +6,8 @@ Drives wander over the small site of `tcpipe demo` with the paper's robot. All o
 built into a dataset, a model is trained on the first drives; the further ones, in a store of their own, are predicted on the map as
 `tcpipe evaluate --drive` does. Paths follow one another along a drive. Coverage is of the measured labels, over all drives, with its 95 %
 interval (binomial, clustered by drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the further drives carry so many kg
-more. The second table predicts the rest of each further drive after its first metres adapt the model, beside the mean of these metres.
+more. The line of budgets is of paths there and back: two consecutive parts of a drive. The second table predicts the rest of each
+further drive after its first metres adapt the model, beside the mean of these metres.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.planning.drives import collect_run
-from tcpipe.planning.path_files import choose_map
+from tcpipe.planning.path_files import RISK, choose_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
 from tcpipe.store import open_store
@@ -104,6 +105,23 @@ def coverage_line(quantity: str, length: int, errors: Errors, runs: list[Run]) -
     )
 
 
+def budget_line(errors: Errors, runs: list[Run], length: int = 30) -> str:
+    """Return for how many ways there and back of a drive a budget suffices that `plan-path --budget --return` calls enough at 95 %."""
+    is_enough, names = [], []
+    for run in runs:
+        of = run.metres["energy"]
+        for first in range(0, len(of.predicted) - 2 * length + 1, 2 * length):
+            there, back = slice(first, first + length), slice(first + length, first + 2 * length)
+            sums = [errors.compute_sum(of.predicted[way], of.class_id[way]) for way in (there, back)]
+            budget = (sums[0] + sums[1]).compute_quantile(RISK)
+            is_enough.append(float(of.measured[first : first + 2 * length].sum()) <= budget)
+            names.append(run.name)
+    if not is_enough:
+        return f"budget 2 x {length} m: no drive is as long"
+    found = measure_coverage(np.array(is_enough), np.array(names))
+    return f"budget 2 x {length} m: enough for {found} of {found.samples}, at least {RISK:.0%} wanted"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train", type=int, default=10)
@@ -124,6 +142,7 @@ def main() -> None:
     for quantity in ("duration", "energy"):
         for length in LENGTHS:
             print(coverage_line(quantity, length, errors[quantity], runs))
+    print(budget_line(errors["energy"], runs))
     both = {quantity: errors[quantity] for quantity in ("energy", "duration")}
     known_m = [metres for metres in KNOWN_M if metres <= given.metres / 3.0]
     print(*format_adaptations(list(compare_adaptations(both, runs, known_m))), sep="\n")

@@ -176,18 +176,24 @@ def _column_rows(columns: Sequence[Column]) -> str:
     head = "\n| column | type | unit, frame | meaning |\n|---|---|---|---|\n"
     rows = [
         f"| {', '.join(f'`{c.name}`' for c in group)} | {group[0].dtype}{'?' if group[0].nullable else ''} "
-        f"| {', '.join(filter(None, (group[0].unit, group[0].frame)))} | {_join_texts(group)}{_since(group[0])} |\n"
+        f"| {', '.join(filter(None, (*_units(group), group[0].frame)))} | {_join_texts(group)}{_since(group[0])} |\n"
         for group in _group_columns(columns)
     ]
     return "".join((head, *rows)) if rows else ""
 
 
+def _units(group: Sequence[Column]) -> list[str]:
+    """Return the unit of a group, or that of each column where they differ."""
+    units = [column.unit for column in group]
+    return units if len(set(units)) > 1 else units[:1]
+
+
 def _group_columns(columns: Sequence[Column]) -> list[list[Column]]:
-    """Return runs of columns that differ only in their name and in one word of their meaning, such as the axis."""
+    """Return runs of columns that differ only in their name, unit and one word of their meaning, such as the axis."""
     groups: list[list[Column]] = []
     for column in columns:
         last = groups[-1] if groups else []
-        alike = last and replace(column, name="", doc="") == replace(last[0], name="", doc="")
+        alike = last and replace(column, name="", doc="", unit="") == replace(last[0], name="", doc="", unit="")
         if alike and len(_varying_words([*last, column])) == 1:
             last.append(column)
         else:
@@ -247,7 +253,8 @@ page for the code, or for words such as dropout, lever arm, time offset, drift, 
 An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
 unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
 ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect STORE/runs/RUN` lists all
-findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
+findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints;
+of a suspect sensor it also prints the line that excludes it by name.
 """
 
 
@@ -260,6 +267,10 @@ def _findings() -> str:
     return "\n".join(parts)
 
 
+_EXCLUSION = "To exclude it by name"
+"""A remedy of many findings, which the page states once."""
+
+
 def _finding(code: str, entry: Entry) -> str:
     more: list[str] = [entry.severity, *([entry.action] if entry.action != "kept" else [])]
     more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
@@ -269,7 +280,7 @@ def _finding(code: str, entry: Entry) -> str:
     lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
     remedies = [
         *([_sentence(entry.advice)] if entry.advice else []),
-        *(f"{text}: …" for text in entry.remedies.values()),
+        *(f"{text}: …" for text in entry.remedies.values() if text != _EXCLUSION),
     ]
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())
@@ -286,19 +297,24 @@ def _sentence(text: str) -> str:
 
 
 def _recipe() -> str:
-    return f"{_NOTE}\n# Recipe\n\nWhat `tcpipe init` writes: every key with its default.\n\n```toml\n{format_commented_toml()}```\n"
+    text = format_commented_toml().replace(f"  # {_USUAL_RANGE}\n", "\n")
+    head = f"What `tcpipe init` writes: every key with its default. Numbers without a range: {_USUAL_RANGE}."
+    return f"{_NOTE}\n# Recipe\n\n{head}\n\n```toml\n{text}```\n"
+
+
+_USUAL_RANGE = "from 1e-06 to 1000"
 
 
 def _robots() -> str:
     known = load_shipped_profiles()
-    found_by = "| robot | found by message types | found by words of topic names | platform |\n|---|---|---|---|\n"
-    sizes = "\n| robot | width | length | maximum speed | voltage |\n|---|---|---|---|---|\n"
+    robots = "| robot | message types | words of topic names | platform | width | length | maximum speed | voltage |\n"
+    robots += "|---|---|---|---|---|---|---|---|\n"
     for name, of in sorted(known.robots.items()):
-        found_by += f"| `{name}` | {', '.join(of.status_types)} | {', '.join(of.topic_words)} | {of.platform or ''} |\n"
-        volts = "not known" if of.voltage_range_volt is None else "{:g} V to {:g} V".format(*of.voltage_range_volt)
+        volts = "" if of.voltage_range_volt is None else "{:g} V to {:g} V".format(*of.voltage_range_volt)
         measures = ((of.width_m, "m"), (of.length_m, "m"), (of.max_velocity_mps, "m/s"))
-        cells = [f"{value:g} {unit}" if value is not None else "not known" for value, unit in measures]
-        sizes += f"| `{name}` | {' | '.join(cells)} | {volts} |\n"
+        cells = [f"{value:g} {unit}" if value is not None else "" for value, unit in measures]
+        found_by = (", ".join(of.status_types), ", ".join(of.topic_words), of.platform or "")
+        robots += f"| {' | '.join((f'`{name}`', *found_by, *cells, volts))} |\n"
     power = "| message type | for | voltage | current | averaged | drawn current | not known |\n|---|---|---|---|---|---|---|\n"
     refused = "".join(f"- `{name}` {why}.\n" for name, why in known.refusals().items())
     for source in known.power_sources:
@@ -307,19 +323,18 @@ def _robots() -> str:
         only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
         only += ("in place of those above" if source.fallback else None,)
         counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
-        drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "by the mean over the run"}[
-            source.sign
-        ]
+        drawn = source.sign.removeprefix("drawn_")
         fields = f"{source.voltage} | {counter or source.current}{', with ' + source.other_loads if source.other_loads else ''}"
         averaged = "found from motion" if source.averaging_unknown else "yes" if source.averaged else "no"
         cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.open_questions)
         power += f"| {' | '.join(cells)} |\n"
     return (
         f"{_NOTE}\n# Robots and power messages\n\nBuilt-in profiles, from the TOML files in `tcpipe/robots/`, where each number has "
-        "its source. A recipe can have the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nA log with "
+        "its source. A recipe can have the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nMessage types "
+        "or words of topic names identify a robot; empty cells are not known. A log with "
         "`clearpath_platform_msgs/Power` and no other platform's name is a Husky's, the first to publish it.\n\n"
-        f"{found_by}{sizes}\n## Power messages\n\nBest first; a row is a rail. Bare numbers "
-        f"(`std_msgs/Float32`, `Float64`) are identified by their topic's name.\n\n{power}\n"
+        f"{robots}\n## Power messages\n\nBest first; a row is a rail. Bare numbers "
+        f"(`std_msgs/Float32`, `Float64`) are identified by their topic's name. *auto*: the mean over the run decides.\n\n{power}\n"
         f"Types whose currents are not, or may not be, drawn from a battery; tcpipe does not use them:\n\n{refused}"
     )
 

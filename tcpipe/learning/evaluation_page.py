@@ -124,7 +124,8 @@ def _make_coverage_section(found: Evaluation) -> Section:
         and error.crps is not None
     ]
     training = found.model.training
-    count, is_network = training.samples["held out"], find_kind(training.kind).stops_by_fold
+    count, config = training.samples["held out"], training.config
+    is_network = find_kind(training.kind).stops_by_fold and not config.cross_fit
     text = (
         f"Intervals rest on the model's errors on {count} samples of train "
         f"{'that stopped it early, which makes them slightly too small' if is_network else ', each predicted by the other folds'}. The "

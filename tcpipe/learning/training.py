@@ -200,7 +200,8 @@ def train(
     if kind.channels and rules.layers and rules.model != "auto":
         raise UsageError(f"--layers: a model of kind {name} takes the slope and class of a metre, no patch; remove it")
     if kind.channels:
-        logger.info("%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
+        level = logging.WARNING if rules.layers else logging.INFO
+        logger.log(level, "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
     elif variant is None:
         _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
     task = make_training_task(data, rules.fold, other, kind)
@@ -414,13 +415,15 @@ def _make_result(place: Path | str, status: str, training: Training, times: Trai
 def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: ModelKind) -> ModelCard:
     card, config, inputs = data.card, samples.config, samples.inputs
     is_held = find_held_out(fitted.held_out)
-    used, held = samples.split if is_held.all() else samples.split.take(~is_held), samples.take(is_held)
+    is_network = getattr(fitted.predictor, "stops_by_fold", False)
+    used = samples.split.take(samples.folds != config.fold) if is_network else samples.split
+    held = samples.take(is_held)
     return ModelCard(
         architecture=Architecture(
             inputs.patch_px,
             len(inputs.planes),
             len(inputs.outputs),
-            0 if is_held.all() else config.width,
+            config.width if is_network else 0,
             len(inputs.extra_features),
         ),
         channels=inputs.channels,

@@ -208,27 +208,6 @@ def _fill_costs(steps: Steps, k: float, cell: int, limit: float, is_back: bool, 
     return negative
 
 
-@compile_kernel
-def _follow(steps: Steps, k: float, to_goal: Floats, start: int, goal: int, path: Ints) -> int:  # noqa: PLR0917
-    """Write the cells of the cheapest path from start to goal to ``path``, by what each cell costs to the goal; return their number."""
-    cols, count, here = steps.per_metre.shape[1], 1, start
-    path[0] = start
-    while here != goal:
-        best, following = np.inf, here
-        row, col = here // cols, here % cols
-        for course in range(steps.length_m.size):
-            step = compute_step(steps, k, course, row, col)
-            if step == np.inf:
-                continue
-            there = here - steps.crossed[course, 3, 0] * cols + steps.crossed[course, 3, 1]
-            if to_goal[there] < to_goal[here] and max(step, _LEAST) + to_goal[there] < best:
-                best, following = max(step, _LEAST) + to_goal[there], there
-        here = following
-        path[count] = here
-        count += 1
-    return count
-
-
 _CLASSES = 256
 _ALL = "all"
 
@@ -314,20 +293,6 @@ def _find_turning(  # noqa: PLR0917
     return -1
 
 
-@compile_kernel
-def _sum_steps(steps: Steps, k: float, cells: Ints) -> tuple[float, float]:
-    """Return the cost of the steps between cells, and what the search takes it to be without the grade."""
-    cols, total, reduced = steps.per_metre.shape[1], 0.0, 0.0
-    for at in range(cells.size - 1):
-        for course in range(steps.length_m.size):
-            if cells[at + 1] - cells[at] == steps.crossed[course, 3, 1] - steps.crossed[course, 3, 0] * cols:
-                row, col = cells[at] // cols, cells[at] % cols
-                total += compute_step(steps, 0.0, course, row, col)
-                reduced += max(compute_step(steps, k, course, row, col), _LEAST)
-                break
-    return total, reduced
-
-
 def find_least_cost_paths(  # noqa: PLR0917
     steps: Steps, k: float, start: int, goal: int, turning: Turning | None = None, class_id: Classes | None = None
 ) -> tuple[LeastCostPath, ...]:
@@ -340,34 +305,32 @@ def find_least_cost_paths(  # noqa: PLR0917
     negative = _fill_costs(steps, k, goal, np.inf, True, to_goal)
     if not np.isfinite(to_goal[start]):
         return ()
-    cells = np.empty(to_goal.size, np.int64)
-    cells = cells[: _follow(steps, k, to_goal, start, goal, cells)].copy()
-    plain = LeastCostPath(cells, _sum_steps(steps, k, cells)[0], float(to_goal[start]), k, negative)
-    if turning is None or class_id is None:
-        return (plain,)
-    labels, arrived = np.zeros(COURSES * to_goal.size), np.zeros(COURSES * to_goal.size, np.int8)
-    joule_per_rad = turning.joule_per_rad
-    last = _find_turning(
-        steps, k, joule_per_rad, class_id.reshape(-1), _TURNS_RAD, to_goal, start, goal, labels, arrived
-    )
-    cells = _trace_back(last, arrived, steps)
-    total, reduced = _sum_steps(steps, k, cells)
-    cost = float(labels[last])
-    return LeastCostPath(cells, cost - reduced + total, cost, k, negative), plain
+    of_turns = [np.zeros(_CLASSES)] if turning is None else [turning.joule_per_rad, np.zeros(_CLASSES)]
+    classes = np.zeros(to_goal.size, np.uint8) if class_id is None else class_id.reshape(-1)
+    paths = []
+    for joule_per_rad in of_turns:
+        labels, arrived = np.zeros(COURSES * to_goal.size), np.zeros(COURSES * to_goal.size, np.int8)
+        last = _find_turning(steps, k, joule_per_rad, classes, _TURNS_RAD, to_goal, start, goal, labels, arrived)
+        cells, raw, reduced = _trace_back(last, arrived, steps, k)
+        cost = float(labels[last])
+        paths.append(LeastCostPath(cells, cost - reduced + raw, cost, k, negative))
+    return tuple(paths)
 
 
-def _trace_back(state: int, arrived: NDArray[np.int8], steps: Steps) -> Ints:
-    """Return the cells of the path to a state of the search with turns."""
-    moves = (steps.crossed[:, 3, 1] - steps.crossed[:, 3, 0] * steps.shape[1]).tolist()
-    cells = [state // COURSES]
+def _trace_back(state: int, arrived: NDArray[np.int8], steps: Steps, k: float) -> tuple[Ints, float, float]:
+    """Return the cells of the path to a state of the search with turns, and what its steps cost, with and without the grade."""
+    cells, raw, reduced = [state // COURSES], 0.0, 0.0
     while (way := int(arrived[state])) != _START:
         cell, course = divmod(state, COURSES)
         if way == _STEP:
-            cells.append(cell - moves[course])
+            row, col = np.divmod(cell, steps.shape[1]) + steps.crossed[course, 3] * (1, -1)
+            cells.append(int(row * steps.shape[1] + col))
+            raw += compute_step(steps, 0.0, course, row, col)
+            reduced += max(compute_step(steps, k, course, row, col), _LEAST)
             state = cells[-1] * COURSES + course
         else:
             state = cell * COURSES + (course + (-1 if way == _LEFT else 1)) % COURSES
-    return np.array(cells[::-1])
+    return np.array(cells[::-1]), raw, reduced
 
 
 def compute_least_costs(steps: Steps, k: float, start: int, goal: int, *, limit: float) -> Floats:

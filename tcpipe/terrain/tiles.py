@@ -25,20 +25,16 @@ _STRIP_TILES = CACHED_TILES // 3 - 3
 """Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
 
 
-class Tiled(Protocol):
-    """Pixels in tiles that are cheap to read."""
+class BandReader(Protocol):
+    """A layer of several bands on a grid of its own."""
 
     @property
     def grid(self) -> MapGrid:
-        """Where the pixels lie."""
+        """Where its pixels lie."""
 
     @property
     def tile_px(self) -> int:
-        """Side of the square tiles, aligned with pixel (0, 0)."""
-
-
-class BandReader(Tiled, Protocol):
-    """A layer of several bands on a grid of its own."""
+        """As of `MapReader`."""
 
     @property
     def layer(self) -> Layer:
@@ -120,7 +116,7 @@ def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
     return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 
 
-def group_by_tile(px: NDArray[np.float64], source: Tiled) -> Iterator[NDArray[np.int64]]:
+def group_by_tile(px: NDArray[np.float64], source: MapReader | BandReader) -> Iterator[NDArray[np.int64]]:
     """Yield the indices of pixel positions, shape (N, 2), by tile; within a tile in Z-order.
 
     Tiles come row by row inside strips narrow enough that a tile is still held when the rows above and below want it.

@@ -92,6 +92,7 @@ def test_schedulers_call_commands_and_options_that_exist() -> None:
     """Their own parsers read them in addition (systemd-analyze verify, crontab -n, bash -n), where those are."""
     checks = {
         "slurm/night.sbatch": ["bash", "-n"],
+        "slurm/cluster.sbatch": ["bash", "-n"],
         "crontab": ["crontab", "-n"],
         "systemd/tcpipe-night.timer": ["systemd-analyze", "calendar"],
     }

@@ -71,6 +71,21 @@ def test_the_model_knows_what_it_was_trained_on(trained, dataset):
     assert said[:, 0] == pytest.approx([by_id[name] for name in held.column("sample_id")], rel=1e-4)
 
 
+def test_intervals_can_rest_on_networks_without_each_fold(trained, dataset, tmp_path):
+    """Every sample has a prediction; that of the stopping fold is the model's own, those of the others are not."""
+    train(dataset, tmp_path / "model", config=replace(CONFIG, cross_fit=True))
+    model, alone = load_model(tmp_path / "model"), load_model(trained[0])
+    samples = open_dataset(dataset)["train"]
+    assert model.card.training.samples == {**alone.card.training.samples, "held out": len(samples)}
+    assert all(np.array_equal(_weights(tmp_path / "model")[name], of) for name, of in _weights(trained[0]).items())
+    own = dict(zip(samples.column("sample_id"), model.predict(samples.patches)[:, 0], strict=True))
+    said = model.residuals["power_predicted_watt"]
+    is_own = np.isclose(said, [own[name] for name in model.residuals["sample_id"]], rtol=1e-4)
+    is_stopping = model.residuals["fold"] == CONFIG.fold
+    assert is_own[is_stopping].all()
+    assert is_own[~is_stopping].mean() < 0.1
+
+
 @pytest.mark.parametrize("energy_only", [False, True])
 def test_net_energy_can_be_trained_on(energy_only, dataset, tmp_path):
     config = replace(CONFIG, epochs=1, label="net")

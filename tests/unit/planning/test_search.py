@@ -173,6 +173,14 @@ def _sum_edges(cells, edges):
     return sum(cost[a, b] for a, b in zip(cells[:-1].tolist(), cells[1:].tolist(), strict=True))
 
 
+@pytest.mark.parametrize("cols", [1, 2, 3, 4])
+def test_a_strip_of_few_columns_is_searched_as_any_other(cols):
+    power = np.random.default_rng(cols).uniform(20.0, 300.0, (COURSES, 12, cols))
+    costs, open_ = _grid(power, 0.8, np.zeros((12, cols))), np.ones((COURSES, 12, cols), bool)
+    found = find_least_cost_paths(_steps(costs, "energy", open_), 0.0, 0, 12 * cols - 1)[0]
+    assert found.cost == pytest.approx(_by_hand(costs, "energy", open_, 0)[-1], rel=1e-9)
+
+
 @settings(max_examples=15)
 @given(RANDOM_POWER)
 def test_the_least_over_a_cell_is_the_way_there_and_on_from_there(power):
