@@ -28,7 +28,6 @@ from tcpipe.learning.model_card import TrainingRange
 from tcpipe.learning.models import Model, load_model
 from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.cost_map import make_cost_map
-from tcpipe.planning.cost_model import BATCH_PATCHES
 
 ROUNDS = 5
 WANTED = 0.9
@@ -61,11 +60,12 @@ def main() -> None:
         survey = make_survey(model, source, 1.0)
         survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
         patches = int(np.count_nonzero(np.isfinite(survey.costs.velocity_mps)))
-        ready = np.random.default_rng(0).random((BATCH_PATCHES, 40, 40, 3)).astype(np.float32)
+        together = model.card.layout.batch_rows
+        ready = np.random.default_rng(0).random((together, 40, 40, 3)).astype(np.float32)
 
         def forward() -> None:
-            for first in range(0, patches, BATCH_PATCHES):
-                model.predict(ready[: min(BATCH_PATCHES, patches - first)])
+            for first in range(0, patches, together):
+                model.predict(ready[: min(together, patches - first)])
 
         def judged() -> None:
             bare = make_survey(model, source, 1.0)

@@ -33,14 +33,15 @@ def make_subset(data: Dataset, name: str, count: int, seed: int) -> Samples:
 
 def measure(data: Dataset, name: str, count: int, seed: int) -> dict[str, tuple[float, float]]:
     """Return RMSE of E [J] and T [s] by split."""
-    samples = make_subset(data, name, count, seed)
+    samples, kind = make_subset(data, name, count, seed), find_kind(name)
     with tempfile.TemporaryDirectory() as directory:
-        fitted = find_kind(name).fit_folds(samples, Job(name, "", Path(directory, "state")))
+        job = Job(name, "", Path(directory, "state"))
+        predictor = kind.fit_folds(samples, job).predictor if kind.stops_by_fold else kind.fit(samples)
     found = {}
     for split in (split for split in ("test", "unseen") if len(data[split])):
         part = data[split].take(np.isfinite(data[split].labels).all(axis=1)).with_channels(*samples.inputs.channels)
         held = replace(samples, split=part)
-        power, velocity = predict_samples(fitted.predictor, held).T
+        power, velocity = predict_samples(predictor, held).T
         said = compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), 1.0)
         true = compute_costs(*held.labels.T, 1.0)
         found[split] = tuple(float(np.sqrt(np.mean((said[of] - true[of]) ** 2))) for of in ("E", "T"))

@@ -73,7 +73,7 @@ SMALLEST = {
         "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"
     ),
     "physics": Smallest("--metres 100", rf"C_rr grass +{NUMBER} ± +{NUMBER}"),
-    "plan_path": Smallest("40 1", rf"peak memory: {NUMBER} x that of the full search"),
+    "plan_path": Smallest("120 1", rf"peak memory: {NUMBER} x that of the full search"),
     "read_logs": Smallest("--minutes 0.05", rf"{NUMBER} of {NUMBER} figures met"),
     "real_data": Smallest("drive={log}", rf"drive, .*blocks .* {NUMBER} J"),
     "sample_patches": Smallest("50", rf"nearest gather +{NUMBER} us a patch +{NUMBER} x"),

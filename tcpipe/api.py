@@ -27,6 +27,7 @@ def run_train(options: TrainOptions) -> TrainResult:
     ``str`` of the result is what the command prints. Raises `UsageError` where an option is out of its range, or ``out`` holds something
     else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the interrupted training is another one.
     """
+    from tcpipe.errors import UsageError
     from tcpipe.formats.recipe_toml import resolve_recipe
     from tcpipe.learning.fitting import FitConfig
     from tcpipe.learning.training import train as run
@@ -37,6 +38,8 @@ def run_train(options: TrainOptions) -> TrainResult:
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features", "layers"})
     if isinstance(layers := given.get("layers"), str):
         given["layers"] = [name.strip() for name in layers.split(",")]
+    if options.predictor is not None and options.model is not None:
+        raise UsageError(f"--model {options.model}: --predictor gives the model; remove one of them")
     if options.predictor is None:
         given["model"] = options.model or ("resnet18" if is_network else "auto")
     config = from_values(FitConfig, {**asdict(resolve_recipe(options.recipe).train), **given}, where="train")

@@ -151,7 +151,11 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     if cluster is not None:  # its workers have another working directory
         from tcpipe.formats.object_storage import make_absolute
 
-        options = replace(options, model=make_absolute(options.model), store=make_absolute(options.store))
+        own = options.predictor
+        own = str(Path(own).absolute()) if own is not None and Path(own.split(":")[0]).is_file() else own
+        options = replace(
+            options, model=make_absolute(options.model), store=make_absolute(options.store), predictor=own
+        )
     with show_progress("cost-map", quiet=quiet) as shown:
         result = make_cost_map(
             *_load_inputs(options),

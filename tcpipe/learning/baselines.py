@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -14,10 +13,11 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.prediction_errors import Residuals
 from tcpipe.dataset import Dataset, Split
-from tcpipe.dataset.extra_features import read_extra_features
+from tcpipe.dataset.extra_features import available_features, read_extra_features
 from tcpipe.errors import DatasetError, ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult
+from tcpipe.learning.fitting import FitConfig, ModelKind, Task
 from tcpipe.learning.metrics import (
     ALL,
     FEWEST_GROUPS,
@@ -30,10 +30,10 @@ from tcpipe.learning.metrics import (
     compute_errors_by_class,
 )
 from tcpipe.learning.models import Model
-from tcpipe.learning.physics_model import Form, find_idle_power, fit_curves, fit_physics_model
+from tcpipe.learning.physics_model import Form
 from tcpipe.learning.predictions import Measured, Predicted, make_residuals, predict_costs, predict_spreads
-from tcpipe.learning.predictor import find_kind
-from tcpipe.learning.training import Variant
+from tcpipe.learning.predictor import AUTOMATIC, Job, Predictor, Samples, find_kind, predict_samples
+from tcpipe.learning.training import Variant, make_samples
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
@@ -45,21 +45,11 @@ CURVES: Mapping[Form, str] = {
 }
 PHYSICS, TREES = "physics", "gradient boosting"
 SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
-BASELINE_OF_KIND: Mapping[str, str] = {str(form): name for form, name in CURVES.items()} | {
-    PHYSICS: PHYSICS,
-    "boosting": TREES,
-}
+BASELINE_OF_KIND: Mapping[ModelKind, str] = dict(zip(AUTOMATIC, SIMPLEST_FIRST, strict=True))
 """What a baseline is called that would be the model itself."""
 
 _ALIKE = 1.005
 """Ratio up to which errors are the same: by digits of rounding nobody is better."""
-
-Predict = Callable[[Split], Array]
-"""Power [W] and velocity [m/s] of the samples of a split, shape (N, 2)."""
-
-
-Fit = Callable[[Split], tuple[Predict, Array | None]]
-"""From training samples to a predictor; and what the other folds say of each of them, where that comes with it."""
 
 
 def compare_baselines(
@@ -75,13 +65,14 @@ def compare_baselines(
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
         return [], [make_finding("baseline-missing", Subject("model", "baselines"), names=names)]
-    fitted, lacking = _fit_baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
+    fitted, lacking = _fit_baselines(train, data, [name for name in SIMPLEST_FIRST if name != own])
     logger.info("baselines: %s, fitted on %d samples", ", ".join(fitted), len(train))
     found, block_m = list[BaselineResult](), data.card.recipe.split.block_m
     for split, part in sets.items():
         class_ids = read_extra_features(part.split).class_id
-        for name, (predict, residuals) in fitted.items():
-            theirs = Predicted.centre(residuals, predict(part.split), class_ids, ours.chord_m)
+        for name, (samples, predictor, residuals) in fitted.items():
+            there = replace(samples, split=part.split.with_channels(*samples.inputs.channels))
+            theirs = Predicted.centre(residuals, predict_samples(predictor, there), class_ids, ours.chord_m)
             found += compare_with_baseline(name, split, part, said[split], theirs, block_m=block_m, seed=seed)
     return found, lacking
 
@@ -96,77 +87,32 @@ def _select_fitted_samples(train: Split, ours: Model) -> Split:
 
 
 def _fit_baselines(
-    train: Split, ours: Model, wanted: Sequence[str]
-) -> tuple[dict[str, tuple[Predict, Residuals]], list[Finding]]:
+    train: Split, data: Dataset, wanted: Sequence[str]
+) -> tuple[dict[str, tuple[Samples, Predictor, Residuals]], list[Finding]]:
     """Return the baselines by name, with their held-out predictions, and a finding for each that cannot be fitted."""
-    fits: dict[str, Fit] = {name: partial(_fit_curves, form) for form, name in CURVES.items()}
-    fits |= {PHYSICS: _fit_physics, TREES: partial(_fit_trees, ours)}
-    found, lacking = dict[str, tuple[Predict, Residuals]](), list[Finding]()
-    for name in wanted:
+    found, lacking = dict[str, tuple[Samples, Predictor, Residuals]](), list[Finding]()
+    for kind, name in ((kind, name) for kind, name in BASELINE_OF_KIND.items() if name in wanted):
         try:
-            predict, said = fits[name](train)
-            found[name] = predict, make_residuals(train, _cross_fit(fits[name], train) if said is None else said)
+            samples, predictor, said = _fit_baseline(find_kind(kind), train, data)
+            found[name] = samples, predictor, make_residuals(train, said)
         except ModelError as error:
             names = {"error": error.problems[0]}
             lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
     return found, lacking
 
 
-def _cross_fit(fit: Fit, train: Split) -> Array:
-    """Return what is said of each sample by a fit to the other folds; NaN where these are too few, which centres nothing."""
-    said, folds = np.full((len(train), 2), np.nan), train.column("fold")
-    for fold in np.unique(folds):
-        held = folds == fold
-        with suppress(ModelError):
-            said[held] = np.nan if held.all() else fit(train.take(~held))[0](train.take(held))
-    return said
-
-
-def _fit_curves(form: Form, train: Split) -> tuple[Predict, None]:
-    features = read_extra_features(train)
-    curves = fit_curves(form, features.slope_rad, features.class_id, train.labels.astype(np.float64))
-
-    def predict(split: Split) -> Array:
-        there = read_extra_features(split)
-        return curves.predict(there.slope_rad, there.class_id)
-
-    return predict, None
-
-
-def _fit_physics(train: Split) -> tuple[Predict, None]:
-    fitted = fit_physics_model(
-        read_extra_features(train), train.labels.astype(np.float64), idle_watt=find_idle_power(train)
-    )
-    return lambda split: fitted.predict(np.empty(0, np.float32), read_extra_features(split)), None
-
-
-def _fit_trees(ours: Model, train: Split) -> tuple[Predict, Array]:
-    """Return trees over features of all layers, and of the turn."""
-    from tcpipe.learning.table_model import compute_features, fit_table  # noqa: PLC0415  numba loads with it
-
-    folds, labels = train.column("fold"), train.labels.astype(np.float64)
-    if len(np.unique(folds)) < 2:
-        raise ModelError(
-            f"{len(train)} training samples are in one fold, expected two or more, to choose the number of trees"
-        )
-
-    def features(split: Split) -> Array:
-        return np.column_stack(
-            [
-                compute_features(split, ours.patch_m, ours.classes.count),
-                np.nan_to_num(read_extra_features(split).turn_radpm),
-            ]
-        )
-
-    model, said = fit_table(
-        features(train),
-        labels,
-        np.ones_like(labels),
-        folds,
-        channels=train.view.form.planes,
-        class_count=ours.classes.count,
-    )
-    return lambda split: model.predict(features(split)), said
+def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[Samples, Predictor, Array]:
+    """Return a fitted kind, and what the other folds say of each sample; NaN where these are too few, which centres nothing."""
+    turn = tuple(of.name for of in available_features(read_extra_features(train)) if of.name == "turn_radpm")
+    if kind.features is None:  # trees take the turn, but not the commanded speed
+        kind = type(kind.__name__, (kind,), {"features": turn})
+    split = train.with_channels(*kind.channels) if kind.channels else train
+    samples = make_samples(Task(split, split, split, split.label_columns), FitConfig(), data, kind)
+    try:
+        fitted = kind.fit_folds(samples, Job("", "", Path()))
+    except ModelError:
+        return samples, kind.fit(samples), np.full(samples.labels.shape, np.nan)
+    return samples, fitted.predictor, fitted.held_out.astype(np.float64)
 
 
 def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:

@@ -204,11 +204,18 @@ def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
 
 def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Floats:
     """Return predictions of each part of the samples by a model of the others, shape (N, outputs)."""
+    require_folds(parts)
     out = np.empty_like(samples.labels)
     for part in np.unique(parts):
         held = parts == part
         out[held] = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
     return out
+
+
+def require_folds(folds: NDArray[np.generic]) -> None:
+    """Raise `ModelError` unless there are two folds or more."""
+    if len(np.unique(folds)) < 2:
+        raise ModelError(f"{len(folds)} training samples are in one fold, expected two or more")
 
 
 def predict_samples(predictor: Predictor, samples: Samples) -> Floats:

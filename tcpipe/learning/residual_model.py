@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_BATCH, _FEWEST_STEPS, _MOST_STEPS = 64, 300, 2400
+_BATCH, _FEWEST_STEPS, _MOST_STEPS = 64, 300, 5000
 """Samples of a step, and limits of the steps."""
 
 

@@ -34,7 +34,7 @@ from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
 from tcpipe.learning.fitting import TrainingTimes
 from tcpipe.learning.physics_model import Curves, cross_fit_curves, fit_curves, list_curve_arrays, read_curves
-from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Predictor, Samples
+from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Predictor, Samples, require_folds
 from tcpipe.recipe import TrainConfig
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
 
@@ -421,6 +421,7 @@ class BoostingModel(Predictor):
     def fit_folds(cls, samples: Samples, job: Job | None = None) -> Fitted:
         """Fit curves and trees, as many trees as are best where each fold is predicted by the others."""
         del job
+        require_folds(samples.folds)
         began, inputs = time.perf_counter(), samples.inputs
         numbers = standardize_features(inputs.extra_features, samples.features)
         plain = compute_features(samples.split, inputs.patch_m, inputs.class_count)

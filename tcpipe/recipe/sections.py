@@ -352,8 +352,8 @@ class TrainConfig:
     """Boosting: max_depth."""
     leaf_samples: Annotated[int, Bounds(ge=1, le=1_000_000)] = 10
     """Boosting: min_data_in_leaf."""
-    residual_passes: Annotated[int, Bounds(ge=1, le=10_000)] = 30
-    """Residual network: passes over the samples (300 to 2400 steps)."""
+    residual_passes: Annotated[int, Bounds(ge=1, le=10_000)] = 80
+    """Residual network: passes over the samples (300 to 5000 steps)."""
     residual_learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 3e-3
     """Residual network (AdamW)."""
     residual_weight_decay: Annotated[float, Bounds(ge=0, le=1)] = 1e-2
