@@ -66,12 +66,9 @@ _COMMON = "Every command has `--help`; `Also:` lists which of the others it has.
 
 
 def _shared_options(contexts: Sequence[click.Context]) -> dict[str, str]:
-    """Return the options, with their help, that at least four commands have in the same words."""
+    """Return the options, with their help, that several commands have in the same words."""
     records = Counter(record for context in contexts for record in _option_records(context))
-    return {names: text for (names, text), commands in records.items() if commands >= _COMMANDS}
-
-
-_COMMANDS = 4
+    return {names: text for (names, text), commands in records.items() if commands > 1}
 
 
 def _option_records(context: click.Context) -> list[tuple[str, str]]:
@@ -99,6 +96,7 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
         next(word for word in names.split() if word.startswith("--")) for names in also if "--help" not in names
     ]
     body = formatter.getvalue().rstrip() + (f"\n\nAlso: {', '.join(long_names)}" if long_names else "")
+    body = body.replace(" [OPTIONS]", "", 1)
     return f"## tcpipe {context.info_name}\n\n```\n{body}\n```\n"
 
 
@@ -324,7 +322,8 @@ def _robots() -> str:
         only += ("in place of those above" if source.fallback else None,)
         counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
         drawn = source.sign.removeprefix("drawn_")
-        fields = f"{source.voltage} | {counter or source.current}{', with ' + source.other_loads if source.other_loads else ''}"
+        loads = source.other_loads.partition(" (")[0]
+        fields = f"{source.voltage} | {counter or source.current}{', with ' + loads if loads else ''}"
         averaged = "found from motion" if source.averaging_unknown else "yes" if source.averaged else "no"
         cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.open_questions)
         power += f"| {' | '.join(cells)} |\n"

@@ -42,15 +42,18 @@ def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
 @json_option
 @quiet_option
 def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
-    """Evaluate MODEL on DATASET's test samples and unseen area, and write evaluation.json, .csv and .html to OUT.
+    """Evaluate MODEL on DATASET's test samples and unseen area, and write evaluation.json and .html to OUT.
 
-    RMSE and MAPE of power, velocity, time and energy by terrain class; the ablation of the input layers; the baselines of Wei and
-    Isler and the expected time; the noise floor of the labels; all with the values of the paper. OUT keeps the networks that the
-    command trains, for the next call; predictions.parquet has every prediction. OUT may be a URL in a bucket, where each evaluation is
-    a generation.
+    RMSE and MAPE of power, velocity, time and energy by terrain class; baselines, centred by the same rule; the coverage of intervals;
+    the ablation of the input layers; networks of each class, those of Wei and Isler, and the expected time; the noise floor of the
+    labels; all with the values of the paper. OUT keeps the networks that the command trains, for the next call; predictions.parquet has
+    every prediction. OUT may be a URL in a bucket, where each evaluation is a generation.
 
     With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals and figures, in
     drives.json and drives.html of OUT; DATASET, which MODEL was trained on, shows whether a drive was held back.
+
+    With --adapt: errors and coverage on the rest of each run after its first metres adapt MODEL, in adaptation.json of OUT; DATASET may
+    be of another robot.
     """
     from tcpipe.api import run_evaluate
 
