@@ -27,7 +27,7 @@ from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import find_scenario, simulate
-from tcpipe.simulation.paper_site import scale_hidden_variance
+from tcpipe.simulation.scenarios import scale_hidden_variance
 from tcpipe.simulation.world import World, draw_waves, sum_waves
 
 PIXEL_M = 0.5

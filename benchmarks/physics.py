@@ -18,13 +18,14 @@ import pyarrow as pa
 from tcpipe import ingest
 from tcpipe.cost.physics import FitSamples, fit_and_validate_physics
 from tcpipe.formats.recipe_toml import load_recipe
-from tcpipe.pipeline.dataset.card import find_idle_power, make_fit_samples
+from tcpipe.pipeline.dataset.card import find_idle_power
 from tcpipe.report.label_sections import describe_physics
 from tcpipe.simulation import Faults, find_scenario, simulate
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import RasterSpec, Scenario
 from tcpipe.simulation.world import World
+from tcpipe.stages.label import make_fit_samples
 from tcpipe.store import Store
 
 NAMES = {4: "grass", 5: "mud", 6: "unpaved", 7: "paved"}

@@ -51,8 +51,7 @@ def add_map(options: AddMapOptions, *, strays: tuple[str, ...], dry_run: bool, a
 
     With --stac tcpipe takes the newest rasters of a catalogue of open data around tracks; --dry-run lists them, with licence and bytes.
     """
-    from tcpipe.pipeline.maps import run_add_map
-    from tcpipe.pipeline.open_data import plan_open_data
+    from tcpipe.pipeline.maps import plan_open_data, run_add_map
 
     if strays:
         raise UsageError(f"{strays[0]}: belongs to no option; quote patterns, as in --height 'dem/*.tif'")

@@ -19,13 +19,14 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
-    find_rows_in_files,
+    find_places_in_files,
     is_shard,
     open_patches,
     read_current_card,
     read_samples,
     sample_columns,
 )
+from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.layers import LAYERS
@@ -335,9 +336,10 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
     form = make_tensor_layout(asked, files.layers, files.patch_px)
-    parts = {}
-    for name, rows in find_rows_in_files(card, split).items():
-        columns = SampleColumns(directory, np.flatnonzero(split == name))
-        view = SampleView(StoredPixels(files, rows), np.arange(len(rows)), form)
+    parts, places = {}, find_places_in_files(card, split)
+    for name in SPLITS:
+        rows = np.flatnonzero(split == name)
+        columns = SampleColumns(directory, rows)
+        view = SampleView(StoredPixels(files, places[rows]), np.arange(len(rows)), form)
         parts[name] = Split(name, card, columns, view, energy)
     return Dataset(directory, card, parts)

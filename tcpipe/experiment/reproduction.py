@@ -39,7 +39,7 @@ from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.report.page import Section, render_page
 from tcpipe.simulation import Scenario, SimulatedSite, find_scenario, simulate
-from tcpipe.simulation.paper_site import scale_hidden_variance
+from tcpipe.simulation.scenarios import scale_hidden_variance
 
 logger = logging.getLogger("tcpipe")
 

@@ -487,16 +487,10 @@ def has_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
     return True
 
 
-def find_rows_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> dict[str, NDArray[np.int64]]:
-    """Return, for every split, where its samples lie in the order of the files; ``splits`` is the samples' column, (N,)."""
-    rows = {name: np.flatnonzero(splits == name) for name in SPLITS}
-    if card.format == "parquet":
-        return dict(_iterate_splits(rows))
-    return rows
-
-
-def _iterate_splits(rows: Mapping[str, NDArray[np.int64]]) -> Iterator[tuple[str, NDArray[np.int64]]]:
-    first = 0
-    for name, here in rows.items():
-        yield name, np.arange(first, first + len(here))
-        first += len(here)
+def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDArray[np.int64]:
+    """Return where each sample lies in the order of the files, (N,); ``splits`` is the samples' column, (N,)."""
+    places = np.arange(len(splits))
+    if card.format == "parquet":  # one split after the other
+        rows = np.concatenate([np.flatnonzero(splits == name) for name in SPLITS])
+        places[rows] = np.arange(len(rows))
+    return places

@@ -230,13 +230,14 @@ def _compute_span_s(topic: Topic) -> float | None:
     return (topic.end_ns - topic.start_ns) / 1e9
 
 
-_MISSING = {"no-gnss": "gnss", "no-power": "power", "no-imu": "imu", "no-wheel-odometry": "wheel_odometry"}
+MISSING = {"no-gnss": "gnss", "no-power": "power", "no-imu": "imu", "no-wheel-odometry": "wheel_odometry"}
+"""Role without which labels or checks are missing, by the code of the finding."""
 
 
 def find_missing_roles(roles: Collection[str]) -> tuple[Finding, ...]:
     """Return a finding for each role that is not among ``roles`` and without which labels or checks are missing."""
     present = {*roles, "gnss"} if "pose" in roles else roles
-    return tuple(make_finding(code, Subject("role", role)) for code, role in _MISSING.items() if role not in present)
+    return tuple(make_finding(code, Subject("role", role)) for code, role in MISSING.items() if role not in present)
 
 
 def find_left_out(reasons: Mapping[tuple[str, str], str]) -> Iterator[Finding]:

@@ -14,8 +14,7 @@ from tcpipe.fusion.withheld import WithheldScore, score_comparisons
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse_inputs import name_pose
-from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import find_read_config
+from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.stages.withheld import compare_withheld
 from tcpipe.store import is_store, run_at
 from tcpipe.tables.levels import Streams
@@ -74,15 +73,13 @@ def audit(
 ) -> Audit:
     """Withhold fixes, wheels and camera in windows, fuse the rest, and score the track by what was withheld.
 
+    Raises `UsageError`: the run is too short, or has no sensor beside the one that would be withheld; `LogError`, `RecipeError`,
+    `StoreError`, `FusionError`: it cannot be read or fused.
+
     Parameters
     ----------
     run : a log, or ``STORE/runs/RUN``, which is fused as its own recipe says.
     recipe, robot, message_definitions : how a log is read and fused, as `tcpipe.pipeline.ingest.ingest` takes them.
-
-    Raises
-    ------
-    UsageError : the run is too short, or has no sensor beside the one that would be withheld.
-    LogError, RecipeError, StoreError, FusionError : it cannot be read or fused.
     """
     name = format_path(run)
     streams, config = read_audited(run, recipe, robot=robot, message_definitions=message_definitions)

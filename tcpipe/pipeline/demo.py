@@ -54,10 +54,7 @@ class DemoResult:
 def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoResult:
     """Simulate, ingest, add the map, build the dataset and write the reports under ``directory``.
 
-    Raises
-    ------
-    UsageError : when the directory holds something else.
-    DatasetError : when a step fails (which would be a bug).
+    Raises `UsageError`: the directory holds something else; `DatasetError`: a step fails (which would be a bug).
     """
     site_path, store_path, dataset_path = directory / "site", directory / "store", directory / "dataset"
     clear(directory)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
-from tcpipe.formats.dataset_files import find_rows_in_files, open_patches, read_card, read_samples, sample_columns
+from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import to_plain
 from tcpipe.pipeline.explain import flatten_recipe
@@ -190,7 +190,6 @@ def _count_differing_patches(
 def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> NDArray[np.int64]:
     """Return a hash of every patch, in the order of the samples: equal pixels, equal hashes."""
     files = open_patches(directory, card)
-    split = table.column("split").to_numpy()
     found = np.empty(table.num_rows, np.int64)
     for piece in range(len(files.starts) - 1):
         pixels = files.read(piece, files.layers)
@@ -199,10 +198,8 @@ def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> NDArra
         found[files.starts[piece] : files.starts[piece + 1]] = [
             hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
         ]
-    out = np.empty_like(found)
-    for name, rows in find_rows_in_files(card, split).items():
-        out[split == name] = found[rows]
-    return out
+    places: NDArray[np.int64] = found[find_places_in_files(card, table.column("split").to_numpy())]
+    return places
 
 
 def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict[str, int]:

@@ -20,7 +20,7 @@ from tcpipe.formats.dataset_card import DatasetCard, list_shifts
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     PatchFiles,
-    find_rows_in_files,
+    find_places_in_files,
     is_shard,
     open_patches,
     read_current_card,
@@ -167,16 +167,14 @@ class _Sample:
 def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
     """Tell where a sample of a dataset came from, and make it again from the store.
 
+    Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data model, or the store no
+    longer holds the sample's run.
+
     Parameters
     ----------
     sample_id : its id.
     dataset : the dataset's directory.
     store : the store it was built from.
-
-    Raises
-    ------
-    DatasetError, StoreError : there is no such dataset, sample or store, the dataset is of another data model, or the store no longer holds
-        the sample's run.
     """
     opened = open_store(store)
     directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)
@@ -387,7 +385,7 @@ def _iterate_reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, sour
 def _read_stored_layers(files: PatchFiles, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
     """Return the stored layers of the sample in a row of samples.parquet, each of shape (px, px)."""
     split = read_samples(files.directory, ["split"]).column("split").to_numpy()
-    place = find_rows_in_files(card, split)[split[row]][int((split[:row] == split[row]).sum())]
+    place = int(find_places_in_files(card, split)[row])
     piece = int(np.searchsorted(files.starts, place, side="right")) - 1
     return {name: pixels[place - files.starts[piece]] for name, pixels in files.read(piece, files.layers).items()}
 

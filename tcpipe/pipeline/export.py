@@ -118,6 +118,9 @@ def export(
     The log is read once and written piece by piece: memory does not grow with it. What ``out`` holds already of the same log is left
     alone.
 
+    Raises `LogError`: the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to
+    another log or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
+
     Parameters
     ----------
     log_path : a log of any container, or the URL of one.
@@ -125,11 +128,6 @@ def export(
     topics : names of topics; none given means all. One text may name several, divided by commas.
     message_definitions : a directory of .msg or .idl files for types that the log does not define.
     threads : how many threads read and decompress.
-
-    Raises
-    ------
-    LogError : the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log
-        or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
     """
     _refuse_what_is_ours(out)
     clear(out)
@@ -305,10 +303,8 @@ class ExportedLayers:
 def export_layers(source: Path | str, out: Path) -> ExportedLayers:
     """Write a dataset, a run or all runs of a store, here or in a bucket, as a GeoPackage with styles for QGIS.
 
-    Raises
-    ------
-    UsageError : ``source`` is none of these, ``out`` is there and something else, or the extra ``gis`` is not installed.
-    DatasetError, StoreError : it cannot be read.
+    Raises `UsageError`: ``source`` is none of these, ``out`` is there and something else, or the extra ``gis`` is not installed;
+    `DatasetError`, `StoreError`: it cannot be read.
     """
     stored = is_store(source) or find_store_above(source) is not None
     if stored:

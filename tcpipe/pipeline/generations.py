@@ -25,10 +25,7 @@ def write_generation(url: str, card: str) -> Iterator[Path]:
     The files come first, in a folder of their own, then the commit that names it. Of two calls at once the second becomes the next
     generation; calls that put the same card complete one generation. What no commit can name any more is removed.
 
-    Raises
-    ------
-    UsageError : something else is at the URL.
-    StoreError : the place cannot be read or written.
+    Raises `UsageError`: something else is at the URL; `StoreError`: the place cannot be read or written.
     """
     place = open_place(url)
     read_generations(place, card)
@@ -36,7 +33,9 @@ def write_generation(url: str, card: str) -> Iterator[Path]:
         directory = scratch / (url.rstrip("/").rpartition("/")[2])
         directory.mkdir()
         yield directory
-        _remove_leftovers(place, _put_generation(place, directory, card))
+        state = _put_generation(place, directory, card)
+        names = [entry.name for entry in place.entries(GENERATIONS)]
+        place.map(place.delete, [name for name in names if is_left_over(name, state)])
 
 
 def read_generations(place: Place, card: str) -> State:
@@ -81,9 +80,3 @@ def _has_newest(place: Place, state: State, folder: str, directory: Path) -> boo
 def _commit_as(number: int, generation: Generation) -> Callable[[State], Entries]:
     """Return what adds a generation under one number alone: the folder of another has another name."""
     return lambda state: Entries(generations=(generation,)) if state.number + 1 == number else Entries()
-
-
-def _remove_leftovers(place: Place, state: State) -> None:
-    """Remove what killed and slower calls left, and generations that were replaced for long."""
-    names = [entry.name for entry in place.entries(GENERATIONS)]
-    place.map(place.delete, [name for name in names if is_left_over(name, state)])

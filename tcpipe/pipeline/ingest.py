@@ -6,7 +6,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
 from pathlib import Path
@@ -22,7 +22,7 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here, pause_garbage_collection
 from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State, Superseded
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.object_storage import is_presigned, is_url, make_absolute
+from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
 from tcpipe.formats.run_documents import remove_if_empty
@@ -38,9 +38,8 @@ from tcpipe.pipeline.calls import (
     start_stopwatch,
     stored_bytes,
 )
-from tcpipe.pipeline.claims import hold_claims
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_queue import Item, LogQueue
+from tcpipe.pipeline.log_queue import Item, LogQueue, hold_claims
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -105,8 +104,8 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := load_profiles(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with _place_for_stand_ins(logs := list(options.logs)) as staging, remove_if_empty(options.store):
-        found = find_sources(logs, as_one=options.as_one, staging=staging, tables=ruling.tables)
+    with make_scratch_directory() as staging, remove_if_empty(options.store):
+        found = find_sources(logs := list(options.logs), as_one=options.as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(options.store, create=True)
@@ -370,12 +369,6 @@ def _judge_result(state: State, result: IngestResult, source: LogSource, *, befo
     problems = find_problems(result.run)
     told = {of.key for old in before.find_rows(result.run.run_id) for of in find_problems(old)}
     return replace(result, known=all(of.key in told for of in problems), acknowledged=is_acknowledged(problems, state))
-
-
-def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[Path]:
-    """Return a temporary directory, where a log is named by its URL."""
-    remote = any(is_url(log) for log in logs)
-    return make_scratch_directory() if remote else nullcontext(Path())
 
 
 _CONTAINED = 0.9

@@ -23,7 +23,7 @@ from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_resul
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store
-from tcpipe.tables.findings import Finding, Subject, judge, make_finding, read_threshold
+from tcpipe.tables.findings import Subject, judge, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, MaskedTrack, Streams, Track, add_findings
 
 
@@ -133,8 +133,7 @@ def _read(
     store: Store, run_id: str, before: RunJson | None, log: AnyLog, task: IngestTask, *, sha256: str
 ) -> tuple[Streams, RunJson]:
     """Return L1 and what is known of its log; from the store what was made with the same read settings."""
-    from tcpipe.stages.read import read_run  # noqa: PLC0415
-    from tcpipe.stages.read_roles import find_read_config  # noqa: PLC0415
+    from tcpipe.stages.read import find_read_config, read_run  # noqa: PLC0415  kernels load only when there is work
 
     key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
     if before and before.message_definitions == task.definitions and not task.force:
@@ -177,7 +176,9 @@ def make_manifest(
     """Return what became of a run; ``known`` gives tags and damage."""
     info, count = labelled.info, labelled.table.num_rows
     subject = Subject("run", info.run_id)
-    found = (*find_damaged_log(known.damage, subject), *_find_few_segments(count, subject))
+    found = find_damaged_log(known.damage, subject)
+    if 0 < count < read_threshold("few-segments", "min_segments_count"):
+        found = (*found, make_finding("few-segments", subject, segments_count=count))
     info = add_findings(info, found, info.report.facts)
     messages = {role: table.num_rows for role, table in streams.tables.items()}
     return Manifest(
@@ -197,11 +198,6 @@ def make_manifest(
         robot_requested=task.robot,
         message_definitions=task.definitions,
     )
-
-
-def _find_few_segments(count: int, subject: Subject) -> tuple[Finding, ...]:
-    few = 0 < count < read_threshold("few-segments", "min_segments_count")
-    return (make_finding("few-segments", subject, segments_count=count),) if few else ()
 
 
 def run_stages(

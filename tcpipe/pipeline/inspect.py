@@ -108,14 +108,12 @@ def inspect(
 ) -> Inspected:
     """Return what the path holds.
 
+    Raises `LogError`, `MapError`, `DatasetError`, `StoreError`: it is none of these, or cannot be read.
+
     Parameters
     ----------
     full : read every message of a log: damage, gaps, stamps and clocks, instead of its index alone.
     message_definitions : a directory of .msg or .idl files for types that a log does not define.
-
-    Raises
-    ------
-    LogError, MapError, DatasetError, StoreError : when it is none of these, or cannot be read.
     """
     ask = partial(
         _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions

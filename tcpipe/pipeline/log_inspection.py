@@ -24,7 +24,8 @@ from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
 from tcpipe.robots import Profiles
 from tcpipe.stages.proposals import find_proposals
-from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.stages.read import decide_roles, find_read_config
+from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 
@@ -266,7 +267,7 @@ class TopicStamps:
         if not table.num_rows:
             return
         first = table if self._last is None else pa.concat_tables([self._last, table])
-        log_ns, header_ns = _log_ns(first), _read_header_ns(first)
+        log_ns, header_ns = to_integers(first, "log_time_ns"), _read_header_ns(first)
         again = np.zeros(len(log_ns), bool)
         steps = np.diff(log_ns)
         if header_ns is not None:
@@ -281,11 +282,6 @@ class TopicStamps:
         new = slice(len(log_ns) - table.num_rows, None)
         self._keep(log_ns[new], None if header_ns is None else header_ns[new], same[new])
         self._last = table.take(pa.array([table.num_rows - 1]))  # a slice would keep all of it
-
-    def times(self) -> tuple[Ints, Ints | None]:
-        """Return the log times and header stamps that are kept [ns]."""
-        log_ns, header_ns, _ = self._joined()
-        return log_ns, header_ns
 
     def topic_times(self) -> TopicTimes:
         """Return them for `tcpipe.logs.clocks`: what repeats a message exactly has its content."""
@@ -340,11 +336,6 @@ class TopicStamps:
             np.concatenate(headers) if headers else None,
             np.concatenate([same for _, _, same in self._kept]),
         )
-
-
-def _log_ns(table: pa.Table) -> Ints:
-    log_ns: Ints = table.column("log_time_ns").to_numpy()
-    return log_ns
 
 
 def _read_header_ns(table: pa.Table) -> Ints | None:

@@ -10,6 +10,7 @@ import shlex
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,28 +22,18 @@ from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.clocks import CLOCK
 from tcpipe.logs.roles import OVERLAY
-from tcpipe.logs.topics import Topic
+from tcpipe.logs.topics import MISSING, Topic
 from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_logs_at
 from tcpipe.recipe import ReadConfig, Recipe, Role
-from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.stages.read import decide_roles, find_read_config, read_run
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
 from tcpipe.tables.findings import Finding, Subject, Verdict, judge, make_finding, read_threshold, sort_findings
 from tcpipe.tables.levels import LabelledSegments
-
-MISSING: Mapping[Role, str] = {
-    "gnss": "no-gnss",
-    "imu": "no-imu",
-    "wheel_odometry": "no-wheel-odometry",
-    "power": "no-power",
-    "command": "no-command",
-}
-"""Code of the finding on a log without the role."""
 
 WANTED_HZ: Mapping[str, float] = {
     "imu": LEAST_RATE_HZ,
@@ -173,14 +164,12 @@ def preflight(
 ) -> Preflight:
     """Return what recording like this promises.
 
+    Raises `LogError`, `RecipeError`: it is no log, or cannot be read at all.
+
     Parameters
     ----------
     log : a minute or more, of any container, or the URL of one; all of it is read. Of a folder of logs the first.
     recipe, robot, message_definitions : as `tcpipe.pipeline.ingest.ingest` takes them.
-
-    Raises
-    ------
-    LogError, RecipeError : it is no log, or cannot be read at all.
     """
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)
@@ -221,6 +210,7 @@ def _summarize(
     for more in (seen.findings or (), report.findings):
         made = {(of.code, of.subject) for of in findings}
         findings += [of for of in more if (of.code, of.subject) not in made]
+    losses = find_largest_losses([expected_yield.distance_by_reason_m] if expected_yield else [])
     ready = expected_yield is not None and expected_yield.segments and all(of.severity == "note" for of in findings)
     return Preflight(
         log=seen.path,
@@ -230,7 +220,7 @@ def _summarize(
         problems=problems,
         findings=tuple(sort_findings(findings)),
         verdict=judge(findings),
-        losses=_find_largest_losses(expected_yield),
+        losses=tuple(loss for loss in losses if loss.share > _WORTH_SAYING)[:_MOST_LOSSES],
         record=record,
         large=large,
         recipe=seen.recipe or "",
@@ -282,8 +272,8 @@ def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
     Without GNSS or power there is no sample: these are missed whatever the recipe says.
     """
     present = {*roles, "gnss"} if "pose" in roles else {*roles}
-    for role, code in MISSING.items():
-        is_needless = role not in ("gnss", "power") and read.topics.get(role) == []
+    for code, role in {**MISSING, "no-command": "command"}.items():
+        is_needless = role not in ("gnss", "power") and read.topics.get(cast("Role", role)) == []
         if role not in present and not is_needless:
             found = make_finding(code, Subject("role", role))
             yield replace(found, severity="warning") if found.severity == "note" else found
@@ -314,11 +304,6 @@ def _is_ruled_by_rate(budget: EnergyBudget) -> bool:
     least_share = read_threshold("power-rate-dominates", "min_variance_fraction")
     gain = read_threshold("power-rate-dominates", "max_remaining_fraction")
     return budget.rate**2 > least_share * budget.total**2 and budget.at_20_hz < gain * budget.total
-
-
-def _find_largest_losses(expected_yield: ExpectedYield | None) -> tuple[StoreLoss, ...]:
-    losses = find_largest_losses([expected_yield.distance_by_reason_m] if expected_yield else [])
-    return tuple(loss for loss in losses if loss.share > _WORTH_SAYING)[:_MOST_LOSSES]
 
 
 def record_command(topics: Iterable[Topic], names: Sequence[str]) -> str:

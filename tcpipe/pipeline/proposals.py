@@ -35,7 +35,7 @@ from tcpipe.recipe.suggestions import (
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.proposals import find_proposals
-from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.stages.read import decide_roles, find_read_config
 from tcpipe.stages.read_sources import place_frames
 from tcpipe.store import is_store
 from tcpipe.tables.findings import Finding
@@ -50,9 +50,7 @@ def propose_recipe(
 ) -> ProposedRecipe:
     """Return the recipe for a log, or the first of a folder's, or the tables in a folder, whatever recipe there is.
 
-    Raises
-    ------
-    LogError, UsageError : there is nothing to read.
+    Raises `LogError`, `UsageError`: there is nothing to read.
     """
     path = path if is_url(path) else Path(path)
     if isinstance(path, Path) and (is_store(path) or (path / "dataset.json").is_file()):

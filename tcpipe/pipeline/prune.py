@@ -75,6 +75,8 @@ def prune(
 ) -> Pruned:
     """Remove what a store no longer needs, each thing whole or not at all.
 
+    Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or something cannot be removed; what went before is gone.
+
     Parameters
     ----------
     recipe : the recipe that rules: of a run that was ingested with it, what earlier calls made with others is old.
@@ -82,10 +84,6 @@ def prune(
     forget : datasets, by the path where they lay, that are gone: what they refer to may go.
     min_age_s : what killed calls left is removed when it is so old; what waits for a dataset, when nothing was put there for so long.
     dry_run : say what would go, and remove nothing.
-
-    Raises
-    ------
-    StoreError, UsageError, RecipeError : there is no store, or something cannot be removed; what went before is gone.
     """
     ruling = resolve_recipe(recipe)
     opened = open_store(store)
@@ -105,7 +103,8 @@ def prune(
         (removed if why is None else kept).append(Leftover(what, place.where(), _measure_size(place), why))
         if why is None and not dry_run:  # the commit first: nobody looks for what is about to go
             log.commit("pruned", Entries(removed=tuple(parts)))
-            _remove(place)
+            for entry in sorted(place.entries(), key=lambda entry: split_number(entry.name) is None):
+                place.delete(entry.name)  # its documents first, so that no reader looks for the rest
     left = [
         Leftover("left by a killed call", str(path), _measure_size(Place(path)))
         for path in _iterate_temporaries(opened, min_age_s)
@@ -241,22 +240,16 @@ def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str 
             why = unread
         except StoreError as error:
             named, why = set(), error.problems[0]
-        uncommitted = (
-            _find_uncommitted(find_highest_numbers(entry.name for entry in entries), rows) if run_id else set()
+        stems = (
+            [stem.partition("/") for stem in find_highest_numbers(entry.name for entry in entries)] if run_id else []
         )
-        for recipe_id in uncommitted:
+        for recipe_id in {recipe for recipe, _, kind in stems if kind == "manifest"} - {row.recipe_id for row in rows}:
             left = [entry for entry in entries if entry.name.startswith(f"{recipe_id}/")]
             yield "no commit names it", place, left, "ingest its log again, or remove it"
         young = {_find_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
         content = [of for of in entries if split_number(of.name) or _CONTENT.search(of.name)]
         over = [of for of in content if of.name not in named and _find_folder(of.name) not in young]
         yield "no document names it", place, over, why
-
-
-def _find_uncommitted(last: Mapping[str, int], rows: Sequence[RunFacts]) -> set[str]:
-    """Return the recipes of a run with a manifest and no commit."""
-    parted = (stem.partition("/") for stem in last)
-    return {recipe for recipe, _, kind in parted if kind == "manifest"} - {row.recipe_id for row in rows}
 
 
 def _iterate_named(place: Place, sizes: Mapping[str, int], rows: Sequence[RunFacts]) -> Iterator[str]:
@@ -287,12 +280,6 @@ def _find_folder(name: str) -> str:
     """Return the directory of content in which a file lies; a document is one for itself."""
     found = _CONTENT.search(name)
     return name[: found.end()] if found else name
-
-
-def _remove(place: Place) -> None:
-    """Remove a run or an ingestion: its documents first, so that no reader looks for the rest."""
-    for entry in sorted(place.entries(), key=lambda entry: split_number(entry.name) is None):
-        place.delete(entry.name)
 
 
 def _remove_empty(store: Store, min_age_s: float) -> None:

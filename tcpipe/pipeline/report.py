@@ -22,7 +22,7 @@ from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failur
 from tcpipe.pipeline.prune import is_replaced
 from tcpipe.pipeline.status import find_changes, judge_runs
 from tcpipe.report.dataset_patches import find_picture_folder, iterate_pictures
-from tcpipe.report.dataset_report import MOST_SAMPLES, render_dataset_report
+from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.label_sections import describe_physics
 from tcpipe.report.maps import Pictures
 from tcpipe.report.run_report import run_report
@@ -47,16 +47,13 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
 
     One that would be the same is left alone.
 
+    Raises `UsageError`: the path is none of these; `StoreError`: something cannot be read; of a store all other pages are written.
+
     Parameters
     ----------
     path : what the page is of.
     runs : of a store: write the page of every run too.
     patches : of a dataset: write pictures of all patches into a folder beside the page, which shows them.
-
-    Raises
-    ------
-    UsageError : when the path is none of these.
-    StoreError : something cannot be read; of a store all other pages are written.
     """
     inside = is_store(path) or find_store_above(path) is not None
     if not inside and (is_url(path) or (Path(path) / CARD).is_file()):
@@ -102,10 +99,6 @@ def _report_dataset(path: Path | str, *, patches: bool) -> Page:
     place = open_place(path) if fetched is None else fetched.place
     card = read_current_card(directory)
     folder, count = find_picture_folder(card)
-    if patches and card.samples > MOST_SAMPLES:
-        raise UsageError(
-            f"{path}: of more than {MOST_SAMPLES} samples the page shows means, which have no patch; leave --patches out"
-        )
     for name, data in iterate_pictures(directory, card) if patches else ():
         place.put(f"{folder}/{name}", data, lasting=False)
     shown = folder if card.samples and len(place.files(folder)) == count else ""

@@ -23,7 +23,6 @@ from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, 
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import format_path, is_url, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.pipeline.calls import (
     INGEST,
@@ -133,6 +132,8 @@ def find_status(
 ) -> Status:
     """Return where every log stands; parameters as those of `tcpipe.pipeline.ingest.ingest`.
 
+    Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or nothing is known of its sources.
+
     Parameters
     ----------
     logs
@@ -141,12 +142,6 @@ def find_status(
         A log that was written since so many seconds is growing.
     create
         The store need not be there.
-
-    Raises
-    ------
-    StoreError, UsageError, RecipeError
-        There is no store, or nothing is known of its sources.
-
     """
     ruling = resolve_recipe(recipe)
     opened = Store(store if is_url(store) else check_local_output(store)) if create else open_store(store)
@@ -169,7 +164,8 @@ def find_status(
     mine = range(len(found.sources)) if shard is None else select_shard(found.sources, shard)
     tasks = (IngestTask(found.sources[at], *how, min_age_s) for at in mine)
     steps = plan(tasks, state, broken=runs.lost if opened.place.path else ())
-    problems = [*_store_problems(runs)]
+    problems = [*state.problems, *find_incomplete_runs(runs)]
+    problems += [call.problem for call in begun if call.state == "killed"]
     if (
         not create
         and all(call.state == "killed" for call in begun)
@@ -202,13 +198,6 @@ def find_status(
         losses=find_largest_losses(run.distance_by_reason_m for run in current),
         exit_code=3 if trouble else 0,
     )
-
-
-def _store_problems(found: Ingestions) -> Iterator[Problem]:
-    """Yield what is wrong with a store: commits, runs that are not complete, calls that were killed."""
-    yield from found.state.problems
-    yield from find_incomplete_runs(found)
-    yield from (call.problem for call in list_begun_calls(found.state) if call.state == "killed")
 
 
 def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:

@@ -25,7 +25,7 @@ from tcpipe.formats.dataset_files import (
     REPORT,
     SAMPLES,
     PatchFiles,
-    find_rows_in_files,
+    find_places_in_files,
     has_sample_ids,
     open_patches,
     read_card,
@@ -82,9 +82,7 @@ class Verified:
 def verify(path: Path | str) -> Verified:
     """Re-read a dataset, a run, a store, a map, a model or a cost map; all but a map also at a URL.
 
-    Raises
-    ------
-    UsageError : when the path is none of these.
+    Raises `UsageError`: the path is none of these.
     """
     stored = _verify_stored(str(path)) if is_url(path) else None
     if is_url(path) and stored is None:
@@ -204,7 +202,7 @@ def _verify_samples(directory: Path, card: DatasetCard) -> Iterator[CheckResult]
     yield from (f"{where}: {problem}" for problem in _find_wrong_joins(samples, card))
     for key, value in measure_samples(samples.select(CARD_COLUMNS), has_terrain="terrain" in card.layers).items():
         told = getattr(card, key)
-        if told != value and not (told is None and key == "doubtful"):  # before data model 1.2 nobody counted them
+        if told != value:
             yield f"{directory / CARD}: {key} is {to_plain(told)}, but the samples give {to_plain(value)}"
     yield from (f"{directory / CARD}: {problem}" for problem in _find_wrong_runs(samples, card))
     used_m = math.fsum(to_floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
@@ -267,15 +265,12 @@ def _verify_rows(wrong: pa.ChunkedArray, what: str) -> Iterator[str]:
 def _verify_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> Iterator[CheckResult]:
     """Decode every patch; compare order, ids and values with the samples and the class table."""
     files = open_patches(directory, card, proved=False)
-    split = samples.column("split").to_numpy()
-    place = np.empty(samples.num_rows, np.int64)  # of each row of samples in the files
-    for name, rows in find_rows_in_files(card, split).items():
-        place[split == name] = rows
     for piece in range(len(files.starts) - 1):
         try:
             yield from _verify_piece(files, piece)
         except DatasetError as error:
             yield from error.problems
+    place = find_places_in_files(card, samples.column("split").to_numpy())
     in_files = samples.take(pa.array(np.argsort(place, kind="stable")))
     yield from _verify_patch_columns(directory, card, in_files)
 

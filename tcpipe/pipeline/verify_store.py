@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -207,9 +206,12 @@ def find_strangers(place: Place) -> Iterator[str]:
 def verify_map(path: Path) -> Iterator[CheckResult]:
     """Yield the same of one map: every file, and every tile of every layer and level decoded."""
     yield "maps", 1
-    checksums = yield from _verify_listed(path)
-    if checksums is None:
-        return
+    place, checksums = Place(path), read_checksums(path)
+    yield from find_wrong_files(place, checksums)
+    yield "files", len(checksums) + 1
+    for entry in place.entries():
+        if entry.name not in {*checksums, CHECKSUMS}:
+            yield _describe_stranger(place, entry.name)
     yield from _verify_tiles(path)
 
 
@@ -235,22 +237,6 @@ def _isolate_errors(findings: Iterator[CheckResult]) -> Iterator[CheckResult]:
         yield from findings
     except TcpipeError as error:
         yield from error.problems
-
-
-def _verify_listed(directory: Path) -> Any:
-    """Compare every file below a directory with its ``checksums.json``; return what that lists, or None if it cannot be trusted."""
-    try:
-        checksums = read_checksums(directory)
-    except StoreError as error:
-        yield from error.problems
-        return None
-    yield from find_wrong_files(Place(directory), checksums)
-    yield "files", len(checksums) + 1
-    place = Place(directory)
-    for entry in place.entries():
-        if entry.name not in {*checksums, CHECKSUMS}:
-            yield _describe_stranger(place, entry.name)
-    return checksums
 
 
 def _verify_streams(place: Place, known: RunJson | None) -> Iterator[CheckResult]:

@@ -99,7 +99,6 @@ page.start(async () => {
     rows.push(["ground", classes.get(c.class[i])?.name ?? "unknown"], ["split", told.splits[c.split[i]].name]);
     if (Number.isFinite(c.apart[i])) rows.push(["nearest train", digits(c.apart[i], "apart")]);
     rows.push(["quality", flags.length ? flags.join("; ") : "clean"]);
-    if (told.samples.cell_m !== null) return [[`mean of ${c.count[i]} samples`, ""], ...rows];
     const run = told.runs[c.run[i]];
     rows.push(["run", run.href ? make("a", run.id, { href: run.href }) : run.id]);
     rows.push(["time", page.clock(Number(start(i) / 1000000n))]);

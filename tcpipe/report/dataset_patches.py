@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import PatchFiles, find_rows_in_files, open_patches, read_samples
+from tcpipe.formats.dataset_files import PatchFiles, find_places_in_files, open_patches, read_samples
 from tcpipe.formats.json_files import Json
 from tcpipe.report.pictures import ACROSS, colour_classes, colour_heights, encode_picture, make_picture_uri, make_sheet
 from tcpipe.tables.columns import to_floats
@@ -55,10 +55,14 @@ class _Patches:
         return _join_colours({layer: np.concatenate(parts)[back] for layer, parts in stacks.items()})
 
     def select(self, samples: pa.Table) -> NDArray[np.int64]:
-        """Return up to `MOST_PATCHES` rows, rising, taken in turn from each split, class and 5° of slope: always the same ones."""
-        pieces = np.unique(self.piece)
+        """Return up to `MOST_PATCHES` rows, rising, taken in turn from each split, class and 5° of slope: always the same ones.
+
+        ``samples`` are the first ones of the dataset.
+        """
+        piece = self.piece[: samples.num_rows]
+        pieces = np.unique(piece)
         pieces = pieces[np.unique(np.linspace(0, len(pieces) - 1, _MOST_PIECES).astype(int))]
-        rows = np.flatnonzero(np.isin(self.piece, pieces))
+        rows = np.flatnonzero(np.isin(piece, pieces))
         near = samples.take(rows)
         slope = np.floor(np.degrees(to_floats(near, "slope_rad")) / 5.0).tolist()
         names = (near.column(name).to_pylist() for name in ("split", "terrain_name"))
@@ -73,23 +77,21 @@ class _Patches:
 def _open_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
     files = open_patches(directory, card)
     splits = samples.column("split").to_numpy(zero_copy_only=False)
-    place = np.empty(samples.num_rows, dtype=np.int64)
-    for name, rows in find_rows_in_files(card, splits).items():
-        place[splits == name] = rows
+    place = find_places_in_files(card, splits)
     piece = np.searchsorted(files.starts, place, side="right") - 1
     return _Patches(files, place, piece, choose_thinning(card.patch_px))
 
 
-def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int32]) -> Json:
-    """Return sheets of patches by layer and the rows of the page that they belong to (``row_of`` each sample, (T,)).
+def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, count: int) -> Json:
+    """Return sheets of patches by layer and the samples that they belong to, all among the first ``count``.
 
     `DatasetError` if they cannot be read.
     """
     if not samples.num_rows:
         return None
     patches = _open_patches(directory, card, samples)
-    rows = patches.select(samples)
-    return make_sheets(row_of[rows].tolist(), patches.read(rows), patches.files)
+    rows = patches.select(samples.slice(0, count))
+    return make_sheets(rows.tolist(), patches.read(rows), patches.files)
 
 
 def choose_thinning(patch_px: int) -> int:
@@ -124,9 +126,7 @@ def find_picture_folder(card: DatasetCard) -> tuple[str, int]:
 def iterate_pictures(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
     """Yield file name and content of the pictures of all patches, in the order of the samples.
 
-    Raises
-    ------
-    DatasetError : they cannot be read.
+    Raises `DatasetError`: they cannot be read.
     """
     samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
     patches = _open_patches(directory, card, samples)

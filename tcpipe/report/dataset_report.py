@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,14 +42,13 @@ from tcpipe.report.page import (
     render_page,
     show_verdict,
 )
-from tcpipe.report.plots import Plot, draw_waterfall, label_histograms, make_plot
+from tcpipe.report.plots import Plot, draw_waterfall, label_histograms
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
 _PAGE = "report.html"
 MOST_SAMPLES = 100_000
-"""Samples that can each be clicked; more are means over cells."""
+"""On the page: of more the first ones, since their order is random."""
 
 SAMPLE_COLUMNS = (
     *("sample_id", "split", "run_id", "start_ns", "start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg"),
@@ -64,16 +62,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class SamplesShown:
-    """Rows of the page: a sample each, or a cell each.
-
-    ``xy_m`` are middles in the first map's plane, (N, 2); ``row_of`` is where each sample of the table went, ``apart_m`` how far its
-    nearest train sample lies, NaN of those that are not held out, (T,) each.
-    """
+    """The samples of the page, and their middles in the first map's plane, (N, 2)."""
 
     xy_m: Floats
-    row_of: NDArray[np.int32]
-    apart_m: Floats
-    cell_m: float | None
     json: Json
 
 
@@ -93,7 +84,7 @@ def render_dataset_report(
     plots, lost = draw_dataset_map(directory, card, len(shown.xy_m))
     quality = samples.column("quality").to_numpy()
     try:
-        patches = make_patches_data(directory, card, samples, shown.row_of)
+        patches = make_patches_data(directory, card, samples, len(shown.xy_m))
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
@@ -106,7 +97,7 @@ def render_dataset_report(
         links=[] if beside is None else _list_store_pages(beside, hrefs),
         warnings=lost,
         sections=[
-            _make_map_section(shown, plots),
+            _make_map_section(shown, card.samples, plots),
             *([] if patches is None else [_GALLERY]),
             *_make_label_sections(samples),
             make_quality_section(quality, "samples"),
@@ -116,7 +107,7 @@ def render_dataset_report(
             Section("Distance breakdown", "Used and excluded distances add up to the odometer.", plots=[waterfall]),
             *_make_removal_sections(card),
             *make_balance_sections(card.balance),
-            _make_audit_section(card, samples, shown),
+            _make_audit_section(card),
             *_make_table_sections(card, hrefs),
             _make_provenance_section(card),
         ],
@@ -126,10 +117,8 @@ def render_dataset_report(
     )
 
 
-def _make_verdict(card: DatasetCard) -> VerdictBox | None:
-    """Return the verdict and the findings by code; None of a dataset of before data model 3.0."""
-    if card.verdict is None:
-        return None
+def _make_verdict(card: DatasetCard) -> VerdictBox:
+    """Return the verdict and the findings by code."""
     groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
     return show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups)
 
@@ -155,14 +144,11 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
     ]
 
 
-def _make_map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
+def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> Section:
     text = "Positions of samples; dashed: region of the split. The buffer is in no split. A box in the plot selects on the map."
-    if shown.cell_m is not None:
-        text += (
-            f" There are more than {MOST_SAMPLES} samples: a point is the mean of one split and class in a square of "
-            f"{shown.cell_m:.1f} m, and its quality any flag of any of them."
-        )
-    elif not len(shown.xy_m):
+    if len(shown.xy_m) < count:
+        text += f" Of {count} samples {len(shown.xy_m)}, drawn at random, are shown."
+    if not len(shown.xy_m):
         return Section("The samples on the map", "There is none.")
     return Section("The samples on the map", text, controls="dataset.html", plots=plots)
 
@@ -216,36 +202,12 @@ def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
 
 
 def _make_label_sections(samples: pa.Table) -> list[Section]:
-    plots = label_histograms(samples, "samples") if samples.num_rows else []
-    return [Section("Labels", "One value per sample.", plots=plots)] if samples.num_rows else []
+    if not samples.num_rows:
+        return []
+    return [Section("Labels", "One value per sample.", plots=label_histograms(samples, "samples"))]
 
 
-def _draw_distances(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
-    """Yield the distances of held-out samples to the nearest training sample, unless cells are shown in their place."""
-    if shown.cell_m is not None:
-        return
-    split = to_texts(samples.column("split"))
-    distances_m = {name: np.sort(shown.apart_m[split == name]) for name in ("test", "unseen")}
-    distances_m = {name: part for name, part in distances_m.items() if np.isfinite(part).any()}
-    if not distances_m:
-        return
-    plot = make_plot(
-        "apart",
-        alt="Share of held-out samples whose nearest train sample is no further than this; the table below has the counts.",
-        axes=("middle to nearest train middle [m]", "share of samples"),
-        legend={name: SPLIT_COLOURS[name] for name in distances_m},
-        height_px=240,
-        tools="save",
-        waits=True,
-    )
-    for name, sorted_m in distances_m.items():
-        kept = np.unique(np.linspace(0, len(sorted_m) - 1, 400).astype(int))
-        shares = (kept + 1) / len(sorted_m)
-        plot.figure.step(sorted_m[kept], shares, mode="after", color=SPLIT_COLOURS[name], line_width=2)
-    yield plot
-
-
-def _make_audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShown) -> Section:
+def _make_audit_section(card: DatasetCard) -> Section:
     rows = [
         (
             part.split,
@@ -263,7 +225,7 @@ def _make_audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShow
     counts = ("samples", "overlap train", "neighbours of train", "places near train")
     header = ("split", *counts, "nearest train", "median")
     text = "Held-out samples near training samples. On the map: colour by distance to the nearest training sample, or tick its lines."
-    return Section("Leakage audit", text, header=header, rows=rows, plots=list(_draw_distances(samples, shown)))
+    return Section("Leakage audit", text, header=header, rows=rows)
 
 
 def _make_finding_sections(card: DatasetCard) -> list[Section]:
@@ -359,46 +321,32 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
     to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
     middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
     xy_m = np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
-    cell_m, row_of = None, np.arange(table.num_rows, dtype=np.int32)
-    keys: dict[str, NDArray[np.integer]] = {
-        "split": _find_indices(table, "split", SPLITS),
-        "class": table.column("terrain_class").fill_null(0).to_numpy(),
-        "quality": table.column("quality").to_numpy(),
-        "run": _find_indices(table, "run_id", [run.run_id for run in card.runs]),
-    }
-    apart_m, nearest = find_nearest_train_m(xy_m, keys["split"])
-    x_m, y_m = xy_m.T
-    readers = _list_values(card, table) | {"apart": lambda: apart_m, "x": lambda: x_m, "y": lambda: y_m}
-    if table.num_rows > MOST_SAMPLES:
-        values, keys, row_of, cell_m = _average_in_cells(readers, keys, xy_m)
-        xy_m = np.column_stack([values["x"], values["y"]])
-    else:
-        values = {name: read() for name, read in readers.items()}
-        values["count"] = np.ones(len(xy_m))
-    columns: dict[str, Column] = {"x": ("steps", values["x"]), "y": ("steps", values["y"])}
-    columns |= {name: make_shown_column(digits, values[name]) for name, (*_, digits) in LABELS.items()}
-    columns |= {name: ("half", part) for name, part in values.items() if name not in {*columns, "count"}}
-    columns |= {"split": ("u8", keys["split"]), "class": ("u8", keys["class"]), "quality": ("u16", keys["quality"])}
-    columns |= {"run": ("u16", keys["run"]), "count": ("u32", values["count"])}
-    if cell_m is None:
-        after = table.column("start_ns").to_numpy() - np.array(find_first_starts_ns(card, table), np.int64)[keys["run"]]
-        columns |= {"after_s": ("u32", after // 10**9), "after_ns": ("u32", after % 10**9)}
-        near = apart_m < np.sqrt(2.0) * card.patch_m
-        columns["nearest"] = ("u32", np.where(near, nearest, np.arange(len(near))))
-    json: dict[str, Json] = {"packed": pack_columns(columns), "cell_m": cell_m, "ids": _find_odd_ids(table)}
-    return SamplesShown(xy_m, row_of, apart_m, cell_m, json)
-
-
-def _list_values(card: DatasetCard, table: pa.Table) -> dict[str, Callable[[], Floats]]:
-    """Return by name what reads a value of every sample, shape (N,): one at a time, so that few are in memory."""
-    readers = {name: partial(to_floats, table, column) for name, (column, *_) in LABELS.items()}
-    readers |= {f"{name}_std": partial(to_floats, table, column) for name, (_, column, _) in LABELS.items()}
-    angles = {"slope": "slope_rad", "turn": "yaw_change_rad"}
-    every: dict[str, Callable[[], Floats]] = {**readers}
-    every |= {name: lambda of=column: np.degrees(to_floats(table, of)) for name, column in angles.items()}  # type: ignore[misc]
+    apart_m, nearest = find_nearest_train_m(xy_m, _find_indices(table, "split", SPLITS))
+    starts_ns = np.array(find_first_starts_ns(card, table), np.int64)
+    table = table.slice(0, MOST_SAMPLES)
+    count = table.num_rows
+    columns: dict[str, Column] = {"x": ("steps", xy_m[:count, 0]), "y": ("steps", xy_m[:count, 1])}
+    for name, (column, std, digits) in LABELS.items():
+        columns[name] = make_shown_column(digits, to_floats(table, column))
+        columns[f"{name}_std"] = ("half", to_floats(table, std))
+    for name, column in (("slope", "slope_rad"), ("turn", "yaw_change_rad")):
+        columns[name] = ("half", np.degrees(to_floats(table, column)))
     if card.physics:
-        every["residual"] = lambda: readers["power"]() - to_floats(table, "physics_power_watt")
-    return every
+        columns["residual"] = ("half", to_floats(table, "power_watt") - to_floats(table, "physics_power_watt"))
+    run = _find_indices(table, "run_id", [of.run_id for of in card.runs])
+    after = table.column("start_ns").to_numpy() - starts_ns[run]
+    near = (apart_m < np.sqrt(2.0) * card.patch_m) & (nearest < count)
+    columns |= {
+        "apart": ("half", apart_m[:count]),
+        "split": ("u8", _find_indices(table, "split", SPLITS)),
+        "class": ("u8", table.column("terrain_class").fill_null(0).to_numpy()),
+        "quality": ("u16", table.column("quality").to_numpy()),
+        "run": ("u16", run),
+        "after_s": ("u32", after // 10**9),
+        "after_ns": ("u32", after % 10**9),
+        "nearest": ("u32", np.where(near, nearest, np.arange(len(near)))[:count]),
+    }
+    return SamplesShown(xy_m[:count], {"packed": pack_columns(columns), "ids": _find_odd_ids(table)})
 
 
 def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray[np.int32]:
@@ -416,44 +364,7 @@ def find_first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
 
 
 def _find_odd_ids(table: pa.Table) -> Sequence[str] | None:
-    """Return the ids where they are not the run's and the start's, which the page puts together itself; None for too many."""
-    if table.num_rows > MOST_SAMPLES:
-        return None
+    """Return the ids where they are not the run's and the start's, which the page puts together itself."""
     ids = table.column("sample_id").to_pylist()
     made = zip(table.column("run_id").to_pylist(), table.column("start_ns").to_pylist(), strict=True)
     return None if ids == [f"{run}-{start}" for run, start in made] else ids
-
-
-def _average_in_cells(
-    readers: Mapping[str, Callable[[], Floats]], keys: Mapping[str, NDArray[np.integer]], xy_m: Floats
-) -> tuple[dict[str, Floats], dict[str, NDArray[np.integer]], NDArray[np.int32], float]:
-    """Return means over square cells, one row for each split and class in a cell, each sample's row, and the cells' side [m]."""
-    cell_m, low_m = 1.0, xy_m.min(axis=0)
-    while True:
-        place = np.zeros(len(xy_m), np.int64)
-        for axis, factor in ((0, 4_000_000), (1, 1)):
-            place += np.floor((xy_m[:, axis] - low_m[axis]) / cell_m).astype(np.int64) * factor
-        place *= 4
-        place += keys["split"]
-        place *= 256
-        place += keys["class"]
-        groups = np.unique(place)
-        if len(groups) <= MOST_SAMPLES:
-            break
-        cell_m *= np.sqrt(2.0)
-    size, group = len(groups), np.searchsorted(groups, place).astype(np.int32)
-    del place
-    means = {}
-    for name, read in readers.items():
-        part = read()
-        known = np.isfinite(part)
-        with np.errstate(invalid="ignore"):
-            means[name] = np.bincount(group[known], part[known], size) / np.bincount(group[known], minlength=size)
-    count = np.bincount(group, minlength=size).astype(float)
-    whole: dict[str, NDArray[np.integer]] = {name: np.zeros(size, np.int64) for name in keys}
-    for name, numbers in keys.items():
-        if name == "quality":
-            np.bitwise_or.at(whole[name], group, numbers)
-        else:
-            whole[name][group] = numbers
-    return means | {"count": count}, whole, group, float(cell_m)

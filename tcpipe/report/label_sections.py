@@ -1,4 +1,4 @@
-"""Sections on labels: losses, quality bits, error budget, physics of the robot, and balance over class, slope and speed."""
+"""Sections on labels: losses, quality bits, error budget, physics of the robot, and balance over class and slope."""
 
 from __future__ import annotations
 
@@ -152,38 +152,21 @@ _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
 
 def make_balance_sections(balance: Balance) -> list[Section]:
-    """Return how samples are spread over class, slope and speed, and how well labels repeat themselves."""
-    by_slope, by_speed = balance.by_class_and_slope, balance.cells
+    """Return how samples are spread over class and slope, and how well labels repeat themselves."""
+    cells = balance.by_class_and_slope
     text = (
         f"Samples, in brackets the effective (independent) number: neighbours are correlated ({_format_correlation(balance)}). "
-        f"{sum(cell['rare'] for cell in by_slope)} of {len(by_slope)} cells have fewer than {balance.enough_effective:g}, "
+        f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells have fewer than {balance.enough_effective:g}, "
         "marked with * and a dashed border; – is ground of the map without samples. drive-next.geojson proposes where to drive."
     )
-    header, rows = _make_cell_table(by_slope, "class", [(cell["class"] or "any",) for cell in by_slope])
-    slope_section = Section("Balance of class and slope", text, header=header, rows=rows)
-    keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in by_speed]
-    header, rows = _make_cell_table(by_speed, "class, speed [m/s]", keys)
-    text = "The same, by velocity (the label)."
-    speed_section = Section("Balance of class, slope and speed", text, header=header, rows=rows, folded=True)
-    return [slope_section, speed_section, _make_repeatability_section(balance)]
-
-
-def _make_cell_table(
-    cells: Sequence[CellRow], name: str, keys: Sequence[tuple[str, ...]]
-) -> tuple[list[str], list[list[str | Shaded]]]:
-    """Return header and rows: a row a key, classes as they come and under each its speeds, rising; a column a range of slope."""
     names = {cell["slope"] for cell in cells}
     slopes = [slope for slope in SLOPE_NAMES if slope in names]
     most = max((sum(cell["samples"].values()) for cell in cells), default=0)
-    texts = {(key, cell["slope"]): _shade_cell(cell, most) for key, cell in zip(keys, cells, strict=True)}
-    classes = list(dict.fromkeys(key[0] for key in keys))
-    ordered = sorted(dict.fromkeys(keys), key=lambda key: (classes.index(key[0]), *map(_find_lower_end, key[1:])))
-    return [name, *slopes], [[", ".join(key), *(texts.get((key, slope), "") for slope in slopes)] for key in ordered]
-
-
-def _find_lower_end(speeds: str) -> tuple[float, bool]:
-    words = speeds.split()
-    return float(words[-1] if words[0] == "above" else words[0]), words[0] == "above"
+    texts = {(cell["class"] or "any", cell["slope"]): _shade_cell(cell, most) for cell in cells}
+    classes = dict.fromkeys(name for name, _ in texts)
+    rows = [[name, *(texts.get((name, slope), "") for slope in slopes)] for name in classes]
+    section = Section("Balance of class and slope", text, header=["class", *slopes], rows=rows)
+    return [section, _make_repeatability_section(balance)]
 
 
 def _shade_cell(cell: CellRow, most: int) -> Shaded:

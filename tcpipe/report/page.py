@@ -10,8 +10,8 @@ kind       what a reader gets
 =========  ======================================================================================
 ``u8``     whole numbers to 255; ``u16`` to 65 535; ``u32`` to 4 294 967 295
 ``f32``    a float32
-``half``   the upper 16 bits of a float32, rounded: to 0.4 %, for slopes and deviations
 ``text``   texts, as JSON
+``half``   the upper 16 bits of a float32, rounded: to 0.4 %, for slopes and deviations
 ``steps``  ``low + step * number`` over the column's range in 65 534 steps, for coordinates and labels
 =========  ======================================================================================
 

@@ -17,7 +17,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.report.colours import DOUBTED, FAINT, KEPT, LINE_COLOURS, UNUSED
+from tcpipe.report.colours import DOUBTED, KEPT, LINE_COLOURS, UNUSED
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -29,7 +29,7 @@ from tcpipe.report.label_sections import (
 )
 from tcpipe.report.maps import Pictures, RunMap, draw_run_map
 from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
-from tcpipe.report.plots import Plot, draw_histogram, label_histograms, make_plot, show_text
+from tcpipe.report.plots import Plot, label_histograms, make_plot, show_text
 from tcpipe.report.run_plots import (
     SPEED_ROLES,
     Line,
@@ -241,45 +241,16 @@ def _make_label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot
     if not segments.num_rows:
         return
     yield Section("Labels", "One value per segment.", plots=label_histograms(segments, "segments", prefix="of "))
-    if physics is None or not physics.fitted:
-        return
-    yield from make_physics_sections({} if physics.fit is None else {robot: physics.fit})
-    text = (
-        f"Power minus the physics model (idle, drivetrain, rolling, grade, turning) fitted on this run ({physics.segments} segments): "
-        f"terrain and errors. {physics.outliers} segments are further than four standard deviations of "
-        f"{physics.residual_watt:.0f} W."
-    )
-    yield Section("Residuals of the physics model", text, plots=list(_draw_physics(segments)))
-
-
-def _draw_physics(segments: pa.Table) -> Iterator[Plot]:
-    measured, fitted = to_floats(segments, "power_watt"), to_floats(segments, "physics_power_watt")
-    yield draw_histogram("residual", measured - fitted, label="w - physics [W]", of_what="segments")
-    known = np.isfinite(measured) & np.isfinite(fitted)
-    plot = make_plot(
-        "physics",
-        alt="Measured power of each segment over the power that the physics model predicts; equal on the line.",
-        axes=("w by physics [W]", "w [W]"),
-        height_px=220,
-        tools="save",
-        waits=True,
-    )
-    ends: NDArray[np.float64] = np.array([fitted[known].min(), fitted[known].max()]) if known.any() else np.zeros(2)
-    plot.figure.scatter(
-        fitted[known].astype(np.float32), measured[known].astype(np.float32), size=4, color=KEPT, alpha=0.7
-    )
-    plot.figure.line(ends, ends, color=FAINT, line_dash="dashed", line_width=1.5)
-    yield plot
+    yield from make_physics_sections({robot: physics.fit} if physics is not None and physics.fit is not None else {})
 
 
 def make_sensor_sections(run_json: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
-    """Return the sections on topics, rejections, disagreements and clocks; ``run_json`` is None where it is lost."""
+    """Return the sections on topics, rejections, noise and clocks; ``run_json`` is None where it is lost."""
     facts = manifest.info.report.facts
     return [
         *([] if run_json is None else [_make_topics_section(run_json, manifest.counts)]),
         *_make_trust_sections(facts, rejections),
         *_make_noise_sections(facts),
-        *_make_disagreement_sections(facts),
         *_make_clock_sections(facts, manifest.info.report.findings),
     ]
 
@@ -376,29 +347,6 @@ def _describe_noise(
         f"{sensor} over {time_s:g} s: {fitted:.2g} {unit} fitted, {stated:.2g} {unit} claimed, {share:.0%} by the data"
         for time_s, fitted, stated, share in zip(each.time_s, std, claimed, each.data_share, strict=True)
     ]
-
-
-def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
-    """Return when sensors and track disagree, in which quantity and by how much, if they do."""
-    disagreements = facts.audit.disagreements if facts.audit else ()
-    if not disagreements:
-        return []
-    start_ns = min((stretch.start_ns for stretch in facts.fuse.stretches), default=0) if facts.fuse else 0
-    rows = [
-        (
-            _name(part.sensor),
-            f"{(part.start_ns - start_ns) * 1e-9:.0f} to {(part.end_ns - start_ns) * 1e-9:.0f} s",
-            f"{part.size:.2g} m",
-            f"{part.expected_std:.2g} m",
-        )
-        for part in disagreements
-    ]
-    text = (
-        "Windows of 5 s in which the distance of the track differs from that of every sensor. There σ is inflated and segments "
-        "are flagged."
-    )
-    header = ("nearest sensor", "in the run", "difference", "expected (1σ)")
-    return [Section("Disagreements of sensors and track", text, header=header, rows=rows)]
 
 
 def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:

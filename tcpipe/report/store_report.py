@@ -347,7 +347,9 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
     for run in runs:
         if run.facts is None or (run.is_current and run.facts.defect):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
-            rows.append((run.run_id, run.state, _describe_problem(run.facts) if run.facts else line))
+            if run.facts:
+                line = describe_finding((*run.facts.damage, *select_problems(run.facts.findings))[0])
+            rows.append((run.run_id, run.state, line))
     if not rows:
         return []
     text = "Use 'tcpipe acknowledge' for problems that cannot be repaired."
@@ -355,10 +357,6 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
         text += f" The first {_MOST_LISTED} of {len(rows)}; the table above has every run."
     header = ("log or run", "is", "why")
     return [Section("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)]
-
-
-def _describe_problem(facts: RunFacts) -> str:
-    return describe_finding((*facts.damage, *select_problems(facts.findings))[0])
 
 
 def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:

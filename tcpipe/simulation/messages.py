@@ -194,37 +194,26 @@ def _make_visual(topic: str, reading: Reading, sensor: Visual) -> MessageStream:
 def _make_power(topic: str, reading: Reading, power: PowerType) -> list[MessageStream]:
     values = reading.values
     volt, left, right, rest = (values[name] for name in ("voltage_volt", "left_amp", "right_amp", "electronics_amp"))
-    match power:
-        case "husky_status":
-            columns = {"battery_voltage": volt, "left_driver_voltage": volt, "right_driver_voltage": volt}
-            columns |= {"left_driver_current": left, "right_driver_current": right, "mcu_and_user_port_current": rest}
-            columns |= {"uptime": (reading.stamp_ns - reading.stamp_ns[0]) // 1_000_000}
-            return [
-                _make_stream(
-                    topic, "husky_msgs/msg/HuskyStatus", reading, "base_link", columns, ros_control_loop_freq=10.0
-                )
-            ]
-        case "clearpath_power":
-            columns = {"measured_voltages": np.column_stack([volt, volt, volt])}
-            columns |= {"measured_currents": np.column_stack([rest, left, right])}
-            return [
-                _make_stream(
-                    topic, "clearpath_platform_msgs/msg/Power", reading, "base_link", columns, battery_connected=1
-                )
-            ]
-        case "battery_state":
-            columns = {"voltage": volt, "current": -(left + right)}  # REP-147: negative when discharging
-            return [
-                _make_stream(
-                    "/battery_state", "sensor_msgs/msg/BatteryState", reading, "base_link", columns, present=True
-                )
-            ]
-        case "battery_states":
-            return [
-                _make_stream(f"/{side}_drive/battery_state", "sensor_msgs/msg/BatteryState", reading, "base_link",
-                        {"voltage": volt, "current": amp}, present=True)
-                for side, amp in (("left", left), ("right", right))
-            ]  # fmt: skip
+    columns: dict[str, Any]
+    if power == "husky_status":
+        columns = {"battery_voltage": volt, "left_driver_voltage": volt, "right_driver_voltage": volt}
+        columns |= {"left_driver_current": left, "right_driver_current": right, "mcu_and_user_port_current": rest}
+        columns |= {"uptime": (reading.stamp_ns - reading.stamp_ns[0]) // 1_000_000}
+        kind, constants = "husky_msgs/msg/HuskyStatus", {"ros_control_loop_freq": 10.0}
+        return [_make_stream(topic, kind, reading, "base_link", columns, **constants)]
+    if power == "clearpath_power":
+        columns = {"measured_voltages": np.column_stack([volt, volt, volt])}
+        columns |= {"measured_currents": np.column_stack([rest, left, right])}
+        kind = "clearpath_platform_msgs/msg/Power"
+        return [_make_stream(topic, kind, reading, "base_link", columns, battery_connected=1)]
+    currents = {"/left_drive/battery_state": left, "/right_drive/battery_state": right}
+    if power == "battery_state":
+        currents = {"/battery_state": -(left + right)}  # REP-147: negative when discharging
+    kind = "sensor_msgs/msg/BatteryState"
+    return [
+        _make_stream(name, kind, reading, "base_link", {"voltage": volt, "current": amp}, present=True)
+        for name, amp in currents.items()
+    ]
 
 
 def _make_command(topic: str, reading: Reading, dialect: Dialect) -> MessageStream:

@@ -126,7 +126,7 @@ def _compute_curvature(corners: Float, radius_m: float) -> tuple[Float, float]:
     """Return the smoothed curvature every PATH_GRID_M, run-out included, and the length up to the last corner."""
     steps = np.diff(corners, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
-    turns = _wrap_angle(np.diff(np.arctan2(steps[:, 1], steps[:, 0])))
+    turns = (np.diff(np.arctan2(steps[:, 1], steps[:, 0])) + np.pi) % (2.0 * np.pi) - np.pi
     cuts = np.zeros(lengths.size + 1)
     for i, turn in enumerate(turns):
         cuts[i + 1] = min(radius_m * np.tan(abs(turn) / 2.0), 0.45 * min(lengths[i], lengths[i + 1]))
@@ -148,10 +148,6 @@ def compute_moving_average(values: Float, window_m: float) -> Float:
     padded = np.concatenate([np.full(half, values[0]), values, np.full(half, values[-1])])
     sums = np.concatenate([[0.0], np.cumsum(padded)])
     return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1))
-
-
-def _wrap_angle(angle_rad: Float) -> Float:
-    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 @dataclass(frozen=True, slots=True)

@@ -218,7 +218,9 @@ def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: No
     readings = {name: _offset_stamps(name, reading, sensors, faults) for name, reading in readings.items()}
     if faults.clock_step:
         middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
-        return {name: _step_clock(reading, middle_ns) for name, reading in readings.items()}
+        for name, reading in readings.items():
+            stamp_ns = np.where(reading.stamp_ns < middle_ns, reading.stamp_ns, reading.stamp_ns + CLOCK_STEP_NS)
+            readings[name] = replace(reading, stamp_ns=stamp_ns)
     return readings
 
 
@@ -475,12 +477,6 @@ def _offset_stamps(name: str, reading: Reading, sensors: Sensors, faults: Faults
 
 
 _SINGULAR = {"wheels": "wheel"}
-
-
-def _step_clock(reading: Reading, middle_ns: int) -> Reading:
-    return replace(
-        reading, stamp_ns=np.where(reading.stamp_ns < middle_ns, reading.stamp_ns, reading.stamp_ns + CLOCK_STEP_NS)
-    )
 
 
 def _draw_begin_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> int:

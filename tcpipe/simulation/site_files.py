@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -53,15 +53,14 @@ class SimulatedSite:
 def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> SimulatedSite:
     """Write a simulated site to ``out``, whole or not at all: the same scenario and seed give the same bytes. An identical site is kept.
 
-    Raises
-    ------
-    UsageError : the scenario is unknown, or ``out`` holds something else.
+    Raises `UsageError`: the scenario is unknown, or ``out`` holds something else.
     """
     chosen = scenario_by_name(scenario) if isinstance(scenario, str) else scenario
     about = {"seed": seed, "datum": chosen.world.site.datum, "scenario": chosen, "tcpipe_version": __version__}
     clear_beside(out)
     site = _read_site(out, chosen)
-    if _is_complete(site, about):
+    files = (*site.logs, *site.rasters.values(), site.region, *site.truths, site.world)
+    if all(path.exists() for path in files) and site.world.read_bytes() == to_json(about).encode():
         return replace(site, unchanged=True)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is not this simulated site; give another directory")
@@ -87,11 +86,6 @@ def _read_site(out: Path, scenario: Scenario) -> SimulatedSite:
         tuple(out / "truth" / f"{spec.name}.parquet" for spec in scenario.drives),
         out / "world.json",
     )
-
-
-def _is_complete(site: SimulatedSite, about: Mapping[str, Any]) -> bool:
-    files = (*site.logs, *site.rasters.values(), site.region, *site.truths, site.world)
-    return all(path.exists() for path in files) and site.world.read_bytes() == to_json(about).encode()
 
 
 def simulate_readings(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, dict[str, Reading]]:

@@ -40,9 +40,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     Each clock epoch, and each section between long pauses, is fused for itself. Stamps are multiples of the track's period; where no sensor
     measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
 
-    Raises
-    ------
-    FusionError : no sensor measures motion, or the estimate breaks down.
+    Raises `FusionError`: no sensor measures motion, or the estimate breaks down.
     """
     try:
         return _fuse(streams, config, run_id)
@@ -119,9 +117,7 @@ def fuse_recovering(
     That is the IMU, which carries the state from tick to tick, if the track recovers without it; else the only sensor without which it
     does.
 
-    Raises
-    ------
-    FusionError : the track contradicts every sensor, whichever is excluded.
+    Raises `FusionError`: the track contradicts every sensor, whichever is excluded.
     """
     fused = fuse_sections(inputs, streams, config)
     if not is_astray(fused.windows, fused.astray):

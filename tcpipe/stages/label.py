@@ -22,7 +22,7 @@ from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_p
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
-from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m
+from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, find_common_scale_std
 from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import (
     IdlePower,
@@ -45,7 +45,6 @@ from tcpipe.stages.label_motion import (
 )
 from tcpipe.stages.label_uncertainty import (
     audit_power_sensor,
-    compute_common_displacement_std_m,
     count_confirming_sensors,
     find_sensor_findings,
     find_stationary_ns,
@@ -162,6 +161,7 @@ def compute_segment_costs(
     better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ)
     ground_mps = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
     end_watt, noise_joule = compute_power_watt(rails, end_ns), noise.std_joule()
+    scale_std = find_common_scale_std(info.report.facts.fuse, start_ns, to_integers(cut, "clock_epoch"))
     cost = compute_labels(
         chord_m=to_floats(cut, "chord_m"),
         duration_s=(end_ns - start_ns).astype(np.float64) * 1e-9,
@@ -170,7 +170,7 @@ def compute_segment_costs(
         end_power_watt=end_watt,
         displacement_std_m=_compute_displacement_std_m(cut, rows, smoothed=info.estimator == "smoother"),
         energy_noise_joule=noise_joule,
-        common_displacement_std_m=compute_common_displacement_std_m(cut, info.report.facts),
+        common_displacement_std_m=scale_std * to_floats(cut, "chord_m"),
         sensor=sensor,
     )
     net = subtract_idle_power(
@@ -238,18 +238,26 @@ def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
     return float(np.linalg.norm(steps)) if steps else 0.0
 
 
+def make_fit_samples(table: pa.Table) -> FitSamples:
+    """Return segments or samples as input of the fit; the rise is that of the track."""
+    names = [ALL] * table.num_rows
+    if "terrain_name" in table.column_names:
+        names = table.column("terrain_name").fill_null(ALL).to_pylist()
+    return FitSamples(
+        power_watt=to_floats(table, "power_watt"),
+        velocity_mps=to_floats(table, "velocity_mps"),
+        rise=(to_floats(table, "end_z_m") - to_floats(table, "start_z_m")) / to_floats(table, "chord_m"),
+        mean_abs_yaw_rate_radps=to_floats(table, "mean_abs_yaw_rate_radps"),
+        terrain=np.array(names, np.str_),
+    )
+
+
 def add_physics(table: pa.Table, idle_watt: float) -> tuple[pa.Table, PhysicsFacts]:
     """Return the labelled segments of a run with the power that the physical model predicts, and the fit.
 
     The model has idle power ``idle_watt`` (NaN where unknown), drivetrain, rolling, grade and turning.
     """
-    metres = FitSamples(
-        power_watt=to_floats(table, "power_watt"),
-        velocity_mps=to_floats(table, "velocity_mps"),
-        rise=(to_floats(table, "end_z_m") - to_floats(table, "start_z_m")) / to_floats(table, "chord_m"),
-        mean_abs_yaw_rate_radps=to_floats(table, "mean_abs_yaw_rate_radps"),
-        terrain=np.full(table.num_rows, ALL),
-    )
+    metres = make_fit_samples(table)
     watt = idle_watt if np.isfinite(idle_watt) else None
     found = fit_physics(metres, idle_watt=watt)
     if found is None or not found.is_plausible():

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.motion.row_sections import find_runs, number_pieces
-from tcpipe.motion.uncertainty import find_common_scale_std
 from tcpipe.power.audit import (
     estimate_offset_std,
     find_gain_change,
@@ -139,12 +138,6 @@ def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts,
     sign_joule = np.where(lost, np.abs(integrate_energy(rails, *spans, rule=rule)), 0.0)
     offset_joule = np.linalg.norm(offsets, axis=0) if offsets else np.nan
     return SensorError(facts.gain_std_fraction, offset_joule, sign_joule)
-
-
-def compute_common_displacement_std_m(cut: pa.Table, facts: StageFacts) -> Floats:
-    """Return the part of each segment's displacement error that its section has in common [m], shape (M,)."""
-    scale_std = find_common_scale_std(facts.fuse, to_integers(cut, "start_ns"), to_integers(cut, "clock_epoch"))
-    return scale_std * to_floats(cut, "chord_m")
 
 
 _MOTION = (*FIXES, WHEELS, VISUAL)

@@ -33,15 +33,13 @@ def mask_track(
 ) -> MaskedTrack:
     """Return the track with ``dropped_by``: every reason why a row is not steady driving at the terrain's limit.
 
+    Raises `FusionError`: for most of a minute of driving the track is faster than plausible.
+
     Parameters
     ----------
     max_velocity_mps, max_plausible_mps : [m/s], of the robot's profile; the recipe's take precedence. Without a maximum, no row is
         dropped as below the limit.
     chord_m : [m], length of a segment, over which the relative position error counts.
-
-    Raises
-    ------
-    FusionError : for most of a minute of driving the track is faster than plausible.
     """
     table, period_s = track.table, 1.0 / track.info.rate_hz
     rows = MotionRows(
@@ -294,9 +292,7 @@ _DRIVES_MPS = 0.1
 def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, tuple[Finding, ...]]:
     """Return the rows faster than a limit [m/s], by velocity or by the step between two rows, and the finding; a jump is not a speed.
 
-    Raises
-    ------
-    FusionError : the moving median of the speed, over a minute of driving, exceeds the limit.
+    Raises `FusionError`: the moving median of the speed, over a minute of driving, exceeds the limit.
     """
     table = track.table
     speed_mps = np.hypot(to_floats(table, "east_velocity_mps"), to_floats(table, "north_velocity_mps"))

@@ -70,9 +70,7 @@ def read_sources(
 
     Messages are removed from ``messages`` as they are read, so that no log is in memory twice.
 
-    Raises
-    ------
-    RoleError : ``read.fields`` names what the messages do not hold.
+    Raises `RoleError`: ``read.fields`` names what the messages do not hold.
     """
     played = [(cast("Role", role.name), topic) for role in assignment.roles.values() for topic in role.topics]
     findings: list[Finding] = []
@@ -260,9 +258,7 @@ def place_pose(
 ) -> tuple[dict[str, pa.Table], str, tuple[Finding, ...]]:
     """Return the streams with the pose in longitude and latitude, the CRS of these, and findings.
 
-    Raises
-    ------
-    RecipeError : `read.pose_crs` is no projected CRS.
+    Raises `RecipeError`: `read.pose_crs` is no projected CRS.
     """
     if _POSE not in streams:
         return dict(streams), config.gnss_crs, ()

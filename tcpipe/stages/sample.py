@@ -66,6 +66,8 @@ def sample_segments(
 ) -> Sampled:
     """Return the patches of all segments that are on the map.
 
+    Raises `TableError`: chords and positions contradict each other; `MapError`: CRSs cannot be connected, or a tile is damaged.
+
     Parameters
     ----------
     segments : L5 of any runs, or `PLACED_SEGMENTS` of it; of several reasons the first counts: position uncertain, off the map, nodata,
@@ -73,10 +75,6 @@ def sample_segments(
     source, pool : the map, and its tiles as `sample_patches` takes them.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
     shifts : of runs on this map.
-
-    Raises
-    ------
-    TableError : chords and positions contradict each other. MapError : CRSs cannot be connected, or a tile is damaged.
     """
     PLACED_SEGMENTS.check(segments, more=True)
     chord_m, projection = to_floats(segments, "chord_m"), find_map_projection(source, gnss_crs)
@@ -162,9 +160,7 @@ def sample_on_maps(
 
     Parameters as `sample_segments`; ``pools`` and ``shifts`` have one a map.
 
-    Raises
-    ------
-    TableError, MapError : as `sample_segments`; the maps have not the same layers or classes, or are too far apart.
+    Raises `TableError`, `MapError`: as `sample_segments`; the maps have not the same layers or classes, or are too far apart.
     """
     check_same_layers(sources, config)
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)

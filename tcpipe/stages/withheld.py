@@ -70,9 +70,7 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
 
     All windows of a length are withheld together, so that a sensor and a length cost one fusion.
 
-    Raises
-    ------
-    FusionError : no sensor measures motion.
+    Raises `FusionError`: no sensor measures motion.
     """
     streams, _ = prepare_pose(streams)
     inputs = prepare_inputs(streams, config)

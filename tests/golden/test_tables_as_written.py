@@ -13,8 +13,7 @@ from tcpipe.formats.recipe_toml import load_profiles, parse_recipe
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.power.rails import integrate_recorded_energy
 from tcpipe.stages.message_arrays import make_rails
-from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import find_read_config
+from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.tables.columns import to_floats
 
 ROWS = 400

@@ -14,7 +14,7 @@ from tcpipe.formats.logs.table_log import open_tables
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, load_recipe
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import Recipe
-from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.stages.read import decide_roles, find_read_config
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 VI, SIDES = ("voltage", "current"), ("left", "right")

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from tcpipe import __version__
 from tcpipe.cost.labels import pool_budgets
-from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics
+from tcpipe.cost.physics import fit_and_validate_physics
 from tcpipe.formats.dataset_card import (
     Balance,
     DatasetCard,
@@ -35,6 +35,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut
+from tcpipe.stages.label import make_fit_samples
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import PhysicsFit
@@ -208,22 +209,6 @@ def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
         if fit is not None:
             found[robot] = fit
     return found
-
-
-def make_fit_samples(samples: pa.Table) -> FitSamples:
-    """Return samples or segments as input of the fit; the rise is that of the track."""
-    names = (
-        samples.column("terrain_name").fill_null(ALL).to_pylist()
-        if "terrain_name" in samples.column_names
-        else [ALL] * samples.num_rows
-    )
-    return FitSamples(
-        power_watt=to_floats(samples, "power_watt"),
-        velocity_mps=to_floats(samples, "velocity_mps"),
-        rise=(to_floats(samples, "end_z_m") - to_floats(samples, "start_z_m")) / to_floats(samples, "chord_m"),
-        mean_abs_yaw_rate_radps=to_floats(samples, "mean_abs_yaw_rate_radps"),
-        terrain=np.array(names, np.str_),
-    )
 
 
 def find_idle_power(samples: pa.Table) -> float | None:

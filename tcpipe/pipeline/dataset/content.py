@@ -274,9 +274,7 @@ class Content:
 def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> Content:
     """Sample, split and order; segments are kept in files in ``directory``, which must be empty, pixels where ``workers`` see them.
 
-    Raises
-    ------
-    DatasetError, MapError : no segment, none on the map, or none inside the region.
+    Raises `DatasetError`, `MapError`: no segment, none on the map, or none inside the region.
     """
     recipe = options.recipe
     segments, distance_by_reason_m, unusable = _pool_segments(inputs.runs, directory, again=inputs.again)

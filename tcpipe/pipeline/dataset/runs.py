@@ -152,10 +152,9 @@ def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[s
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
 
 
-def _format_names(run_ids: Iterable[str], most: int = 3) -> str:
-    """Return the first names, and how many more there are."""
-    names = sorted(run_ids)
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+def _format_names(names: Sequence[str]) -> str:
+    """Return the first three names, and how many more there are."""
+    return ", ".join(sorted(names)[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _suggest_logs(found: Ingestions, run_ids: Iterable[str]) -> str:
@@ -191,7 +190,10 @@ def group_similar_runs(
     A run belongs to the first group with which it shares a role and differs in none: a sensor may be off for a drive.
     """
     groups: list[tuple[list[str], SensorsByRole]] = []
-    sensors_by_run = {run_id: _describe_sensors(of) for run_id, of in sensors.items()}
+    sensors_by_run = {
+        run_id: {role: (of.topic, of.type_name, of.frame_id.strip("/")) for role, of in own.items()}
+        for run_id, own in sensors.items()
+    }
     for run_id, own_sensors in sorted(sensors_by_run.items(), key=lambda item: (-len(item[1]), item[0])):
         for runs, group_sensors in groups:
             shared = own_sensors.keys() & group_sensors.keys()
@@ -212,10 +214,6 @@ def format_robot(sensors: SensorsByRole) -> str:
         f"{role} {topic} ({kind}, frame {frame or 'none'})" for role, (topic, kind, frame) in sorted(sensors.items())
     )
     return ", ".join(parts) or "no sensor is known"
-
-
-def _describe_sensors(sensors: Mapping[str, Sensor | KnownSensor]) -> SensorsByRole:
-    return {role: (of.topic, of.type_name, of.frame_id.strip("/")) for role, of in sensors.items()}
 
 
 def _is_similar(one: tuple[str, str, str], other: tuple[str, str, str]) -> bool:

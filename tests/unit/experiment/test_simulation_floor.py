@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tcpipe.experiment.simulation_floor import compute_true_costs
-from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface
 from tcpipe.simulation.route import Leg, Pause, simulate_drive
-from tcpipe.simulation.scenarios import make_small_world
+from tcpipe.simulation.scenarios import make_paper_site, make_paper_surface, make_small_world
 from tcpipe.simulation.truth import compute_true_cost
 
 

@@ -9,8 +9,7 @@ from tcpipe.logs.field_mapping import make_mapped_message, read_fields
 from tcpipe.logs.messages import read_messages
 from tcpipe.logs.roles import assign_roles
 from tcpipe.logs.topics import Topic
-from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import find_read_config
+from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.tables.columns import to_floats
 
 NAV_SAT_FIX, GPS_FIX = "sensor_msgs/msg/NavSatFix", "gps_common/msg/GPSFix"

@@ -12,18 +12,18 @@ from object_gateway import open_bucket
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.formats.place import Place
-from tcpipe.pipeline import claims as claims_module
 from tcpipe.pipeline import log_queue
+from tcpipe.pipeline import log_queue as claims_module
 from tcpipe.pipeline.calls import identify_process
-from tcpipe.pipeline.claims import Claims, hold_claims
 from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.log_queue import Claims, hold_claims
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 
 TASK = """
 import os, pathlib, signal, sys, time
-from tcpipe.pipeline import claims, ingest
+from tcpipe.pipeline import log_queue as claims, ingest
 from tcpipe.recipe import Recipe
 
 logs, store, share, marks, deadly = sys.argv[1:]

@@ -54,7 +54,7 @@ def test_a_role_that_the_recipe_does_without_is_not_missed_unless_no_sample_is_l
 
     without = ReadConfig(topics={"wheel_odometry": [], "power": []})
     assert missing({"pose", "imu"}, without) == ["power", "command"]
-    assert missing({"imu"}, ReadConfig()) == ["gnss", "wheel_odometry", "power", "command"]
+    assert missing({"imu"}, ReadConfig()) == ["gnss", "power", "wheel_odometry", "command"]
 
 
 def test_a_missing_role_is_no_note_before_it_is_too_late_to_record_one():

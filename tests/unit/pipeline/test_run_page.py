@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,11 +12,9 @@ from stored_files import run_document
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
-from tcpipe.report.run_report import make_sensor_sections, run_report
+from tcpipe.report.run_report import run_report
 from tcpipe.simulation import Faults, make_tiny, simulate
 from tcpipe.store import Store
-from tcpipe.tables.facts import AuditFacts, Disagreement
-from tcpipe.tables.findings import StageReport
 
 
 @pytest.fixture(scope="module")
@@ -130,17 +127,6 @@ def test_the_noise_of_every_fused_sensor_is_in_the_facts_and_on_the_page(store):
     assert all(0.0 <= share <= 1.0 for each in noise.values() for share in each.data_share)
     section = html.split("<h2>Noise of the sensors</h2>")[1].split("<h2>")[0]
     assert all(name.replace("_", " ") in section for name in noise)
-
-
-def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
-    run, html = page(store)
-    assert "Disagreements of sensors and track" not in html
-    info, start_ns = run.manifest.info, run.manifest.info.report.facts.fuse.stretches[0].start_ns
-    each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", 4.9, 0.016)
-    facts = replace(info.report.facts, audit=AuditFacts((each,)))
-    told = replace(run.manifest, info=replace(info, report=StageReport((), facts)))
-    (section,) = [s for s in make_sensor_sections(None, told, run.rejections()) if "Disagree" in s.title]
-    assert section.rows == [("gnss", "10 to 20 s", "4.9 m", "0.016 m")]
 
 
 def test_every_topic_stands_on_the_page_and_may_break(store):

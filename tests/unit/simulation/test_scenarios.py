@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario
-from tcpipe.simulation.paper_site import make_paper_world
-from tcpipe.simulation.scenarios import SCENARIOS
+from tcpipe.simulation.scenarios import SCENARIOS, make_paper_world
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "simulation.md").read_text(encoding="utf-8")
 

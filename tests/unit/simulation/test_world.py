@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from pyproj import Proj
 
-from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface, scale_hidden_variance
 from tcpipe.simulation.robot import compute_rolling_resistance
-from tcpipe.simulation.scenarios import make_small_world
+from tcpipe.simulation.scenarios import make_paper_site, make_paper_surface, make_small_world, scale_hidden_variance
 from tcpipe.simulation.world import (
     GRASS,
     MUD,

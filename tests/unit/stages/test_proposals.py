@@ -10,7 +10,7 @@ from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages.proposals import find_proposals
-from tcpipe.stages.read_roles import decide_roles
+from tcpipe.stages.read import decide_roles
 
 RTK = """std_msgs/Header header
 float64 latitude

@@ -17,8 +17,7 @@ from tcpipe.pipeline.proposals import propose_recipe
 from tcpipe.recipe import Recipe, TableMapping
 from tcpipe.recipe.checking import from_values
 from tcpipe.simulation.scenarios import make_tiny
-from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import find_read_config
+from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.tables.columns import to_floats, to_integers
 
 START_NS = 1_760_456_485 * 10**9

@@ -64,13 +64,12 @@ def test_what_was_driven_twice_gives_the_noise_that_was_put_in(balance):
     assert found["std"] == pytest.approx(NOISE_WATT, rel=0.15)
 
 
-def test_the_page_shows_every_cell_by_class_and_by_speed(built, balance):
+def test_the_page_shows_every_cell_of_class_and_slope(built, balance):
     page = (built / "report.html").read_text()
-    by_class, by_speed = page.split("<h2>Balance of class and slope")[1].split("<h2>Balance of class, slope and speed")
-    by_speed = by_speed.split("<h2>Repeatability: lower bound of model errors")[0]
-    for cells, shown in ((balance["by_class_and_slope"], by_class), (balance["cells"], by_speed)):
-        found = [int(count) for count in re.findall(r"<td[^>]*><span[^>]*>(\d+) \(\d+\)\*?</span></td>", shown)]
-        assert sorted(found) == sorted(sum(cell["samples"].values()) for cell in cells if any(cell["samples"].values()))
+    shown = page.split("<h2>Balance of class and slope")[1].split("<h2>Repeatability: lower bound of model errors")[0]
+    found = [int(count) for count in re.findall(r"<td[^>]*><span[^>]*>(\d+) \(\d+\)\*?</span></td>", shown)]
+    cells = balance["by_class_and_slope"]
+    assert sorted(found) == sorted(sum(cell["samples"].values()) for cell in cells if any(cell["samples"].values()))
 
 
 def test_where_to_drive_next_is_geojson_that_a_gis_takes(built, balance):
