@@ -66,6 +66,22 @@ def test_the_command_takes_it_and_a_folder_alone_runs_nothing(place, tmp_path):
     assert json.loads(done.stdout)["model"] == "own"
     made = command("cost-map", model, tmp_path / "costs", "--cell-size", "4", "--store", store, *own, cwd=here)
     assert "cells with a cost" in made.stdout
+    planning = ("--store", store, *own)
+    ends = [",".join(map(str, end)) for end in lonlat([(-12.0, -5.0), (-2.0, -4.0)]).tolist()]
+    plan = ("--from", ends[0], "--to", ends[1], "--allow-extrapolation", "--out", tmp_path / "plan.geojson")
+    graph = ("--graph", "graph.geojson", "--out", tmp_path / "graph.geojson", "--origin", ends[0])
+    line = [[0.0, 0.0], [8.0, 1.0]]
+    nodes = [({"id": number}, {"type": "Point", "coordinates": at}) for number, at in enumerate(line)]
+    edge = ({"id": 5, "startid": 0, "endid": 1}, {"type": "LineString", "coordinates": line})
+    features = [{"type": "Feature", "properties": facts, "geometry": of} for facts, of in (*nodes, edge)]
+    (here / "graph.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    for asked in (
+        ("evaluate", model, "dataset", tmp_path / "evaluation", "--noise-draws", "1", *own),
+        ("predict-path", model, "--path", "path.geojson", *planning),
+        ("plan-path", model, *plan, *planning),
+        ("route-graph", model, *graph, *planning),
+    ):
+        assert command(*asked, cwd=here).returncode == 0
     done = command("predict-path", model, "--path", "path.geojson", "--store", store, cwd=here)
     assert done.returncode == 2
     assert "was trained with code of your own, which no folder has: give it with --predictor FILE.py" in done.stderr
