@@ -152,5 +152,9 @@ def test_a_network_is_written_as_onnx_and_a_folder_of_a_graph_needs_no_code(plac
     graph.write_bytes(b"none")
     with pytest.raises(ModelError, match="no ONNX graph that can be run"):
         tcpipe.train(data, tmp_path / "none", predictor=str(graph))
-    with pytest.raises(ModelError, match="expected a model of kind resnet18"):
-        tcpipe.train(data, tmp_path / "physics", model="physics", onnx=graph)
+
+
+def test_only_a_network_is_written_as_onnx(place, tmp_path):
+    done = command("train", place[0] / "dataset", "physics", "--model", "physics", "--onnx", "graph.onnx", cwd=tmp_path)
+    assert "expected a model of kind resnet18 without extra features to write as ONNX" in done.stderr
+    assert not (tmp_path / "graph.onnx").exists()
