@@ -13,6 +13,7 @@ from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
+from tcpipe.stages.clock_findings import correct_clocks
 from tcpipe.stages.fuse_findings import (
     find_fuse_findings,
     find_parameter_findings,
@@ -21,7 +22,6 @@ from tcpipe.stages.fuse_findings import (
 )
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
-    correct_clocks,
     drop_implausible_sensors,
     exclude_sensors,
     name_pose,

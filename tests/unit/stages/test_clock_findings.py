@@ -10,7 +10,8 @@ from suggested_recipes import proposed
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.fuse_inputs import FusionInputs, correct_clocks, find_clock_jumps, prepare_inputs
+from tcpipe.stages.clock_findings import correct_clocks, find_clock_jumps
+from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.tables.findings import Subject
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
