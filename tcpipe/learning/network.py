@@ -8,7 +8,9 @@ batch normalisation are those of Keras.
 
 from __future__ import annotations
 
+import io
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -141,6 +143,29 @@ def make_resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> 
     network.head.bias.data[:] = torch.tensor(list(start))
     made: ResNet18 = network.to(find_device(), memory_format=torch.channels_last)
     return made
+
+
+class _Units(nn.Module):
+    """A network with the axes of patches, whose outputs have their units."""
+
+    def __init__(self, network: nn.Module, scale: Sequence[float]) -> None:
+        super().__init__()
+        self.network, self.scale = network, torch.tensor(scale)
+
+    def forward(self, patches: Any) -> Any:
+        return self.network(patches.permute(0, 3, 1, 2)) * self.scale
+
+
+def export_graph(network: nn.Module, shape: Sequence[int], scale: Sequence[float]) -> bytes:
+    """Return a network as an ONNX graph from patches, each of this shape, to its outputs over ``scale``; needs the package onnx."""
+    stream, whole = io.BytesIO(), _Units(network, scale).cpu().eval()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the newer exporter needs one package more
+        torch.onnx.export(
+            whole, (torch.zeros(1, *shape),), stream, dynamo=False, input_names=["patches"], output_names=["outputs"],
+            dynamic_axes={"patches": {0: "samples"}, "outputs": {0: "samples"}},
+        )  # fmt: skip
+    return stream.getvalue()
 
 
 def find_device() -> Any:

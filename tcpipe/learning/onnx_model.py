@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from importlib.util import find_spec
@@ -67,27 +65,10 @@ def export_network(predictor: Predictor, name: str) -> bytes:
     if not isinstance(predictor, NetworkModel) or predictor.inputs.extra_features:
         raise ModelError(f"{name}: expected a model of kind resnet18 without extra features to write as ONNX")
     _require("onnx")
-    import torch  # noqa: PLC0415  seconds
+    from tcpipe.learning.network import export_graph  # noqa: PLC0415  torch takes seconds
 
-    inputs, network, scale = predictor.inputs, predictor.network, torch.tensor(predictor.inputs.scale)
-
-    class Units(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = network
-
-        def forward(self, patches: Any) -> Any:
-            return self.network(patches.permute(0, 3, 1, 2)) * scale
-
-    stream, example = io.BytesIO(), torch.zeros(1, inputs.patch_px, inputs.patch_px, len(inputs.planes))
-    network.cpu().eval()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the newer exporter needs one package more
-        torch.onnx.export(
-            Units().eval(), (example,), stream, dynamo=False, input_names=["patches"], output_names=["outputs"],
-            dynamic_axes={"patches": {0: "samples"}, "outputs": {0: "samples"}},
-        )  # fmt: skip
-    return stream.getvalue()
+    inputs = predictor.inputs
+    return export_graph(predictor.network, (inputs.patch_px, inputs.patch_px, len(inputs.planes)), inputs.scale)
 
 
 def _require(package: str) -> None:

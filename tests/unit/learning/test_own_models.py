@@ -69,6 +69,18 @@ def test_the_command_takes_it_and_a_folder_alone_runs_nothing(place, tmp_path):
     done = command("predict-path", model, "--path", "path.geojson", "--store", store, cwd=here)
     assert done.returncode == 2
     assert "was trained with code of your own, which no folder has: give it with --predictor FILE.py" in done.stderr
+    assert (
+        command("evaluate", model, "dataset", tmp_path / "evaluated", "--noise-draws", "1", *own, cwd=here).returncode
+        == 0
+    )
+    stored = ("--store", store, *own)
+    done = command("predict-path", model, "--path", "path.geojson", *stored, "--json", cwd=here)
+    assert json.loads(done.stdout)["energy_joule"] > 0.0
+    start, goal = ("{},{}".format(*point) for point in lonlat([(-12.0, -5.0), (-2.0, -4.0)]).tolist())
+    ends = ("--from", start, "--to", goal, "--allow-extrapolation", "--out", tmp_path / "plan.geojson")
+    assert command("plan-path", model, *ends, *stored, cwd=here).returncode in {0, 3}
+    done = command("route-graph", model, "--out", tmp_path / "graph.geojson", *stored, cwd=here)
+    assert "--predictor" not in done.stderr
     assert not any("by_hand" in path.read_text(errors="ignore") for path in model.iterdir())
 
 
@@ -136,5 +148,9 @@ def test_a_network_is_written_as_onnx_and_a_folder_of_a_graph_needs_no_code(plac
     graph.write_bytes(b"none")
     with pytest.raises(ModelError, match="no ONNX graph that can be run"):
         tcpipe.train(data, tmp_path / "none", predictor=str(graph))
-    with pytest.raises(ModelError, match="expected a model of kind resnet18"):
-        tcpipe.train(data, tmp_path / "physics", model="physics", onnx=graph)
+
+
+def test_only_a_network_is_written_as_onnx(place, tmp_path):
+    done = command("train", place[0] / "dataset", "physics", "--model", "physics", "--onnx", "graph.onnx", cwd=tmp_path)
+    assert "expected a model of kind resnet18 without extra features to write as ONNX" in done.stderr
+    assert not (tmp_path / "graph.onnx").exists()
