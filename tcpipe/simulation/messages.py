@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation.sensors import Doppler, Gnss, Imu, Mounting, Power, Reading, Sensors, Visual, Wheels
+from tcpipe.simulation.sensors import Doppler, Gnss, Imu, Mounting, Power, Reading, Sensors, Values, Visual, Wheels
 
 Dialect = Literal["ros1", "ros2"]
 PowerType = Literal["husky_status", "clearpath_power", "battery_state", "battery_states"]
@@ -90,7 +90,7 @@ def _make_messages(
 
 
 def _make_stream(
-    topic: str, type_name: str, reading: Reading, frame: str, columns: dict[str, Any], **constants: Any
+    topic: str, type_name: str, reading: Reading, frame: str, columns: Values, **constants: Any
 ) -> MessageStream:
     columns = {**_make_header(reading.stamp_ns), **columns}
     fixed = {"header.frame_id": frame, **{name.replace("__", "."): value for name, value in constants.items()}}
@@ -179,7 +179,7 @@ def _make_visual(topic: str, reading: Reading, sensor: Visual) -> MessageStream:
     columns = _make_vector("pose.pose.position", reading.values["position_m"])
     columns |= _make_vector("pose.pose.orientation", reading.values["orientation_xyzw"], "xyzw")
     known = sensor.covariance == "known"
-    constants: dict[str, Any] = {"pose__covariance": known * np.diag(np.full(6, 1e-2)).ravel()}
+    constants: Values = {"pose__covariance": known * np.diag(np.full(6, 1e-2)).ravel()}
     if sensor.says == "twist":
         columns |= _make_vector("twist.twist.linear", reading.values["linear_mps"])
         columns |= _make_vector("twist.twist.angular", reading.values["angular_radps"])
@@ -194,7 +194,7 @@ def _make_visual(topic: str, reading: Reading, sensor: Visual) -> MessageStream:
 def _make_power(topic: str, reading: Reading, power: PowerType) -> list[MessageStream]:
     values = reading.values
     volt, left, right, rest = (values[name] for name in ("voltage_volt", "left_amp", "right_amp", "electronics_amp"))
-    columns: dict[str, Any]
+    columns: Values
     if power == "husky_status":
         columns = {"battery_voltage": volt, "left_driver_voltage": volt, "right_driver_voltage": volt}
         columns |= {"left_driver_current": left, "right_driver_current": right, "mcu_and_user_port_current": rest}

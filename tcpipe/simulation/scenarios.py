@@ -144,6 +144,7 @@ def _make_visible_world() -> World:
     return replace(world, regions=(*edges, *world.regions), surface=surface, sun=(0.5, 0.35, 0.79))
 
 
+Numbers = dict[str, Any]
 _GROUNDS = {"grass": GRASS, "mud": MUD, "unpaved_road": UNPAVED, "paved_road": PAVED}
 
 
@@ -157,7 +158,7 @@ class PaperSite:
     tours: tuple[Wander | AlongRoad, ...]
 
 
-def read_paper_parameters() -> dict[str, Any]:
+def read_paper_parameters() -> Numbers:
     """Return ``paper_site.toml``: tables of numbers, each with its ``source``."""
     return tomllib.loads(files("tcpipe.simulation").joinpath("paper_site.toml").read_text(encoding="utf-8"))
 
@@ -202,11 +203,11 @@ def scale_hidden_variance(world: World, factor: float) -> World:
     return replace(world, resistance=hidden)
 
 
-def _read_numbers(table: Mapping[str, Any]) -> dict[str, Any]:
+def _read_numbers(table: Numbers) -> Numbers:
     return {name: value for name, value in table.items() if name != "source"}
 
 
-def _read_table(kind: type, table: Mapping[str, Any]) -> dict[str, Any]:
+def _read_table(kind: type, table: Numbers) -> Numbers:
     """Return a table's numbers; a name that the dataclass has not is a mistake in the file."""
     unknown = set(_read_numbers(table)) - {field.name for field in fields(kind)}
     if unknown:
@@ -214,7 +215,7 @@ def _read_table(kind: type, table: Mapping[str, Any]) -> dict[str, Any]:
     return _read_numbers(table)
 
 
-def _iterate_tours(drives: Mapping[str, Any]) -> Iterator[Wander | AlongRoad]:
+def _iterate_tours(drives: Numbers) -> Iterator[Wander | AlongRoad]:
     """Yield the drives: to and fro along roads, and random tours of grass and mud that stay in one of the areas."""
     for run in drives["road"]:
         yield AlongRoad(_PAPER_ROADS[run["road"]], run["from_m"], run["to_m"], run["length_m"])

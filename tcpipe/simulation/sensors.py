@@ -25,6 +25,8 @@ CLOCK_STEP_NS = 2_500_000_000
 """How far header stamps jump with the fault ``clock_step``."""
 
 Triple = tuple[float, float, float]
+Values = dict[str, Any]
+"""Arrays by name, one row a message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +35,7 @@ class Reading:
 
     stamp_ns: NDArray[np.int64]
     log_time_ns: NDArray[np.int64]
-    values: dict[str, Any]
-    """Arrays by name, one row a message."""
+    values: Values
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,7 +348,7 @@ def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading
         error = sensor.orientation_std_rad * noise("imu.orientation").standard_normal((3, stamp.size))
         roll, pitch, yaw = roll + error[0], pitch + error[1], yaw + error[2]
     orientation = multiply(quat_from_rpy(roll, pitch, yaw), sensor.mounting.quat_xyzw())
-    values: dict[str, Any] = {
+    values: Values = {
         "angular_velocity_radps": rate,
         "specific_force_mps2": force,
         "orientation_xyzw": orientation,
@@ -378,7 +379,7 @@ def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> R
     linear = linear + wrong
     keep = _remove_stretch(stamp, truth, noise("visual.dropouts"), sensor.dropout_s) if faults.visual_dropouts else None
     position, orientation = _make_camera_pose(at, sensor, faults, wrong, noise)
-    values: dict[str, Any] = {"linear_mps": linear, "angular_radps": angular}
+    values: Values = {"linear_mps": linear, "angular_radps": angular}
     values |= {"position_m": position, "orientation_xyzw": orientation}
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="visual", keep=keep)
 
@@ -420,14 +421,14 @@ def read_command(truth: Truth, sensor: Command, faults: Faults, noise: Noise) ->
         rng = noise("command.jitter")
         velocity = velocity * (1.0 - sensor.jitter * np.abs(rng.standard_normal(stamp.size)))
         yaw_rate = yaw_rate + sensor.jitter * rng.standard_normal(stamp.size) * (velocity != 0.0)
-    values: dict[str, Any] = {"velocity_mps": velocity, "yaw_rate_radps": yaw_rate}
+    values: Values = {"velocity_mps": velocity, "yaw_rate_radps": yaw_rate}
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="command")
 
 
 def _finish(
     stamp: NDArray[np.int64],
     delay_s: float,
-    values: dict[str, Any],
+    values: Values,
     faults: Faults,
     noise: Noise,
     *,

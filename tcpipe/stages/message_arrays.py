@@ -19,6 +19,8 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import Streams
 
 T = TypeVar("T", bound=np.generic)
+Array = NDArray[Any]
+Arrays = dict[str, Array]
 
 
 class LogReader(Protocol):
@@ -38,13 +40,13 @@ class LogReader(Protocol):
         """Yield the same piece by piece: each the next rows of some topics; a message that lies far behind its time comes later."""
 
 
-def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str, NDArray[Any]]:
+def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> Arrays:
     """Return a table's columns: numbers as they are, texts as str, lists of numbers as (N, k) with NaN where a row is shorter.
 
     Of lists of messages only the numbers are read that ``in_lists`` names, as ``drivers[].current``, and of lists of texts those that it
     names, as ``name[]`` (128 letters, "" where a row is shorter): they are (N, k) as well.
     """
-    found: dict[str, NDArray[Any]] = {}
+    found: Arrays = {}
     for name in table.column_names:
         array = _combine_chunks(table.column(name))
         kind = array.type
@@ -138,8 +140,6 @@ def read_transforms(table: pa.Table) -> Transforms:
     )
 
 
-Arrays = dict[str, NDArray[Any]]
-
 _PUBLISH_TIME = "publish_time_ns"
 
 
@@ -164,7 +164,7 @@ def gather_messages(
     return {topic: _sort_columns(_join_columns(parts)) for topic, parts in pieces.items()}, joined
 
 
-def _compact_column(values: NDArray[Any]) -> NDArray[Any]:
+def _compact_column(values: Array) -> Array:
     """Return a copy of its own of a column's values; one row for all, where every row has the same bits."""
     values = np.ascontiguousarray(values)
     row_bytes = values[:1].nbytes
@@ -183,7 +183,7 @@ def _join_columns(parts: list[Arrays]) -> Arrays:
     return {name: _concatenate_column([part.pop(name) for part in parts]) for name in list(parts[0])}
 
 
-def _concatenate_column(pieces: list[NDArray[Any]]) -> NDArray[Any]:
+def _concatenate_column(pieces: list[Array]) -> Array:
     """Return pieces of one column as one; rows of lists that are shorter than the longest are filled up."""
     if len(pieces) == 1:
         return pieces[0]
@@ -200,7 +200,7 @@ def _concatenate_column(pieces: list[NDArray[Any]]) -> NDArray[Any]:
     return np.concatenate(pieces)
 
 
-def _is_constant(values: NDArray[Any]) -> bool:
+def _is_constant(values: Array) -> bool:
     return len(values) == 1 or values.strides[0] == 0
 
 

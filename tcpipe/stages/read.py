@@ -8,7 +8,6 @@ from typing import Any, cast, get_args
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
 from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, RECIPE, AlignedClocks, Timeline, TopicTimes, settle_clocks
@@ -19,7 +18,7 @@ from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.robots import Profiles
-from tcpipe.stages.message_arrays import LogReader, gather_messages
+from tcpipe.stages.message_arrays import Arrays, LogReader, gather_messages
 from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_power, remove_repeats
 from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
@@ -162,11 +161,11 @@ def make_role_table(
     return STREAMS[role].table(**{name: columns.pop(name)[order] for name in list(columns)})
 
 
-def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
+def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[Arrays]:
     """Return a topic's columns; one part a rail where it is used as power."""
     readings = source.readings.columns
     columns = {name: readings.pop(name)[timeline.row] for name in list(readings)}
-    times: dict[str, NDArray[Any]] = {
+    times: Arrays = {
         "stamp_ns": timeline.stamp_ns,
         "log_time_ns": source.readings.log_time_ns[timeline.row],
         "clock_epoch": timeline.clock_epoch,

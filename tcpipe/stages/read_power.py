@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from tcpipe.logs.field_mapping import Columns
 from tcpipe.logs.messages import LOG_TIME, Readings, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings, read_power
@@ -26,7 +26,7 @@ from tcpipe.tables.levels import STREAMS
 
 
 def read_power_of_topics(
-    topics: Mapping[str, tuple[str, Mapping[str, NDArray[Any]]]],
+    topics: Mapping[str, tuple[str, Columns]],
     assignment: RoleAssignment,
     config: ReadConfig,
     *,
@@ -58,7 +58,7 @@ def name_counter_columns(rail: str) -> tuple[str, str]:
     return f"{rail}: energy_joule", f"{rail}: resets"
 
 
-def select_power_rows(columns: Mapping[str, NDArray[Any]], rails: Sequence[RailReadings]) -> Readings:
+def select_power_rows(columns: Columns, rails: Sequence[RailReadings]) -> Readings:
     """Return the rows of a power topic on which at least one rail carries a voltage or a current."""
     values = {
         name: values
@@ -82,7 +82,7 @@ def select_power_rows(columns: Mapping[str, NDArray[Any]], rails: Sequence[RailR
 
 
 def read_rail_power(
-    rail: RailReadings, times: Mapping[str, NDArray[Any]], columns: Mapping[str, NDArray[Any]]
+    rail: RailReadings, times: Columns, columns: Columns
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a rail's voltages [V] and currents [A] in its topic's readings.
 

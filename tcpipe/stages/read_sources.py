@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, cast, get_args
+from typing import cast, get_args
 
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, RecipeError, RoleError
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import Timeline
 from tcpipe.logs.expressions import UNITS
 from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
-from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
+from tcpipe.logs.field_mapping import MAPPED_TYPES, Columns, make_mapped_message
 from tcpipe.logs.messages import (
     LOG_TIME,
     Readings,
@@ -34,7 +33,7 @@ from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import Extrinsics, ReadConfig, Role
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
-from tcpipe.stages.message_arrays import LogReader, read_transforms
+from tcpipe.stages.message_arrays import Arrays, LogReader, read_transforms
 from tcpipe.stages.read_power import read_power_of_topics, select_power_rows
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -59,7 +58,7 @@ class TopicReadings:
 
 
 def read_sources(
-    messages: dict[str, dict[str, NDArray[Any]]],
+    messages: dict[str, Arrays],
     topics: Mapping[str, Topic],
     assignment: RoleAssignment,
     config: ReadConfig,
@@ -74,7 +73,7 @@ def read_sources(
     """
     played = [(cast("Role", role.name), topic) for role in assignment.roles.values() for topic in role.topics]
     findings: list[Finding] = []
-    arrays: dict[tuple[Role, str], Mapping[str, NDArray[Any]]] = {}
+    arrays: dict[tuple[Role, str], Columns] = {}
     for role, topic in played:
         if topic not in messages:
             findings.append(make_topic_not_decoded(topics[topic]))
@@ -153,7 +152,7 @@ def _find_type(topic: Topic, role: Role, config: ReadConfig) -> str:
     return MAPPED_TYPES[role] if role in config.fields else topic.type_name
 
 
-def _read_fields(columns: dict[str, NDArray[Any]], role: Role, config: ReadConfig) -> dict[str, NDArray[Any]]:
+def _read_fields(columns: Arrays, role: Role, config: ReadConfig) -> Arrays:
     """Return the fields of a topic's messages, those of a message type of the user's own as the recipe maps them."""
     if role not in config.fields:
         return columns

@@ -10,7 +10,7 @@ from suggested_recipes import proposed
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.clock_findings import correct_clocks, find_clock_jumps
+from tcpipe.stages.fuse import correct_clocks, find_clock_jumps
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.tables.findings import Subject
 
