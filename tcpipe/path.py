@@ -5,20 +5,17 @@ in between is too curved, the start moves on to the next sample of the track, un
 metres passed over are *curved*. Moving on by one sample rather than to the end of the rejected piece recovers the straight metres
 behind a bend. What remains at the end of a stretch, shorter than a chord, is *leftover*.
 
-Also: cutting a planned line by chord, and connecting driven lines to a graph.
+Also: cutting a planned line by chord.
 """
 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from shapely import LineString
 
 from tcpipe.geometry.polyline import Polyline
 
@@ -26,12 +23,6 @@ Floats = NDArray[np.float64]
 
 _LEAST_M = 1e-3
 """A rest shorter than this is the rounding of coordinates, not a piece [m]."""
-
-NEAR_M = 3.0
-"""Driven points nearer than this to a node belong to it."""
-
-_OFF_M = 0.5
-"""How far a driven line may be from the straight edges that replace it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,55 +107,3 @@ def find_cuts(points: list[list[float]], radius: float) -> list[tuple[float, flo
     if rest > _LEAST_M and length - cuts[-1][2] > _LEAST_M:
         cuts.append((points[-1][0], points[-1][1], length))
     return cuts
-
-
-def connect_lines(lines: Sequence[Floats]) -> tuple[Floats, list[tuple[int, int]]]:
-    """Return nodes [m], shape (N, 2), and the pairs of them that lines, (P, 2) each, connect.
-
-    A point nearer than 3 m to a node belongs to it; between nodes where ways meet or end, only those remain where the way bends.
-    """
-    nodes, near = list[Floats](), defaultdict[tuple[int, int], list[int]](list)
-    neighbours = defaultdict[int, set[int]](set)
-    for line in lines:
-        last = -1
-        for point in line:
-            column, row = np.floor(point / NEAR_M).astype(int).tolist()
-            found = [at for i in (-1, 0, 1) for j in (-1, 0, 1) for at in near[column + i, row + j]]
-            away = [float(np.linalg.norm(nodes[at] - point)) for at in found]
-            if away and min(away) < NEAR_M:
-                at = found[int(np.argmin(away))]
-            else:
-                at = len(nodes)
-                nodes.append(point)
-                near[column, row].append(at)
-            if last not in {-1, at}:
-                neighbours[at].add(last)
-                neighbours[last].add(at)
-            last = at
-    pairs = {(min(pair), max(pair)) for chain in _list_chains(neighbours) for pair in _simplify(chain, nodes)}
-    used = sorted({at for pair in pairs for at in pair})
-    number = {at: new for new, at in enumerate(used)}
-    return np.array([nodes[at] for at in used]).reshape(-1, 2), sorted((number[a], number[b]) for a, b in pairs)
-
-
-def _list_chains(neighbours: Mapping[int, set[int]]) -> Iterator[list[int]]:
-    """Yield the nodes of each way between nodes that have not two neighbours; of a ring, from any node to itself."""
-    visited = set[tuple[int, int]]()
-    starts = sorted(neighbours, key=lambda at: (len(neighbours[at]) == 2, at))
-    for start in starts:
-        for following in sorted(neighbours[start]):
-            if (start, following) in visited or (len(neighbours[start]) == 2 and (following, start) in visited):
-                continue
-            chain = [start, following]
-            while len(neighbours[chain[-1]]) == 2 and chain[-1] != start:
-                chain.append(next(iter(neighbours[chain[-1]] - {chain[-2]})))
-            visited |= {pair for a, b in pairwise(chain) for pair in ((a, b), (b, a))}
-            yield chain
-
-
-def _simplify(chain: list[int], nodes: Sequence[Floats]) -> Iterator[tuple[int, int]]:
-    """Yield the pairs that remain of a chain: of a ring at least three."""
-    parts = [chain] if chain[0] != chain[-1] else [chain[: len(chain) // 2 + 1], chain[len(chain) // 2 :]]
-    for part in parts:
-        places = {tuple(nodes[at].tolist()): at for at in part}
-        yield from pairwise(places[point] for point in LineString([nodes[at] for at in part]).simplify(_OFF_M).coords)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from shapely import LineString
 
 from tcpipe.errors import PathError, UsageError, clean_lines
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import Json, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.route_graph import RouteEdge, RouteGraph, make_route_graph, read_route_graph
-from tcpipe.path import NEAR_M, connect_lines
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_cost import PathCost, compute_path_cost, find_origin_m, find_projection
 from tcpipe.store import Store
@@ -25,6 +27,12 @@ from tcpipe.tables.findings import Subject, make_finding
 Floats = NDArray[np.float64]
 
 _SHORTEST_M = 0.01
+
+_NEAR_M = 3.0
+"""Driven points nearer than this to a node belong to it."""
+
+_OFF_M = 0.5
+"""How far a driven line may be from the straight edges that replace it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +160,63 @@ def propose_graph(source: MapFile, store: Store, origin_m: Floats) -> RouteGraph
         is_on = (np.minimum(start, end) > (x_min, y_min)).all(axis=1) & (np.maximum(start, end) < (x_max, y_max)).all(
             axis=1
         )
-        is_on &= to_floats(segments, "position_std_m") < NEAR_M
-        apart = np.flatnonzero((np.linalg.norm(start[1:] - end[:-1], axis=1) > NEAR_M) | ~is_on[1:] | ~is_on[:-1]) + 1
+        is_on &= to_floats(segments, "position_std_m") < _NEAR_M
+        apart = np.flatnonzero((np.linalg.norm(start[1:] - end[:-1], axis=1) > _NEAR_M) | ~is_on[1:] | ~is_on[:-1]) + 1
         parts = np.split(np.arange(len(start)), apart)
         lines += [np.concatenate([start[rows], end[rows[-1:]]]) for rows in parts if rows.size and is_on[rows].all()]
     if not lines:
         raise UsageError(f"{store.root}: no run with segments on map {source.name}; give a graph with --graph")
     xy_m, pairs = connect_lines(lines)
     return make_route_graph(xy_m - origin_m, pairs)
+
+
+def connect_lines(lines: Sequence[Floats]) -> tuple[Floats, list[tuple[int, int]]]:
+    """Return nodes [m], shape (N, 2), and the pairs of them that lines, (P, 2) each, connect.
+
+    A point nearer than 3 m to a node belongs to it; between nodes where ways meet or end, only those remain where the way bends.
+    """
+    nodes, near = list[Floats](), defaultdict[tuple[int, int], list[int]](list)
+    neighbours = defaultdict[int, set[int]](set)
+    for line in lines:
+        last = -1
+        for point in line:
+            column, row = np.floor(point / _NEAR_M).astype(int).tolist()
+            found = [at for i in (-1, 0, 1) for j in (-1, 0, 1) for at in near[column + i, row + j]]
+            away = [float(np.linalg.norm(nodes[at] - point)) for at in found]
+            if away and min(away) < _NEAR_M:
+                at = found[int(np.argmin(away))]
+            else:
+                at = len(nodes)
+                nodes.append(point)
+                near[column, row].append(at)
+            if last not in {-1, at}:
+                neighbours[at].add(last)
+                neighbours[last].add(at)
+            last = at
+    pairs = {(min(pair), max(pair)) for chain in _list_chains(neighbours) for pair in _simplify(chain, nodes)}
+    used = sorted({at for pair in pairs for at in pair})
+    number = {at: new for new, at in enumerate(used)}
+    return np.array([nodes[at] for at in used]).reshape(-1, 2), sorted((number[a], number[b]) for a, b in pairs)
+
+
+def _list_chains(neighbours: Mapping[int, set[int]]) -> Iterator[list[int]]:
+    """Yield the nodes of each way between nodes that have not two neighbours; of a ring, from any node to itself."""
+    visited = set[tuple[int, int]]()
+    starts = sorted(neighbours, key=lambda at: (len(neighbours[at]) == 2, at))
+    for start in starts:
+        for following in sorted(neighbours[start]):
+            if (start, following) in visited or (len(neighbours[start]) == 2 and (following, start) in visited):
+                continue
+            chain = [start, following]
+            while len(neighbours[chain[-1]]) == 2 and chain[-1] != start:
+                chain.append(next(iter(neighbours[chain[-1]] - {chain[-2]})))
+            visited |= {pair for a, b in pairwise(chain) for pair in ((a, b), (b, a))}
+            yield chain
+
+
+def _simplify(chain: list[int], nodes: Sequence[Floats]) -> Iterator[tuple[int, int]]:
+    """Yield the pairs that remain of a chain: of a ring at least three."""
+    parts = [chain] if chain[0] != chain[-1] else [chain[: len(chain) // 2 + 1], chain[len(chain) // 2 :]]
+    for part in parts:
+        places = {tuple(nodes[at].tolist()): at for at in part}
+        yield from pairwise(places[point] for point in LineString([nodes[at] for at in part]).simplify(_OFF_M).coords)

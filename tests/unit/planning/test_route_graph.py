@@ -13,9 +13,8 @@ from shared_data import shared_data
 
 from tcpipe.errors import PathError, UsageError
 from tcpipe.formats.route_graph import make_route_graph, read_route_graph
-from tcpipe.path import connect_lines
 from tcpipe.planning.path_cost import compute_path_cost
-from tcpipe.planning.route_graph import write_route_graph
+from tcpipe.planning.route_graph import connect_lines, write_route_graph
 
 MODEL = PhysicsModel()
 
