@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from tcpipe.errors import ModelError, TcpipeError, UsageError
@@ -80,15 +80,15 @@ def _read(source: str, path: Path) -> bytes:
 
 
 def _load_file(source: str, path: Path, name: str) -> OwnKind:
-    digest = hashlib.sha256(_read(source, path)).hexdigest()
-    spec = spec_from_file_location(f"tcpipe_own_{digest[:16]}", path.resolve())
-    if spec is None or spec.loader is None:
-        raise UsageError(f"--predictor {source}: not a Python file")
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look for their module there
+    code = _read(source, path)
+    digest = hashlib.sha256(code).hexdigest()
+    module = ModuleType(f"tcpipe_own_{digest[:16]}")
+    module.__file__ = str(path.resolve())
+    sys.modules[module.__name__] = module  # dataclasses look for their module there
+    # Bytecode in a cache may be of an earlier file: what runs is what the digest is of.
     with report_errors(source):
-        spec.loader.exec_module(module)
-    own = {key: of for key, of in vars(module).items() if getattr(of, "__module__", "") == spec.name}
+        exec(compile(code, module.__file__, "exec"), vars(module))  # noqa: S102  the user names this file
+    own = {key: of for key, of in vars(module).items() if getattr(of, "__module__", "") == module.__name__}
     models = {
         key: of for key, of in own.items() if hasattr(of, "predict") or (inspect.isfunction(of) and key == "predict")
     }

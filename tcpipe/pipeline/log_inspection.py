@@ -254,7 +254,7 @@ class TopicStamps:
 
     def __init__(self) -> None:
         self.every = 1
-        """One of so many messages is among `times`."""
+        """One of so many messages is among `topic_times`."""
         self._messages = self._zero = self._backward = self._repeated = self._duplicates = 0
         self._long_steps: list[Ints] = []
         self._longest_ns, self._longest_at_ns = 0, 0

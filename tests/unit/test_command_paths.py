@@ -39,6 +39,10 @@ TEXTS = {
     "stac",
     "collections",
     "around",
+    "adapt",
+    "budget_joule",
+    "layers",
+    "predictor",
 }
 """Parameters of commands that are text and no path."""
 
@@ -144,6 +148,8 @@ CALLS = [
     "report empty",
     "report file",
     "reproduce other",
+    "route-graph gone --store empty",
+    "route-graph empty --store empty --graph gone.geojson",
     "simulate other",
     "status --store gone",
     "status --store empty",
