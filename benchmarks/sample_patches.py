@@ -55,13 +55,15 @@ class MemoryMap:
     height_reference_m: float = 600.0
     name: str = "memory"
     factors: tuple[int, ...] = (1,)
+    banded: dict[str, Any] = field(default_factory=dict)
 
     def expect(self, tiles):
         """Hold all tiles already."""
 
-    def read(self, layer, row0, row1, col0, col1):
-        """Return a window of a layer: all that is asked of a map of one tile."""
-        return self.arrays[layer][row0:row1, col0:col1]
+    def read_tile(self, layer, i, j, out):
+        """Put the one tile into ``out``; no patch reaches beyond the map."""
+        out[...] = 0
+        out[: self.grid.rows, : self.grid.cols] = self.arrays[layer]
 
 
 @compile_kernel

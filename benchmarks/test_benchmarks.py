@@ -55,7 +55,6 @@ SMALLEST = {
     "error_budget": Smallest("", rf"averaged, 20 Hz \| {NUMBER} %"),
     "faults": Smallest("kills --only 'a file over another' --times 1", r"together +[1-9]"),
     "few_samples": Smallest("{dataset} --counts 60 --kinds physics", rf"60 physics +test +: E +{NUMBER} ± {NUMBER} J"),
-    "own_layers": Smallest("{out} --drives 6", rf"noise +: E +{NUMBER} J, T {NUMBER} s on"),
     "first_minute": Smallest("{out} tiny", rf"\| {NUMBER} ± {NUMBER} segments an hour \|"),
     "fuse": Smallest(
         "--hours 0.01 --paired-seconds 5", rf"15-state filterpy +{NUMBER} us/event[\s\S]*peak memory {NUMBER} MB"
@@ -67,7 +66,9 @@ SMALLEST = {
     ),
     "label_accuracy": Smallest("--scenario tiny", rf"odometer +[+-]?{NUMBER}%"),
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
+    "map_shift": Smallest("--sites 1", r"alone[\s\S]*shared"),
     "many_runs": Smallest("{out} 3", rf"prune --dry-run, again +{NUMBER} s wall"),
+    "own_layers": Smallest("{out} --drives 6", rf"noise +: E +{NUMBER} J, T {NUMBER} s on"),
     "path_coverage": Smallest("--train 2 --metres 60 --further 1", rf"energy +1 m: +{NUMBER} %"),
     "peers": Smallest(
         "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"
