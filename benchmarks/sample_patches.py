@@ -45,13 +45,13 @@ WANTED = {
 
 @dataclass(frozen=True)
 class MemoryMap:
-    """A map in memory, in one piece (`tcpipe.terrain.tiles.MapReader`)."""
+    """A map in memory (`tcpipe.terrain.tiles.MapReader`)."""
 
     arrays: dict[str, Any]
     grid: MapGrid = GRID
     classes: ClassTable = PAPER_CLASSES
     layers: dict[str, Any] = field(default_factory=lambda: make_paper_layers(LAYERS, PAPER_CLASSES))
-    tile_px: int = max(ROWS, COLS)
+    tile_px: int = 512
     height_reference_m: float = 600.0
     name: str = "memory"
     factors: tuple[int, ...] = (1,)
@@ -61,9 +61,11 @@ class MemoryMap:
         """Hold all tiles already."""
 
     def read_tile(self, layer, i, j, out):
-        """Put the one tile into ``out``; no patch reaches beyond the map."""
+        """Put a tile into ``out``."""
+        side = self.tile_px
+        found = self.arrays[layer][i * side : (i + 1) * side, j * side : (j + 1) * side]
         out[...] = 0
-        out[: self.grid.rows, : self.grid.cols] = self.arrays[layer]
+        out[: found.shape[0], : found.shape[1]] = found
 
 
 @compile_kernel
