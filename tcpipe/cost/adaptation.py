@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
-from tcpipe.cost.prediction_errors import COVERAGE, Errors, SumDistribution
+from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, Errors, SumDistribution
 
 Floats = NDArray[np.float64]
 
@@ -39,10 +39,11 @@ _RISE_M, _TURN_RAD = 0.1, 0.3
 _FREEDOM = 4.0
 """Of the prior of s²: as many metres as it counts."""
 _NEIGHBOUR_M, _MOST_NEIGHBOUR = 1.5, 0.45
-_TAIL = (1.0 + COVERAGE) / 2.0
-
+_UPPER_END = (1.0 + COVERAGE) / 2.0
+"""Probability below the upper end of an interval."""
 
 ELSEWHERE_M = 1e6
+"""From here on, distances along a run mean another way: nothing of the run is near."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +125,8 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     weights /= weights.sum()
     mean, variance = _mix(weights, np.array(values), np.array(variances))
     total, total_variance = _mix(weights, np.array(values).sum(axis=1), np.array(sums))
-    wider = float(stdtrit(freedom, _TAIL))
-    low, high = (end * wider / _NORMAL * np.sqrt(variance) for end in (errors.low, errors.high))
+    wider = float(stdtrit(freedom, _UPPER_END))
+    low, high = (end * wider / NORMAL_HALF_WIDTH * np.sqrt(variance) for end in (errors.low, errors.high))
     half = np.hypot(wider * np.sqrt(total_variance), wider * errors.common_share * np.abs(mean).sum())
     return Adapted(mean, mean + low, mean + high, _make_sum(float(total), float(half)))
 
@@ -162,12 +163,9 @@ def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Fl
     return mean, np.tensordot(weights, variances + (values - mean) ** 2, 1)
 
 
-_NORMAL = 1.6448536269514722
-
-
 def _make_sum(middle: float, half: float) -> SumDistribution:
     """Return the distribution of a sum whose 90 % interval has this half-width."""
-    return SumDistribution(middle, half / _NORMAL, half / _NORMAL)
+    return SumDistribution(middle, half / NORMAL_HALF_WIDTH, half / NORMAL_HALF_WIDTH)
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +249,7 @@ def _predict_mean(known: Metres, rest: Metres) -> Adapted:
     per_metre = known.measured / known.length_m
     count, mean = len(per_metre), float(per_metre.mean())
     std = float(per_metre.std(ddof=1)) if count > 1 else np.inf
-    wider = float(stdtrit(max(count - 1.0, 1.0), _TAIL))
+    wider = float(stdtrit(max(count - 1.0, 1.0), _UPPER_END))
     value, length_m = mean * rest.length_m, float(rest.length_m.sum())
     half = wider * std * np.sqrt(1.0 + 1.0 / count) * rest.length_m
     whole = wider * std * float(np.sqrt((rest.length_m**2).sum() + length_m**2 / count))

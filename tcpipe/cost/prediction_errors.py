@@ -41,7 +41,7 @@ FEWEST = 20
 """Fewest held-out samples for errors, and of a class for a bias of its own."""
 
 _TAIL = (1.0 - COVERAGE) / 2.0
-_Z = 1.6448536269514722
+NORMAL_HALF_WIDTH = 1.6448536269514722
 """Half-width of a normal interval of `COVERAGE`, in standard deviations."""
 _CLASSES = 256
 _HALFWAY = 20.0
@@ -154,7 +154,7 @@ class Errors:
         common = np.hypot(float((size * self.bias_std[class_id]).sum()), self.common_share * float(size.sum()))
         # Errors of a single metre are no normal ones, sums nearly.
         like_one = min(variance / float(spread.sum()) ** 2, 1.0)
-        below, above = (end / _Z * like_one + (1.0 - like_one) for end in (-self.low, self.high))
+        below, above = (end / NORMAL_HALF_WIDTH * like_one + (1.0 - like_one) for end in (-self.low, self.high))
         std = float(np.sqrt(variance + common**2))
         return SumDistribution(middle, std * below, std * above)
 
@@ -349,7 +349,7 @@ def _estimate_run_variance(error: Floats, spread: Floats, run: Ints) -> float:
     if means.size < 2:
         return 0.0
     quantile = float(stdtrit(means.size - 1.0, 1.0 - _TAIL))
-    return float(means.var(ddof=1)) * (quantile / _Z) ** 2
+    return float(means.var(ddof=1)) * (quantile / NORMAL_HALF_WIDTH) ** 2
 
 
 def _estimate_correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:

@@ -113,3 +113,10 @@ def append_planes(patches: NDArray[np.float32], numbers: Floats) -> NDArray[np.f
         return patches
     planes = np.broadcast_to(numbers[:, None, None, :].astype(np.float32), (*patches.shape[:3], numbers.shape[1]))
     return np.concatenate([patches, planes], axis=3)
+
+
+def append_column_planes(
+    inputs: Sequence[ExtraFeature], patches: NDArray[np.float32], columns: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Return patches of a batch with a plane for each extra feature, from `COLUMNS` of the batch, shape (N, 4)."""
+    return append_planes(patches, standardize_columns(inputs, columns))

@@ -34,7 +34,7 @@ from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import EARLIER_SCHEMA_VERSION, KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.own_models import OwnKind, load_own_kind, report_errors
-from tcpipe.learning.predictor import Predictor, ask, find_kind
+from tcpipe.learning.predictor import Predictor, find_kind, predict_outputs
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.terrain.classes import ClassTable
@@ -172,7 +172,7 @@ class Model:
             )
         features = fill_unknown(self.card.extra_features, extra_features or empty_extra_features(len(patches)))
         with report_errors(self.own):
-            out = ask(self.predictor, patches, features, self.card.outputs).astype(np.float32)
+            out = predict_outputs(self.predictor, patches, features, self.card.outputs).astype(np.float32)
         names = [name.removeprefix("fused_") for name in self.card.outputs]
         if "velocity_mps" in names:
             column = names.index("velocity_mps")

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from tcpipe.dataset.extra_features import (
     COLUMNS,
     ExtraFeatures,
+    append_column_planes,
     append_planes,
-    standardize_columns,
     standardize_features,
 )
 from tcpipe.errors import ModelError
@@ -38,8 +38,6 @@ _STATE = "state"
 
 _SLOWER = 0.1
 """Factor of the learning rate when the loss stops falling."""
-
-_TOGETHER = 256
 
 _STEPS_BETWEEN = 32
 """Steps that a stop loses at most, unless an epoch has more: a state has 180 MB."""
@@ -141,7 +139,8 @@ class NetworkModel(Predictor):
         config, is_held = samples.config, samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
         trainer, device = _make_trainer(fit)
-        model, best = cls(trainer.network, samples.inputs), _copy_weights(trainer)
+        model = cls(trainer.network, samples.inputs)
+        best: Arrays = trainer.network.arrays()
         logger.info("%s: %d samples to fit, %d to stop by, on %s", job.name, len(fit), len(held), device)
         progress = TrainingProgress(job.key)
         if job.checkpoint.exists():
@@ -158,21 +157,23 @@ class NetworkModel(Predictor):
             progress.epoch += 1
             progress.history.append((progress.epoch, loss, held_loss))
             if held_loss < progress.best_loss:
-                progress.best_loss, progress.best_epoch, best = held_loss, progress.epoch, _copy_weights(trainer)
+                progress.best_loss, progress.best_epoch, best = held_loss, progress.epoch, trainer.network.arrays()
             if progress.epoch % max(_STEPS_BETWEEN * config.batch_size // len(fit), 1) == 0:
                 write_checkpoint(job.checkpoint, progress, _state(trainer, best))
-            _say(job.name, progress, config, times)
+            _log_epoch(job.name, progress, config, times)
         trainer.network.set_arrays(best)
         held_out = np.full(samples.labels.shape, np.nan)
         held_out[is_held] = predict_samples(model, held)
         for fold in np.setdiff1d(np.unique(samples.folds), [config.fold]) if config.cross_fit else ():
             rows = samples.folds == fold
             logger.info("%s: a network without fold %d, for intervals", job.name, fold)
-            held_out[rows] = predict_samples(cls._fit_alike(samples.take(~rows), progress, times), samples.take(rows))
+            held_out[rows] = predict_samples(
+                cls._fit_best_epochs(samples.take(~rows), progress, times), samples.take(rows)
+            )
         return Fitted(model, held_out, progress.epoch, progress.best_epoch, progress.history, times, device)
 
     @classmethod
-    def _fit_alike(cls, fit: Samples, like: TrainingProgress, times: TrainingTimes) -> NetworkModel:
+    def _fit_best_epochs(cls, fit: Samples, like: TrainingProgress, times: TrainingTimes) -> NetworkModel:
         """Return a network of other samples after as many epochs as were best, at the same rates."""
         trainer, _ = _make_trainer(fit)
         for epoch in range(like.best_epoch):
@@ -231,7 +232,7 @@ def _train_epoch(trainer: Trainer, fit: Samples, progress: TrainingProgress, tim
     while (batch := next(feed, None)) is not None:
         patches, labels = batch[0] if energy else batch[:2]
         if inputs.extra_features:
-            patches = append_planes(patches[0], standardize_columns(inputs.extra_features, patches[1]))
+            patches = append_column_planes(inputs.extra_features, *patches)
         weights = batch[2] if len(batch) == 3 else np.ones_like(labels)
         times.feeding_s += time.perf_counter() - asked
         total += trainer.step(patches, labels / scale, weights, rate) * len(patches)
@@ -246,13 +247,9 @@ def _train_epoch(trainer: Trainer, fit: Samples, progress: TrainingProgress, tim
     return total / max(count, 1)
 
 
-def _copy_weights(trainer: Trainer) -> Arrays:
-    return trainer.network.arrays()
-
-
 def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
     """Return all arrays of a checkpoint."""
-    return {"now": _copy_weights(trainer), "best": best, "optimizer": trainer.copy_optimizer_state()}
+    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.copy_optimizer_state()}
 
 
 def _restore(trainer: Trainer, parts: dict[str, Arrays], checkpoint: Path) -> None:
@@ -267,7 +264,7 @@ def _restore(trainer: Trainer, parts: dict[str, Arrays], checkpoint: Path) -> No
         raise ModelError(f"{checkpoint}: {error.problems[0]}") from None
 
 
-def _say(name: str, progress: TrainingProgress, config: FitConfig, times: TrainingTimes) -> None:
+def _log_epoch(name: str, progress: TrainingProgress, config: FitConfig, times: TrainingTimes) -> None:
     epoch, loss, held = progress.history[-1]
     logger.info(
         "%s: epoch %d of at most %d: loss %.4f, held-out fold %.4f (best %.4f in epoch %d); %.0f samples/s, %.1f %% of the time feeding",

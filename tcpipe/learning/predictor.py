@@ -224,11 +224,12 @@ def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
     together = samples.split.view.form.batch_rows
     for first in range(0, len(samples), together):
         rows = np.arange(first, min(first + together, len(samples)))
-        out[rows] = ask(predictor, samples.split.batch(rows)[0], samples.features.take(rows), samples.inputs.outputs)
+        patches = samples.split.batch(rows)[0]
+        out[rows] = predict_outputs(predictor, patches, samples.features.take(rows), samples.inputs.outputs)
     return out
 
 
-def ask(predictor: Predictor, patches: Patches, features: ExtraFeatures, outputs: Sequence[str]) -> Labels:
+def predict_outputs(predictor: Predictor, patches: Patches, features: ExtraFeatures, outputs: Sequence[str]) -> Labels:
     """Return predictions of patches, shape (N, outputs); `ModelError` where a model gives something else."""
     out = np.asarray(predictor.predict(patches, features))
     if out.shape != (len(patches), len(outputs)):

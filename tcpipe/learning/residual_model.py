@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from tcpipe.dataset.extra_features import (
     COLUMNS,
     ExtraFeatures,
+    append_column_planes,
     append_planes,
-    standardize_columns,
     standardize_features,
 )
 from tcpipe.formats.weights import check_arrays
@@ -95,5 +95,5 @@ class ResidualModel(Predictor):
 def _add_planes(inputs: Inputs, patches: Any, labels: Any, weights: Any) -> tuple[Patches, Patches, Patches]:
     """Return a batch whose patches have a plane for each extra feature."""
     if inputs.extra_features:
-        patches = append_planes(patches[0], standardize_columns(inputs.extra_features, patches[1]))
+        patches = append_column_planes(inputs.extra_features, *patches)
     return patches, labels, weights

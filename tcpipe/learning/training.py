@@ -92,8 +92,9 @@ class TrainResult:
         if self.status == "unchanged":
             return f"{self.path}: nothing to do: trained on the same dataset with the same options"
         times = self.training_times_s
+        best = f", best {self.best_epoch} of {self.epochs} epochs or trees" if self.epochs > 1 else ""
         return (
-            f"{self.path}: {self.model} of {self.samples['fitted']} samples, best {self.best_epoch} of {self.epochs} epochs or trees\n"
+            f"{self.path}: {self.model} of {self.samples['fitted']} samples{best}\n"
             f"loss {self.held_out_loss:.4f} of {self.samples['held out']} held-out samples; {times.total_s:.1f} s on {self.device}, "
             f"{100.0 * self.feeding_share:.0f} % of it feeding"
         )

@@ -8,7 +8,6 @@ steps is at most 1 / cos(13.3°) - 1 = 2.8 % longer than a straight line.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -23,9 +22,6 @@ from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import CACHED_TILES, MapReader, choose_level
 
 COURSES = 16
-
-MAX_DETOUR = 1.0 / math.cos(math.atan2(1.0, 2.0) / 2.0)
-"""How much longer than the straight line a path of steps can be, at most, on open ground."""
 
 _FIRST_QUARTER = ((1, 0), (2, 1), (1, 1), (1, 2))
 """East and north in cells."""
@@ -252,11 +248,17 @@ class LazyCostGrid:
             step(number, len(todo))
 
 
+def iterate_row_strips(grid: MapGrid) -> Iterator[tuple[int, int]]:
+    """Yield the first row and the end of each strip of a grid that is held at once."""
+    for first in range(0, grid.rows, _ROWS_TOGETHER):
+        yield first, min(first + _ROWS_TOGETHER, grid.rows)
+
+
 def read_classes(source: MapReader, grid: MapGrid) -> Classes:
     """Return the class under the middle of each cell, shape (rows, cols); 0 without data, or without classes."""
     classes = np.zeros((grid.rows, grid.cols), np.uint8)
-    for first in range(0, grid.rows, _ROWS_TOGETHER) if "terrain" in source.layers else ():
-        rows = classes[first : first + _ROWS_TOGETHER]
+    for first, last in iterate_row_strips(grid) if "terrain" in source.layers else ():
+        rows = classes[first:last]
         row, col = np.mgrid[first : first + len(rows), : grid.cols]
         middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
         rows[:] = np.maximum(find_classes_at(source, middle), 0).reshape(rows.shape)

@@ -48,6 +48,7 @@ from tcpipe.planning.cost_grid import (
     Cells,
     CostGrid,
     iterate_blocks,
+    iterate_row_strips,
     make_empty_grid,
     make_grid,
     read_classes,
@@ -472,19 +473,11 @@ def _read_reasons(costs: CostGrid, first: int, last: int) -> NDArray[np.uint16]:
     return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
 
 
-_ROWS_TOGETHER = 256
-
-
-def _iterate_row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
-    rows = costs.grid.rows
-    yield from ((first, min(first + _ROWS_TOGETHER, rows)) for first in range(0, rows, _ROWS_TOGETHER))
-
-
 def _write_nav2(path: Path, strips: _Strips, name: str, origin_m: tuple[float, float]) -> Nav2Scale:
     """Write the mean over the trusted courses from 0 to `HIGHEST`; return what these two stand for."""
     grid = strips.costs.grid
     mean = np.concatenate(
-        [strips.compute(name, first, last)[_MEAN_BAND - 1] for first, last in _iterate_row_strips(strips.costs)]
+        [strips.compute(name, first, last)[_MEAN_BAND - 1] for first, last in iterate_row_strips(grid)]
     )
     known = np.isfinite(mean)
     low, high = np.percentile(mean[known], (1.0, 99.0)).tolist() if known.any() else (0.0, 1.0)
@@ -501,7 +494,7 @@ def _write_nav2(path: Path, strips: _Strips, name: str, origin_m: tuple[float, f
 def _compute_shares(costs: CostGrid) -> tuple[CellCounts, dict[str, float]]:
     """Return how many cells have a cost, and the share of cells and courses that each reason holds."""
     counts, with_cost, trusted = dict.fromkeys(Reason, 0), 0, 0
-    for first, last in _iterate_row_strips(costs):
+    for first, last in iterate_row_strips(costs.grid):
         bits = np.asarray(costs.reasons[:, first:last])
         with_cost += int(np.count_nonzero((~np.isnan(costs.velocity_mps[:, first:last])).any(axis=0)))
         trusted += int(np.count_nonzero((bits == 0).any(axis=0)))

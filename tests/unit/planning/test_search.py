@@ -1,5 +1,6 @@
 """Least-cost paths, against Bellman-Ford over steps that are found by hand."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,6 @@ from planning_worlds import lonlat, plane
 from tcpipe.planning.cost_grid import (
     COURSES,
     DIRECTIONS,
-    MAX_DETOUR,
     MOVES,
     CostGrid,
     find_crossed_cells,
@@ -33,6 +33,9 @@ from tcpipe.planning.search import (
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
 from tcpipe.terrain.target_grid import MapGrid
+
+MAX_DETOUR = 1.0 / math.cos(math.atan2(1.0, 2.0) / 2.0)
+"""How much longer than the straight line a path of steps can be, at most, on open ground."""
 
 
 @pytest.mark.parametrize("course", range(COURSES))
