@@ -26,7 +26,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, fit_errors
+from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.execution import Executor, run_all, unwrap_result
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
@@ -39,6 +39,7 @@ from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, find_wrong_files
+from tcpipe.learning.models import Model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
@@ -53,7 +54,7 @@ from tcpipe.planning.cost_grid import (
     make_grid,
     read_classes,
 )
-from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, predict_segments
+from tcpipe.planning.cost_model import Reason, SegmentPredictions, check_model, predict_segments
 from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
@@ -154,13 +155,13 @@ class CostMapResult:
         )
 
 
-def make_cost_map_key(model: CostModel, source: MapFile, cell_size_m: float) -> str:
+def make_cost_map_key(model: Model, source: MapFile, cell_size_m: float) -> str:
     """Return what a cost map is made from, as a digest."""
     return digest({"model": model.checksum, "map": source.summary(), "cell_size_m": cell_size_m, "version": VERSION})
 
 
 def make_cost_map(
-    model: CostModel,
+    model: Model,
     source: MapFile,
     out: Path | str,
     *,
@@ -316,14 +317,14 @@ class Cluster:
     """A Dask scheduler's address or an executor, and what gives its workers the model and the map, by files that they see."""
 
     address: str | Executor
-    inputs: Callable[[], tuple[CostModel, MapFile]]
+    inputs: Callable[[], tuple[Model, MapFile]]
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
     """Blocks of cells for one worker, and what the cost map is made from."""
 
-    inputs: Callable[[], tuple[CostModel, MapFile]]
+    inputs: Callable[[], tuple[Model, MapFile]]
     key: str
     grid: MapGrid
     blocks: tuple[Cells, ...]
@@ -357,7 +358,7 @@ def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
 
 
 def _predict_missing(  # noqa: PLR0917
-    model: CostModel, source: MapFile, spool: _Spool, key: str, step: Step, cluster: Cluster | None
+    model: Model, source: MapFile, spool: _Spool, key: str, step: Step, cluster: Cluster | None
 ) -> None:
     """Ask the model, here or on a cluster, about every cell that is not done."""
     costs = spool.costs
@@ -382,17 +383,17 @@ def _predict_missing(  # noqa: PLR0917
 
 
 def _write_files(
-    model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
+    model: Model, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
 ) -> CostMapCard:
     """Write all files but the card; return it."""
-    scales = _write(directory, _Strips(costs, fit_errors(model.residuals), read_classes(source, costs.grid)), origin_m)
+    scales = _write(directory, _Strips(costs, model.errors, read_classes(source, costs.grid)), origin_m)
     cells, shares = _compute_shares(costs)
     return CostMapCard(
         key=key,
         map=source.name,
         model=model.checksum,
-        robot=model.robot,
-        label_energy=model.label_energy,
+        robot=model.card.robot,
+        label_energy=model.card.label_energy,
         grid=costs.grid,
         courses_deg=tuple(ANGLES_DEG.tolist()),
         bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course", "std")),

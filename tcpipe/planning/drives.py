@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.cost.adaptation import Metres, Run
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
-from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, Errors
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError, clean_lines
@@ -25,10 +25,10 @@ from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.learning.models import Model
 from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import (
-    CostModel,
     Reason,
     SegmentPredictions,
     check_model,
@@ -139,7 +139,7 @@ def find_drive(store: Store, log: str) -> RunDirectory:
 
 
 def compute_drive_cost(
-    model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
+    model: Model, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
 ) -> DriveCost:
     """Return what a drive took beside what a model says of it.
 
@@ -158,8 +158,8 @@ def compute_drive_cost(
     """
     check_model(model, source)
     segments = run.segments()
-    if run.manifest.robot != model.robot:
-        raise ModelError(f"{log}: is of robot {run.manifest.robot}, model {model.name} of {model.robot}")
+    if run.manifest.robot != model.card.robot:
+        raise ModelError(f"{log}: is of robot {run.manifest.robot}, model {model.name} of {model.card.robot}")
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
     segments = segments.sort_by("start_ns")
@@ -167,17 +167,17 @@ def compute_drive_cost(
     said = _predict_drive(model, source, segments, recipe.read.gnss_crs, shift_m[:2])
     std_m = np.hypot(to_floats(segments, "position_std_m"), shift_m[2])
     reasons = _list_reasons(model, segments, said, std_m > recipe.sample.max_position_std_m)
-    energy = ENERGIES[model.label_energy].energy
+    energy = ENERGIES[model.card.label_energy].energy
     length_m, good = to_floats(segments, "arc_length_m"), np.array([not why for why in reasons])
     named = sorted({name for why in reasons for name in why})
     trained = data["train"]
     near = are_near(
         compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
-        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.chord_m,
+        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.card.chord_m,
     )  # fmt: skip
     duration = to_floats(segments, "chord_m") / said.velocity_mps
     along = _sum_along(
-        fit_errors(model.residuals), said.terrain_class[good], np.cumsum(length_m)[good],
+        model.errors, said.terrain_class[good], np.cumsum(length_m)[good],
         (to_floats(segments, "duration_s")[good], duration[good]),
         (to_floats(segments, energy)[good], (said.power_watt * duration)[good]),
     )  # fmt: skip
@@ -189,12 +189,12 @@ def compute_drive_cost(
         near_training_percent=100.0 * float(near.mean()),
         duration_s=along.duration_s[-1] if along.duration_s else IntervalComparison(0.0, 0.0, None, None),
         energy_joule=along.energy_joule[-1] if along.energy_joule else IntervalComparison(0.0, 0.0, None, None),
-        label_energy=model.label_energy, along=along,
+        label_energy=model.card.label_energy, along=along,
     )  # fmt: skip
 
 
 def _predict_drive(
-    model: CostModel, source: MapReader, segments: pa.Table, gnss_crs: str, shift_m: Floats
+    model: Model, source: MapReader, segments: pa.Table, gnss_crs: str, shift_m: Floats
 ) -> SegmentPredictions:
     """Return what the model says of each segment, on its ground by the map: where it was driven, moved by a shift (x, y)."""
     projection = find_map_projection(source, gnss_crs)
@@ -209,7 +209,7 @@ def _find_turns(segments: pa.Table) -> Floats:
     return to_floats(segments, "mean_abs_yaw_rate_radps") * to_floats(segments, "duration_s")
 
 
-def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
+def collect_run(model: Model, source: MapReader, run: RunDirectory) -> Run:
     """Return the labelled segments of a run on ground that the model knows, predicted and measured; `UsageError` if there are none.
 
     The run may be of another robot, payload or season: a model is adapted by it.
@@ -225,9 +225,9 @@ def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
         raise UsageError(
             f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
         )
-    duration, energy = to_floats(segments, "chord_m") / said.velocity_mps, ENERGIES[model.label_energy].energy
+    duration, energy = to_floats(segments, "chord_m") / said.velocity_mps, ENERGIES[model.card.label_energy].energy
     length_m, turn_rad = to_floats(segments, "arc_length_m"), _find_turns(segments)
-    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+    turning = None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
     turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, said.terrain_class)
     start_xy_m = find_map_projection(source, gnss_crs).forward(read_lonlat_deg(segments, "start"))
     distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start_xy_m, axis=0), axis=1)), 0, 0.0)
@@ -247,11 +247,11 @@ def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
 
 
 def _list_reasons(
-    model: CostModel, segments: pa.Table, said: SegmentPredictions, uncertain: NDArray[np.bool_]
+    model: Model, segments: pa.Table, said: SegmentPredictions, uncertain: NDArray[np.bool_]
 ) -> list[list[str]]:
     """Return why each segment is not compared; nothing where it is. ``uncertain``: whose place is not known well enough, shape (N,)."""
     unlabelled = ~np.isfinite(
-        to_floats(segments, ENERGIES[model.label_energy].energy) + to_floats(segments, "duration_s")
+        to_floats(segments, ENERGIES[model.card.label_energy].energy) + to_floats(segments, "duration_s")
     )
     return [
         [*flag_names(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * bool(without)]
@@ -349,7 +349,7 @@ class DrivesResult:
 
 
 def evaluate_drives(
-    model: CostModel, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
+    model: Model, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
 ) -> DrivesResult:
     """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``, or to a URL.
 

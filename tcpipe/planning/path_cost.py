@@ -13,15 +13,15 @@ from pyarrow import csv
 from pyproj import Geod
 
 from tcpipe.cost.adaptation import ELSEWHERE_M, Metres, Run, adapt
-from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.rotation import wrap_to_pi
+from tcpipe.learning.models import Model
 from tcpipe.path import find_cuts
 from tcpipe.planning.cost_model import (
-    CostModel,
     Reason,
     SegmentPredictions,
     check_model,
@@ -102,7 +102,7 @@ def find_origin_m(source: MapReader, origin_deg: tuple[float, float] | None) -> 
 
 
 def compute_path_cost(
-    model: CostModel,
+    model: Model,
     source: MapReader,
     lonlat_deg: Floats,
     *,
@@ -126,15 +126,15 @@ def compute_path_cost(
     PathError : the path is shorter, or nowhere on the map.
     """
     check_model(model, source)
-    pieces = cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where, shortest_m=shortest_m)
-    frames = pieces.frames(model.chord_m)
-    if not count_corners_on(source.grid, compute_footprints(frames, model.patch_m)).any():
+    pieces = cut_into_pieces(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
+    frames = pieces.frames(model.card.chord_m)
+    if not count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
     turn_radpm = compute_turns(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m
-    usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
+    usual_radpm = 0.0 if model.card.physics is None else model.card.physics.mean_turn_radpm
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
     said = join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
-    said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
+    said.reasons[pieces.arc_m > model.card.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _sum_costs(model, source, pieces, said, known)
 
 
@@ -160,12 +160,12 @@ def cut_into_pieces(
 
 
 def _sum_costs(
-    model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions, known: Run | None
+    model: Model, source: MapReader, pieces: Pieces, said: SegmentPredictions, known: Run | None
 ) -> PathCost:
-    bits, class_id, errors = said.reasons, said.terrain_class, fit_errors(model.residuals)
+    bits, class_id, errors = said.reasons, said.terrain_class, model.errors
     duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
     turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
-    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+    turning = None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
     turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
@@ -186,11 +186,12 @@ def _sum_costs(
         (fast, slow), (least, most) = ((of.low, of.high) for of in (adapted["duration"], adapted["energy"]))
         sums = {name: of.total for name, of in adapted.items()}
     elif errors is not None:
-        fast, slow = errors["duration"].compute_intervals(duration, class_id)
-        least, most = errors["energy"].compute_intervals(energy, class_id)
+        std = {"duration": said.duration_std_s * pieces.arc_m, "energy": said.energy_std_joule * pieces.arc_m}
+        fast, slow = errors["duration"].compute_intervals(duration, class_id, std["duration"])
+        least, most = errors["energy"].compute_intervals(energy, class_id, std["energy"])
         sums = {
-            "duration": errors["duration"].compute_sum(duration, class_id),
-            "energy": errors["energy"].compute_sum(energy, class_id),
+            name: errors[name].compute_sum(of, class_id, std[name])
+            for name, of in (("duration", duration), ("energy", energy))
         }
     table = PIECES.table(
         piece=np.arange(len(bits)),

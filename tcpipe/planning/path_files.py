@@ -21,9 +21,10 @@ from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_se
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.geometry.rotation import wrap_to_pi
+from tcpipe.learning.models import Model
 from tcpipe.planning.cost_grid import make_survey, read_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
-from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.planning.cost_model import check_model
 from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, write_pieces
 from tcpipe.planning.plan import OBJECTIVES, Objective, Plan, PlanTotals, plan_paths
 from tcpipe.planning.search import find_turning
@@ -140,7 +141,7 @@ def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
 
 
 def predict_path(
-    model: CostModel, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
+    model: Model, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
 ) -> PathResult:
     """Return what the line in a GeoJSON file costs; write its pieces to ``out`` and the totals beside it.
 
@@ -164,7 +165,7 @@ def predict_path(
         return convert_record(known, PathResult, path=path, out=out, status="unchanged")
     cost = compute_path_cost(model, source, lonlat_deg, where=str(path), known=adapted_by)
     totals = convert_record(
-        cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot, label_energy=model.label_energy,
+        cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.card.robot, label_energy=model.card.label_energy,
         adapted_by=None if adapted_by is None else adapted_by.name,
     )  # fmt: skip
     if out is not None:
@@ -330,7 +331,7 @@ def _format_risk(plan: PlanTotals) -> str:
 
 
 def plan(
-    model: CostModel,
+    model: Model,
     source: MapFile,
     request: PlanRequest,
     *,
@@ -380,10 +381,10 @@ def plan(
     who = {
         "model": model.name,
         "map": source.name,
-        "robot": model.robot,
+        "robot": model.card.robot,
         "allow_extrapolation": request.allow_extrapolation,
     }
-    who["label_energy"] = model.label_energy
+    who["label_energy"] = model.card.label_energy
     paths = tuple(
         make_line_feature(way.lonlat_deg, convert_record(way.totals, PlannedPath, **who))
         for way in (asked, *([back] if back else []))
@@ -392,12 +393,12 @@ def plan(
     return PlanResult(request.objective, out, picture, "done", origin.plans, together)
 
 
-def _add_up(model: CostModel, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
+def _add_up(model: Model, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
     """Return what a path and the way back take, with the turn between them, and the probability that a budget suffices."""
     energy, complete = there.totals.energy_joule, there.totals.complete
     errors = None if there.cost.errors is None else there.cost.errors["energy"]
     if back is not None:
-        turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+        turning = None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
         last, first = (np.diff(way.xy_m, axis=0) for way in (there, back))
         turn_rad = wrap_to_pi(np.arctan2(*first[0, ::-1]) - np.arctan2(*last[-1, ::-1]))
         class_id = to_integers(there.cost.pieces, "terrain_class")[-1:].astype(np.uint8)
@@ -422,7 +423,7 @@ def _check_names(out: Path, picture: Path | None) -> None:
         raise UsageError(f"{picture}: expected the name of a file that ends in .png")
 
 
-def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
+def _read_card(path: Path, model: Model, source: MapFile) -> CostMapCard:
     """Return the card of a cost map of this model and map; `ModelError` if it is none."""
     card = read_cost_map_card(path)
     if card is None:
