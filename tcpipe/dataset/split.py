@@ -189,7 +189,7 @@ class Split:
 
         Parameters
         ----------
-        ids : ids, each once; or a file with them, as the page of the dataset writes it: a CSV with a column ``sample_id``, or one id a line.
+        ids : ids; or a file with them, as the dataset's page writes it: a CSV with a column ``sample_id``, or one id a line.
 
         Raises
         ------

@@ -107,6 +107,10 @@ class Exclusion:
     samples: int
     """Samples that the dataset would have without it."""
 
+    def __str__(self) -> str:
+        """Return name, count and reason."""
+        return f"{self.name}: {self.samples} samples excluded: {self.reason or 'reason redacted'}"
+
 
 @dataclass(frozen=True, slots=True)
 class FlaggedSamples:

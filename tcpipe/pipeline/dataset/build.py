@@ -136,7 +136,7 @@ class BuildResult:
         ledger += "".join(f", {-metres:.0f} m {name.replace('_', ' ')}" for metres, name in sorted(lost))
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
         verdict = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
-        return [head, ledger, *floor, *verdict]
+        return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
         if self.card is None or self.card.redaction is None:

@@ -95,13 +95,11 @@ def find_excluded(
         listed = pc.is_in(segment_ids, value_set=ids).to_numpy()[kept] & (number < 0)
         number[listed] = at
         told.append(Exclusion(of.name, of.checksum, of.reason, len(of.ids), int(listed.sum())))
-        subject, reason = Subject("file", of.name), {"reason": of.reason}
-        findings.append(make_finding("samples-excluded", subject, names=reason, excluded_count=told[-1].samples))
         missing = ids.filter(pc.invert(pc.is_in(ids, value_set=segment_ids.combine_chunks())))
         if len(missing):
             example = {"example": ", ".join(missing[:_NAMED_IDS].to_pylist())}
             counts = {"unmatched_count": len(missing), "listed_count": len(ids)}
-            findings.append(make_finding("exclusion-unmatched", subject, names=example, **counts))
+            findings.append(make_finding("exclusion-unmatched", Subject("file", of.name), names=example, **counts))
     return ExcludedSamples(number, tuple(told), tuple(findings))
 
 
