@@ -97,9 +97,17 @@ def find_excluded(
         told.append(Exclusion(of.name, of.checksum, of.reason, len(of.ids), int(listed.sum())))
         missing = ids.filter(pc.invert(pc.is_in(ids, value_set=segment_ids.combine_chunks())))
         if len(missing):
-            example = {"example": ", ".join(missing[:_NAMED_IDS].to_pylist())}
-            counts = {"unmatched_count": len(missing), "listed_count": len(ids)}
-            findings.append(make_finding("exclusion-unmatched", Subject("file", of.name), names=example, **counts))
+            names = {"example": ", ".join(missing[:_NAMED_IDS].to_pylist())}
+            subject = Subject("file", of.name)
+            findings.append(
+                make_finding(
+                    "exclusion-unmatched",
+                    subject,
+                    names=names,
+                    unmatched_count=len(missing),
+                    listed_count=len(ids),
+                )
+            )
     return ExcludedSamples(number, tuple(told), tuple(findings))
 
 
