@@ -224,6 +224,9 @@ def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
         findings=findings,
         verdict=judge_dataset(findings, runs, maps),
         covariates=tuple(replace(covariate, name=f"covariates{n}") for n, covariate in enumerate(card.covariates, 1)),
+        exclusions=tuple(
+            replace(exclusion, name=f"excluded{n}", reason="") for n, exclusion in enumerate(card.exclusions, 1)
+        ),
         redaction=Redacted(),
     )
 
