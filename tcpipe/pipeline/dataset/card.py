@@ -110,6 +110,7 @@ def make_dataset_card(
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
         physics=fit_physics_by_robot(samples),
         covariates=content.covariates,
+        exclusions=content.exclusions,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
         checksums={},

@@ -24,6 +24,7 @@ from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all, unwrap_result
 from tcpipe.formats.dataset_card import (
     Covariate,
+    Exclusion,
     MapRegistration,
     Removal,
     RunSource,
@@ -59,7 +60,7 @@ from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.map_checks import find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
-from tcpipe.pipeline.dataset.splitting import draw_splits
+from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded
 from tcpipe.recipe import CovariateConfig, Recipe
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
@@ -267,6 +268,9 @@ class Content:
     registrations: Sequence[tuple[MapRegistration, ...]]
     """By map, one for each run."""
     covariates: tuple[Covariate, ...]
+    exclusions: tuple[Exclusion, ...]
+    excluded: pa.Table
+    """Id, list and reason of each excluded sample."""
     removal: Removal
     findings: tuple[Finding, ...]
 
@@ -300,14 +304,24 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
     tags = _read_tags(segments, inputs, recipe)
+    excluded = find_excluded(inputs.exclusions, segments.column("segment_id"), sampled.kept)
     assigned, result = draw_splits(
-        segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
+        segments,
+        sampled,
+        sources[0].grid,
+        options.regions,
+        recipe,
+        excluded=excluded.mask,
+        earlier=options.earlier,
+        tags=tags,
     )
-    arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
-    unused_m = {
-        loss: arc_m[assigned.is_in(name)].sum()
-        for loss, name in ((Loss.SPLIT_BUFFER, "buffer"), (Loss.SPLIT_EXCLUDED, EXCLUDED))
+    unused = {
+        Loss.SPLIT_BUFFER: assigned.is_in("buffer"),
+        Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED) & ~excluded.mask,
+        **({Loss.EXCLUDED: excluded.mask} if inputs.exclusions else {}),
     }
+    arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
+    unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
@@ -336,8 +350,19 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         distance_by_reason_m=_move_losses(distance_by_reason_m, {**lost_m, **unused_m}),
         registrations=[of for of, _ in registered],
         covariates=covariates,
+        exclusions=excluded.lists,
+        excluded=excluded.table(take_rows(segments.select(["segment_id"]), sampled.kept).column(0)),
         removal=removal,
-        findings=(*inputs.findings, *unusable, *shifted, *sampled.findings, *narrow, *biased, *incomplete),
+        findings=(
+            *inputs.findings,
+            *unusable,
+            *shifted,
+            *sampled.findings,
+            *excluded.findings,
+            *narrow,
+            *biased,
+            *incomplete,
+        ),
     )
 
 

@@ -29,7 +29,7 @@ from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.pipeline.dataset.splitting import regions_to_json
+from tcpipe.pipeline.dataset.splitting import ExcludedIds, regions_to_json
 from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.recipe import Recipe
 from tcpipe.splits.regions import Regions
@@ -76,6 +76,7 @@ class Inputs:
     findings: tuple[Finding, ...]
     """On the choice of runs."""
     covariates: tuple[CovariateTable, ...] = ()
+    exclusions: tuple[ExcludedIds, ...] = ()
 
 
 def choose_inputs(
@@ -87,6 +88,7 @@ def choose_inputs(
     robot: str | None,
     region: bytes | None,
     covariates: tuple[CovariateTable, ...],
+    exclusions: tuple[ExcludedIds, ...],
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe, and the maps; `DatasetError` lists the candidates."""
     problems = list[str]()
@@ -119,11 +121,14 @@ def choose_inputs(
             "region": None if region is None else region.decode("utf-8", "replace"),
             "format": options.file_format,
             **({"covariates": [(of.name, of.checksum) for of in covariates]} if covariates else {}),
+            **({"excluded": [(of.name, of.checksum, of.reason) for of in exclusions]} if exclusions else {}),
             **({} if options.earlier is None else {"kept_split": _hash_table(options.earlier)}),
         }
     )
     findings = (*chosen.findings, *once.findings)
-    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings, covariates)
+    return Inputs(
+        runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings, covariates, exclusions
+    )
 
 
 def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
@@ -239,6 +244,7 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
     regions = None if options.regions is None else regions_to_json(options.regions)
     yield "--split", _format_region(card.split.region), _format_region(regions)
     yield "--covariates", tuple(of.name for of in card.covariates), tuple(of.name for of in inputs.covariates)
+    yield "--exclude", tuple(of.name for of in card.exclusions), tuple(of.name for of in inputs.exclusions)
     yield "--format", card.format, options.file_format
     if not options.keeps_own_split:
         yield "--keep-split", card.split.kept is not None, options.earlier is not None

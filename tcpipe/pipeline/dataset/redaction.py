@@ -222,6 +222,7 @@ def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
         findings=findings,
         verdict=judge_dataset(findings, runs, maps),
         covariates=tuple(replace(of, name=f"covariates{n}") for n, of in enumerate(card.covariates, 1)),
+        exclusions=tuple(replace(of, name=f"excluded{n}", reason="") for n, of in enumerate(card.exclusions, 1)),
         redaction=Redacted(),
     )
 
