@@ -256,9 +256,10 @@ def _find_severities(
     columns: Mapping[str, Column], findings: Sequence[Finding], spans: Sequence[FindingSpan]
 ) -> NDArray[np.int64]:
     """Return the worst severity that concerns each segment by a span or a flag: its place in `SEVERITIES`, beyond them where none does."""
-    start_s, end_s, quality = (columns[name][1] for name in ("start", "end", "quality"))
+    start_s, end_s = (np.asarray(columns[name][1], np.float64) for name in ("start", "end"))
+    quality = np.asarray(columns["quality"][1], np.int64)
     concerned = [(of.finding.severity, (start_s <= of.end_s) & (end_s >= of.start_s)) for of in spans]
-    flags = {code: Quality[entry.flag.upper()] for code, entry in read_catalogue().items() if entry.flag}
+    flags = {code: int(Quality[entry.flag.upper()]) for code, entry in read_catalogue().items() if entry.flag}
     concerned += [(of.severity, (quality & flags[of.code]) != 0) for of in findings if of.code in flags]
     worst = np.full(len(quality), len(SEVERITIES))
     for severity, rows in concerned:
