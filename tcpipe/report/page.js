@@ -168,10 +168,9 @@ const page = (() => {
   }
   // What is chosen, beside the first figures or below them, and the buttons that go through `count()` rows; `current(by)` is the row from which a step goes.
   function stepThrough(count, current, choose) {
-    const wide = matchMedia("screen and (min-width: 64rem)"), section = at("chosen").closest("section");
-    const place = () => (wide.matches && section.closest(".first") ? document.querySelector(".summary") : section).append(at("chosen"), at("stepping"));
-    wide.addEventListener("change", place);
-    place();
+    const summary = document.querySelector(".summary"), section = at("chosen").closest("section");
+    const beside = matchMedia("(min-width: 64rem)").matches && section.closest(".first") && summary.offsetHeight < section.offsetHeight;
+    (beside ? summary : section).append(at("chosen"), at("stepping"));
     const step = (by) => { const n = count(); if (n) choose((current(by) + by + n) % n); };
     at("before").onclick = () => step(-1);
     at("after").onclick = () => step(1);

@@ -260,7 +260,7 @@ def _make_table_section(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Se
         )
         for run in runs[:MOST_ROWS]
     ]
-    text = "Click a column head to sort; a selection in the plots below filters the table."
+    text = "Click a column head to sort; a selection in the plots filters the table."
     if len(runs) > MOST_ROWS:
         text += f" Without scripts the table shows the first {MOST_ROWS} of {len(runs)}."
     return [Section("All runs", text, header=_COLUMNS, rows=rows, controls="store.html")]
