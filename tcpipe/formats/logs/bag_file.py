@@ -11,6 +11,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,8 @@ class _Connection:
 class BagPart:
     """One .bag file, open for reading."""
 
+    container = "bag"
+
     def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         self.name = name
         self.damage: list[Damage] = []
@@ -109,7 +112,7 @@ class BagPart:
         try:
             self._read_index()
         except DamageError as error:
-            self.damage.append(Damage(error.cause, self.name, self._bytes.size, reason=error.reason))
+            self._note(error.cause, self._bytes.size, reason=error.reason)
             self._bytes.whole()
             self._connections, self._chunks = {}, []
             self._walk()
@@ -118,11 +121,11 @@ class BagPart:
         """Close the file."""
         self._bytes.close()
 
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted connections, chunk by chunk, or some chunks at once where little of them is wanted."""
         if any(chunk.counts is not None and wanted.isdisjoint(chunk.counts) for chunk in self._chunks):
             self._bytes.skips()
-        yield from read_chunk_blocks(self, wanted, threads=threads)
+        yield from read_chunk_blocks(self, wanted)
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
         """Return the chunks that may hold wanted connections, each with the number of bytes in all chunks before it, at most."""
@@ -162,10 +165,9 @@ class BagPart:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
         return read_indexed_messages(found)
 
-    def walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
-        """Return the wanted messages of a chunk by its records; what these lack is added to ``noted``."""
+    def walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
+        """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
         found = self._walked(chunk, data)
-        noted += self._contradictions(chunk, found, len(data))
         return found.messages(data, wanted)
 
     def is_proved(self, chunk: _Chunk) -> bool:
@@ -177,24 +179,24 @@ class BagPart:
         return chunk.counts is not None and not chunk.cut
 
     def _walked(self, chunk: _Chunk, data: memoryview) -> ChunkRecords:
-        """Step through the records of a chunk."""
+        """Step through the records of a chunk, and note what is wrong with them."""
         walked = walk_chunk(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, walked.count)
-        return walked
-
-    def _contradictions(self, chunk: _Chunk, walked: ChunkRecords, size: int) -> list[Damage]:
-        """Return what is wrong with a chunk of ``size`` bytes of which each record was looked at."""
-        found = []
-        if walked.end < size and not chunk.cut:
-            found.append(Damage("record-damaged", self.name, chunk.offset, bytes_lost=size - walked.end))
+        for connection in walked.connections if chunk.counts is None else ():
+            self._take_connection(connection, data[connection.data_offset : connection.end])
+        if walked.end < len(data) and not chunk.cut:
+            self._note("record-damaged", chunk.offset, bytes_lost=len(data) - walked.end)
         if unknown := walked.offsets.keys() - self._connections.keys():
             lost = sum(len(walked.offsets[number]) for number in unknown)
-            found.append(Damage("channel-undeclared", self.name, chunk.offset, messages_lost=lost))
+            self._note("channel-undeclared", chunk.offset, messages_lost=lost)
         counts = {number: len(offsets) for number, offsets in walked.offsets.items()}
         if chunk.counts is not None and counts != chunk.counts:
             lost = max(sum(chunk.counts.values()) - sum(counts.values()), 0)
-            found.append(Damage("chunk-index-damaged", self.name, chunk.offset, messages_lost=lost or None))
-        return found
+            self._note("chunk-index-damaged", chunk.offset, messages_lost=lost or None)
+        return walked
+
+    def _note(self, cause: str, offset: int, **lost: Any) -> None:
+        self.damage.append(Damage(cause, self.name, offset, **lost))
 
     def entries(self, chunks: list[_Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of several chunks by the index records behind them, and of which chunks these are sound."""
@@ -267,7 +269,7 @@ class BagPart:
         if chunk.cut:
             data = self._bytes.read(record.data_offset, self._bytes.size - record.data_offset)
             kept = data if codec == "none" else decompress_prefix(codec, data, size)
-            self.damage.append(Damage("file-cut", self.name, chunk.offset, bytes_lost=size - len(kept)))
+            self._note("file-cut", chunk.offset, bytes_lost=size - len(kept))
             return kept
         if record.end > self._bytes.size:
             raise DamageError("file-cut")
@@ -340,9 +342,7 @@ class BagPart:
                 position = self._take_record(position)
             except DamageError as error:
                 after = self._next_chunk(position + 1)
-                self.damage.append(
-                    Damage(error.cause, self.name, position, bytes_lost=after - position, reason=error.reason)
-                )
+                self._note(error.cause, position, bytes_lost=after - position, reason=error.reason)
                 position = after
 
     def _take_record(self, position: int) -> int:
@@ -370,11 +370,8 @@ class BagPart:
             self.damage.append(self.lost(chunk, error))
             return
         found = self._walked(chunk, data)
-        for connection in found.connections:
-            self._take_connection(connection, data[connection.data_offset : connection.end])
         self._chunks.append(chunk)
         self._bounds.count(len(self._chunks), 0)
-        self.damage += self._contradictions(chunk, found, len(data))
         for number in found.offsets.keys() & self._connections.keys():
             stamps_ns = found.stamps[number]
             self._tally(number, len(stamps_ns), min(stamps_ns), max(stamps_ns))

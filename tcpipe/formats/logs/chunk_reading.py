@@ -6,14 +6,14 @@ for all of them: what a look costs, however short, is paid once for thousands of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, map_in_order
+from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock
 from tcpipe.logs.topics import Damage
 
 GROUP_BYTES = 1 << 23
@@ -23,6 +23,9 @@ _GAP_BYTES = 1 << 13
 _PLACE_BITS = 40
 MAX_PLANNED_BYTES = (1 << _PLACE_BITS) - 1
 """A larger chunk is not planned, but read on its own."""
+
+Piece = tuple[int, int, int]
+"""Where a piece of a chunk starts and stops in it, and where it is laid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,34 +60,16 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
-class ChunkLayout:
-    """The parts of a span's chunks that hold wanted messages, laid one after the other: ``size`` bytes in all.
-
-    ``places`` gives of each chunk, by its number, where a piece starts and stops in it, and where it is laid; ``offset`` where each
-    message then begins, in the order of their entries, shape (N,).
-    """
-
-    places: dict[int, list[tuple[int, int, int]]]
-    offset: Int64Array
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
 class Excerpt:
-    """Bytes in which a span's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,).
-
-    ``lost`` lists the chunks, by number, of which there is none, and why.
-    """
+    """Bytes in which a span's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,)."""
 
     data: memoryview
     offset: Int64Array
     entries: Entries
-    lost: list[tuple[int, DamageError]]
 
-    def without(self, chunks: Sequence[int]) -> Excerpt:
-        """Return it without the messages of some chunks."""
-        left = ~np.isin(self.entries.chunk, chunks)
-        return Excerpt(self.data, self.offset[left], self.entries.at(left), self.lost)
+    def at(self, chosen: NDArray[np.bool_]) -> Excerpt:
+        """Return it with some of the messages."""
+        return Excerpt(self.data, self.offset[chosen], self.entries.at(chosen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,14 +143,14 @@ class ChunkedFile(Protocol[AnyChunk]):
     def load(self, chunk: AnyChunk) -> memoryview:
         """Return all records of a chunk."""
 
-    def copy(self, chunk: AnyChunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
-        """Copy pieces (start, stop, place) of a chunk."""
+    def copy(self, chunk: AnyChunk, pieces: list[Piece], to: memoryview) -> None:
+        """Copy pieces of a chunk."""
 
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
 
-    def walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
-        """Return the wanted messages of a chunk by its records; what these lack is added to ``noted``."""
+    def walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int]) -> Messages:
+        """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
 
     def is_proved(self, chunk: AnyChunk) -> bool:
         """Tell whether a checksum covers the chunk's records, so that it is the index that is wrong where they differ."""
@@ -177,16 +162,10 @@ class ChunkedFile(Protocol[AnyChunk]):
         """Return the damage of a chunk that is lost as a whole."""
 
 
-def read_chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
+def read_chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int]) -> Iterator[MessageBlock]:
     """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
-
-    def read(planned: tuple[Span, list[tuple[int, AnyChunk]]]) -> tuple[list[MessageBlock], list[Damage]]:
-        noted: list[Damage] = []
-        return list(_read_span_blocks(file, *planned, wanted, noted)), noted
-
-    for blocks, noted in map_in_order(read, _plan_spans(file, wanted), threads=threads):
-        file.damage += noted
-        yield from blocks
+    for span, members in _plan_spans(file, wanted):
+        yield from _read_span_blocks(file, span, members, wanted)
 
 
 def _plan_spans(
@@ -203,69 +182,77 @@ def _plan_spans(
 
 
 def _read_span_blocks(
-    file: ChunkedFile[AnyChunk],
-    span: Span,
-    members: list[tuple[int, AnyChunk]],
-    wanted: frozenset[int],
-    noted: list[Damage],
+    file: ChunkedFile[AnyChunk], span: Span, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
 ) -> Iterator[MessageBlock]:
-    """Yield the wanted messages of a span; what is lost or contradicts itself is added to ``noted``."""
+    """Yield the wanted messages of a span; what is lost or contradicts itself is added to the file's damage."""
     doubtful: Sequence[int] = span.chunks
     if span.entries is not None:
-        found = read_excerpt(
-            span,
-            span.entries,
-            load=lambda number: file.load(members[number][1]),
-            copy=lambda number, places, to: file.copy(members[number][1], places, to),
-        )
-        noted += [file.lost(members[number][1], error) for number, error in found.lost]
+        found = read_excerpt(file, span, span.entries, members)
         messages, true = file.indexed(found)
         ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
         doubtful = np.unique(found.entries.chunk[~true]).tolist()
         if doubtful:
             right = ~np.isin(found.entries.chunk, doubtful)
             messages, ordinal = messages.at(right), ordinal[right]
-        yield from _split_in_time(file.name, messages, ordinal, noted)
+        yield from _split_in_time(file, messages, ordinal)
     for number in doubtful:
         base, chunk = members[number]
         try:
             data = file.load(chunk)
         except DamageError as error:
-            noted.append(file.lost(chunk, error))
+            file.damage.append(file.lost(chunk, error))
         else:
-            messages = file.walked(chunk, data, wanted, noted)
-            entries = None if span.entries is None else span.entries.at(span.entries.chunk == number)
-            noted += _find_index_disagreement(file, chunk, messages, entries)
-            yield from _split_in_time(file.name, messages, base + messages.offset, noted)
+            messages = file.walked(chunk, data, wanted)
+            _note_index_disagreement(
+                file, chunk, messages, span.entries and span.entries.at(span.entries.chunk == number)
+            )
+            yield from _split_in_time(file, messages, base + messages.offset)
 
 
-def _split_in_time(name: str, messages: Messages, ordinal: Int64Array, noted: list[Damage]) -> list[MessageBlock]:
+def read_excerpt(
+    file: ChunkedFile[AnyChunk], span: Span, entries: Entries, members: list[tuple[int, AnyChunk]]
+) -> Excerpt:
+    """Return the messages of a span with the bytes in which they lie, but for those of chunks that are lost."""
+    places, offset, size = lay_out_pieces(entries) if span.compact else ({}, entries.offset, 0)
+    data, lost = np.empty(size, np.uint8).data, []
+    for number in span.chunks:
+        chunk = members[number][1]
+        try:
+            if span.compact:
+                file.copy(chunk, places.get(number, []), data)
+            else:
+                data = file.load(chunk)
+        except DamageError as error:
+            lost.append(number)
+            file.damage.append(file.lost(chunk, error))
+    found = Excerpt(data, offset, entries)
+    return found.at(~np.isin(entries.chunk, lost)) if lost else found
+
+
+def _split_in_time(file: ChunkedFile[AnyChunk], messages: Messages, ordinal: Int64Array) -> list[MessageBlock]:
     """Return messages as blocks, without those whose time is past what 63 bits hold."""
     times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
     if not times.all():
-        noted.append(Damage("time-invalid", name, messages_lost=int((~times).sum())))
+        file.damage.append(Damage("time-invalid", file.name, messages_lost=int((~times).sum())))
         messages, ordinal = messages.at(times), ordinal[times]
     return messages.blocks(ordinal)
 
 
-def _find_index_disagreement(
+def _note_index_disagreement(
     file: ChunkedFile[AnyChunk], chunk: AnyChunk, messages: Messages, entries: Entries | None
-) -> list[Damage]:
-    """Return the damage where a chunk's index is broken, or names other messages than its records hold."""
+) -> None:
+    """Note where a chunk's index is broken, or names other messages than its records hold."""
     lost = 0
     if entries is None and (chunk.size > MAX_PLANNED_BYTES or not file.needs_index(chunk)):
-        return []
+        return
     if entries is not None:
         held = messages.at(np.argsort(messages.offset, kind="stable"))
         mine = np.stack([held.offset, held.channel, held.log_time_ns])
         if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
-            return []
+            return
         lost = max(len(entries.offset) - len(held.offset), 0)
-    return [
-        Damage(
-            "chunk-index-damaged", file.name, chunk.offset, messages_lost=0 if file.is_proved(chunk) else lost or None
-        )
-    ]
+    known = 0 if file.is_proved(chunk) else lost or None
+    file.damage.append(Damage("chunk-index-damaged", file.name, chunk.offset, messages_lost=known))
 
 
 def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
@@ -312,11 +299,7 @@ def plan_chunk_spans(
 ) -> Iterator[Span]:
     """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
 
-    Parameters
-    ----------
-    entries : the messages of those chunks whose index is sound.
-    sizes, sound : the chunks' decompressed sizes [byte], and which have a sound index, shape (M,).
-    wanted : the channels to read.
+    ``entries`` are the messages of those whose index is sound; ``sizes`` [byte] and ``sound`` are of all chunks, shape (M,).
     """
     entries = entries.at(np.isin(entries.channel, wanted))
     wanted_bytes = np.bincount(entries.chunk, entries.end - entries.offset, len(sizes))
@@ -332,8 +315,11 @@ def plan_chunk_spans(
         first = after
 
 
-def find_chunk_layout(entries: Entries) -> ChunkLayout:
-    """Return the pieces of a span's chunks that hold its messages."""
+def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Int64Array, int]:
+    """Return how the pieces of chunks that hold messages are laid one after the other.
+
+    That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the bytes in all.
+    """
     begins = np.ones(len(entries.offset), np.bool_)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
     begins[1:] = far | (entries.chunk[1:] != entries.chunk[:-1])
@@ -341,43 +327,13 @@ def find_chunk_layout(entries: Entries) -> ChunkLayout:
     start, stop = entries.offset[at], entries.end[np.append(at[1:], len(begins)) - 1] if len(at) else at
     to = np.cumsum(stop - start) - (stop - start)
     offset = entries.offset + (to - start)[np.cumsum(begins) - 1] if len(at) else entries.offset
-    places: dict[int, list[tuple[int, int, int]]] = {}
+    pieces: dict[int, list[Piece]] = {}
     for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
-        places.setdefault(chunk, []).append((place[0], place[1], place[2]))
-    return ChunkLayout(places, offset, int((stop - start).sum()))
+        pieces.setdefault(chunk, []).append((place[0], place[1], place[2]))
+    return pieces, offset, int((stop - start).sum())
 
 
-def read_excerpt(
-    span: Span,
-    entries: Entries,
-    *,
-    load: Callable[[int], memoryview],
-    copy: Callable[[int, list[tuple[int, int, int]], memoryview], None],
-) -> Excerpt:
-    """Read what a span wants.
-
-    Parameters
-    ----------
-    span, entries : the span, and its messages.
-    load : returns all records of a chunk by its number.
-    copy : copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
-    """
-    kept = find_chunk_layout(entries) if span.compact else None
-    data = np.empty(kept.size if kept else 0, np.uint8).data
-    lost = []
-    for number in span.chunks:
-        try:
-            if kept:
-                copy(number, kept.places.get(number, []), data)
-            else:
-                data = load(number)
-        except DamageError as error:
-            lost.append((number, error))
-    found = Excerpt(data, kept.offset if kept else entries.offset, entries, lost)
-    return found.without([number for number, _ in lost]) if lost else found
-
-
-def copy_pieces(data: memoryview, places: list[tuple[int, int, int]], to: memoryview) -> None:
-    """Copy pieces (start, stop, place) of ``data``."""
-    for start, stop, place in places:
+def copy_pieces(data: memoryview, pieces: list[Piece], to: memoryview) -> None:
+    """Copy pieces of ``data``."""
+    for start, stop, place in pieces:
         to[place : place + stop - start] = data[start:stop]

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from isal.isal_zlib import crc32
@@ -85,6 +86,8 @@ class _Tally:
 class McapPart:
     """One .mcap file, open for reading."""
 
+    container = "mcap"
+
     def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         self.name = name
         self.damage: list[Damage] = []
@@ -137,14 +140,14 @@ class McapPart:
         """Whether chunks were read that carry no CRC."""
         return bool(self._without_crc)
 
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
         if not self._complete:
             self._fill_gaps()
         if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
             self._bytes.skips()
 
-        yield from read_chunk_blocks(self, wanted, threads=threads)
+        yield from read_chunk_blocks(self, wanted)
         self._note_odd_ones_without_crc()
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
@@ -170,20 +173,20 @@ class McapPart:
         self._bounds.walk(chunk.offset, len(records))
         return records, end
 
-    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
+    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; where these end too early, or are none, that is noted."""
         records, end = self._records(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
         if lost := every - len(messages.offset):
-            noted.append(Damage("time-invalid", self.name, chunk.offset, messages_lost=lost))
+            self._note("time-invalid", chunk.offset, messages_lost=lost)
         if end < len(data) and not chunk.cut:
-            noted.append(Damage("record-damaged", self.name, chunk.offset, bytes_lost=len(data) - end))
+            self._note("record-damaged", chunk.offset, bytes_lost=len(data) - end)
         unknown = [n for n in np.unique(messages.channel).tolist() if n not in self._contents.channels]
         counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
         if unknown and not counted:
             lost = int(np.isin(messages.channel, unknown).sum())
-            noted.append(Damage("channel-undeclared", self.name, chunk.offset, messages_lost=lost))
+            self._note("channel-undeclared", chunk.offset, messages_lost=lost)
         return messages.at(np.isin(messages.channel, sorted(wanted)))
 
     def is_proved(self, chunk: Chunk) -> bool:
@@ -524,18 +527,8 @@ class McapPart:
             stamps = gather_integers(data, messages[of] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
-    def _note(
-        self,
-        cause: str,
-        offset: int,
-        *,
-        messages_lost: int | None = None,
-        bytes_lost: int | None = None,
-        reason: str = "",
-    ) -> None:
-        self.damage.append(
-            Damage(cause, self.name, offset, messages_lost=messages_lost, bytes_lost=bytes_lost, reason=reason)
-        )
+    def _note(self, cause: str, offset: int, **lost: Any) -> None:
+        self.damage.append(Damage(cause, self.name, offset, **lost))
 
     def lost(self, chunk: Chunk, error: DamageError) -> Damage:
         """Return the damage of a chunk that is lost as a whole, counted by the message index beside it."""
