@@ -8,15 +8,11 @@ A bag carries no checksum of its own: bz2 has one, lz4 and plain chunks have non
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import LogError
 from tcpipe.formats.logs.bag_records import (
     MAGIC,
     MAX_HEADER_BYTES,
@@ -33,15 +29,11 @@ from tcpipe.formats.logs.bag_records import (
     stamp_ns,
     walk_chunk,
 )
-from tcpipe.formats.logs.chunk_reading import Entries, Excerpt, Messages, copy_pieces, read_chunk_blocks, sort_by_place
+from tcpipe.formats.logs.chunk_reading import ChunkedPart, Entries, Excerpt, Messages, sort_by_place
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
-    Bounds,
-    ByteSource,
     DamageError,
-    FetchedFile,
     Int64Array,
-    MessageBlock,
     decompress,
     decompress_prefix,
     outline_of,
@@ -86,29 +78,17 @@ class _Connection:
     ends: list[int] = field(default_factory=list)
 
 
-class BagPart:
+class BagPart(ChunkedPart[_Chunk]):
     """One .bag file, open for reading."""
 
     container = "bag"
 
-    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
-        self.name = name
-        self.damage: list[Damage] = []
+    def _open(self) -> dict[int, Topic]:
         self.outline = ""
-        self._bytes = ByteSource(path, fetched)
-        self._connections: dict[int, _Connection] = {}
-        self._chunks: list[_Chunk] = []
         self.is_unchecked = False
         """Whether chunks were read that carry no checksum: all but those of bz2."""
-        self._bounds = Bounds(path, self._bytes.size)
-        try:
-            self._read_index_or_walk()
-        except LogError:
-            self.close()
-            raise
-        self.channels = {number: _make_topic(self._connections[number]) for number in sorted(self._connections)}
-
-    def _read_index_or_walk(self) -> None:
+        self._connections: dict[int, _Connection] = {}
+        self._chunks: list[_Chunk] = []
         try:
             self._read_index()
         except DamageError as error:
@@ -116,16 +96,7 @@ class BagPart:
             self._bytes.whole()
             self._connections, self._chunks = {}, []
             self._walk()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._bytes.close()
-
-    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted connections, chunk by chunk, or some chunks at once where little of them is wanted."""
-        if any(chunk.counts is not None and wanted.isdisjoint(chunk.counts) for chunk in self._chunks):
-            self._bytes.skips()
-        yield from read_chunk_blocks(self, wanted)
+        return {number: _make_topic(self._connections[number]) for number in sorted(self._connections)}
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
         """Return the chunks that may hold wanted connections, each with the number of bytes in all chunks before it, at most."""
@@ -142,6 +113,8 @@ class BagPart:
                 if chunk.counts is None or not wanted.isdisjoint(chunk.counts) or self._is_doubtful(chunk)
             ]
         self._bounds.claim(sizes)
+        if len(found) < len(self._chunks):
+            self._bytes.skips()
         return found
 
     def _is_doubtful(self, chunk: _Chunk) -> bool:
@@ -195,9 +168,6 @@ class BagPart:
             self._note("chunk-index-damaged", chunk.offset, messages_lost=lost or None)
         return walked
 
-    def _note(self, cause: str, offset: int, **lost: Any) -> None:
-        self.damage.append(Damage(cause, self.name, offset, **lost))
-
     def entries(self, chunks: list[_Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of several chunks by the index records behind them, and of which chunks these are sound."""
         held: list[bytes] = []
@@ -246,19 +216,16 @@ class BagPart:
             raise DamageError("chunk-index-damaged")
         return record.number(b"conn"), record.data_offset, record.data_bytes
 
-    def copy(self, chunk: _Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
-        """Copy pieces (start, stop, place) of a chunk; of a plain one nothing else is read."""
+    def find_plain_data(self, chunk: _Chunk) -> int | None:
+        """Return where the records of a chunk begin that is not compressed."""
         record = chunk.record
         if record is None or record.opcode != OP_CHUNK or record.codec != "none":
-            copy_pieces(self.load(chunk), places, to)
-            return
+            return None
         self.is_unchecked = True
-        self._bytes.read_pieces(
-            [(record.data_offset + start, to[at : at + stop - start]) for start, stop, at in places]
-        )
+        return record.data_offset
 
     def load(self, chunk: _Chunk) -> memoryview:
-        """Return the records of a chunk; of one that the file's end cuts, what can still be had."""
+        """Return the records of a chunk."""
         record = chunk.record or self._record(chunk.offset)
         codec = record.codec
         if codec != "bz2":
@@ -273,9 +240,8 @@ class BagPart:
             return kept
         if record.end > self._bytes.size:
             raise DamageError("file-cut")
-        if codec == "none":
-            return self._bytes.read(record.data_offset, record.data_bytes)
-        return decompress(codec, self._bytes.read_once(record.data_offset, record.data_bytes), size)
+        data = self._bytes.read_once(record.data_offset, record.data_bytes)
+        return data if codec == "none" else decompress(codec, data, size)
 
     def _read_index(self) -> None:
         """Read the connections and chunk summaries at the file's end; `DamageError` when they cannot be used."""

@@ -6,15 +6,18 @@ for all of them: what a look costs, however short, is paid once for thousands of
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock
-from tcpipe.logs.topics import Damage
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, Int64Array, MessageBlock
+from tcpipe.logs.topics import Damage, Topic
 
 GROUP_BYTES = 1 << 23
 """Chunks of about this size together are planned at once."""
@@ -128,131 +131,149 @@ class PlacedChunk(Protocol):
 AnyChunk = TypeVar("AnyChunk", bound=PlacedChunk)
 
 
-class ChunkedFile(Protocol[AnyChunk]):
-    """A file of chunks: what `read_chunk_blocks` asks of it. `DamageError` where a chunk is lost."""
+class ChunkedPart(ABC, Generic[AnyChunk]):
+    """A file of chunks, open for reading. Methods raise `DamageError` where a chunk is lost."""
 
-    name: str
-    damage: list[Damage]
+    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
+        self.name = name
+        self.damage: list[Damage] = []
+        self._bytes = ByteSource(path, fetched)
+        self._bounds = Bounds(path, self._bytes.size)
+        try:
+            self.channels = self._open()
+        except LogError:
+            self.close()
+            raise
 
+    def close(self) -> None:
+        """Close the file."""
+        self._bytes.close()
+
+    def _note(self, cause: str, offset: int, **lost: Any) -> None:
+        self.damage.append(Damage(cause, self.name, offset, **lost))
+
+    @abstractmethod
+    def _open(self) -> dict[int, Topic]:
+        """Read the index, or, where it cannot be used, walk the file; return every channel."""
+
+    @abstractmethod
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, AnyChunk]]:
-        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
+        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it, at most."""
 
+    @abstractmethod
     def entries(self, chunks: list[AnyChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
 
+    @abstractmethod
     def load(self, chunk: AnyChunk) -> memoryview:
-        """Return all records of a chunk."""
+        """Return all records of a chunk, valid until the next read; of one that the file's end cuts, what can still be had."""
 
-    def copy(self, chunk: AnyChunk, pieces: list[Piece], to: memoryview) -> None:
-        """Copy pieces of a chunk."""
+    @abstractmethod
+    def find_plain_data(self, chunk: AnyChunk) -> int | None:
+        """Return where in the file the records of a chunk begin, of which pieces can be read; None where it must be loaded."""
 
+    @abstractmethod
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
 
+    @abstractmethod
     def walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
 
+    @abstractmethod
     def is_proved(self, chunk: AnyChunk) -> bool:
         """Tell whether a checksum covers the chunk's records, so that it is the index that is wrong where they differ."""
 
+    @abstractmethod
     def needs_index(self, chunk: AnyChunk) -> bool:
         """Tell whether a broken index of this chunk is worth a word."""
 
+    @abstractmethod
     def lost(self, chunk: AnyChunk, error: DamageError) -> Damage:
-        """Return the damage of a chunk that is lost as a whole."""
+        """Return the damage of a chunk that is lost as a whole, counted by the index."""
 
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+        chunks = self.chunks_with(wanted)
+        for group in group_chunks(chunk.size for _, chunk in chunks):
+            members = chunks[group.start : group.stop]
+            sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
+            entries, sound = self.entries([chunk for _, chunk in members], sizes)
+            for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
+                yield from self._read_span_blocks(span, members, wanted)
 
-def read_chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int]) -> Iterator[MessageBlock]:
-    """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
-    for span, members in _plan_spans(file, wanted):
-        yield from _read_span_blocks(file, span, members, wanted)
+    def _read_span_blocks(
+        self, span: Span, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
+    ) -> Iterator[MessageBlock]:
+        """Yield the wanted messages of a span; what is lost or contradicts itself is added to ``damage``."""
+        doubtful: Sequence[int] = span.chunks
+        if span.entries is not None:
+            found = self.read_excerpt(span, span.entries, [chunk for _, chunk in members])
+            messages, true = self.indexed(found)
+            ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
+            doubtful = np.unique(found.entries.chunk[~true]).tolist()
+            if doubtful:
+                right = ~np.isin(found.entries.chunk, doubtful)
+                messages, ordinal = messages.at(right), ordinal[right]
+            yield from self._split_in_time(messages, ordinal)
+        for number in doubtful:
+            base, chunk = members[number]
+            try:
+                data = self.load(chunk)
+            except DamageError as error:
+                self.damage.append(self.lost(chunk, error))
+                continue
+            messages = self.walked(chunk, data, wanted)
+            entries = None if span.entries is None else span.entries.at(span.entries.chunk == number)
+            self._note_index_disagreement(chunk, messages, entries)
+            yield from self._split_in_time(messages, base + messages.offset)
 
+    def read_excerpt(self, span: Span, entries: Entries, chunks: Sequence[AnyChunk]) -> Excerpt:
+        """Return the messages of a span with the bytes in which they lie, but for those of chunks that are lost."""
+        pieces, offset, size = lay_out_pieces(entries) if span.compact else ({}, entries.offset, 0)
+        data, lost = np.empty(size, np.uint8).data, []
+        for number in span.chunks:
+            try:
+                if span.compact:
+                    self._copy(chunks[number], pieces.get(number, []), data)
+                else:
+                    data = self.load(chunks[number])
+            except DamageError as error:
+                lost.append(number)
+                self.damage.append(self.lost(chunks[number], error))
+        found = Excerpt(data, offset, entries)
+        return found.at(~np.isin(entries.chunk, lost)) if lost else found
 
-def _plan_spans(
-    file: ChunkedFile[AnyChunk], wanted: frozenset[int]
-) -> Iterator[tuple[Span, list[tuple[int, AnyChunk]]]]:
-    """Yield what to read at once, and the chunks of its group; the indexes of a group are read ahead."""
-    chunks = file.chunks_with(wanted)
-    for group in group_chunks(chunk.size for _, chunk in chunks):
-        members = chunks[group.start : group.stop]
-        sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
-        entries, sound = file.entries([chunk for _, chunk in members], sizes)
-        for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
-            yield span, members
-
-
-def _read_span_blocks(
-    file: ChunkedFile[AnyChunk], span: Span, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
-) -> Iterator[MessageBlock]:
-    """Yield the wanted messages of a span; what is lost or contradicts itself is added to the file's damage."""
-    doubtful: Sequence[int] = span.chunks
-    if span.entries is not None:
-        found = read_excerpt(file, span, span.entries, members)
-        messages, true = file.indexed(found)
-        ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
-        doubtful = np.unique(found.entries.chunk[~true]).tolist()
-        if doubtful:
-            right = ~np.isin(found.entries.chunk, doubtful)
-            messages, ordinal = messages.at(right), ordinal[right]
-        yield from _split_in_time(file, messages, ordinal)
-    for number in doubtful:
-        base, chunk = members[number]
-        try:
-            data = file.load(chunk)
-        except DamageError as error:
-            file.damage.append(file.lost(chunk, error))
-        else:
-            messages = file.walked(chunk, data, wanted)
-            _note_index_disagreement(
-                file, chunk, messages, span.entries and span.entries.at(span.entries.chunk == number)
-            )
-            yield from _split_in_time(file, messages, base + messages.offset)
-
-
-def read_excerpt(
-    file: ChunkedFile[AnyChunk], span: Span, entries: Entries, members: list[tuple[int, AnyChunk]]
-) -> Excerpt:
-    """Return the messages of a span with the bytes in which they lie, but for those of chunks that are lost."""
-    places, offset, size = lay_out_pieces(entries) if span.compact else ({}, entries.offset, 0)
-    data, lost = np.empty(size, np.uint8).data, []
-    for number in span.chunks:
-        chunk = members[number][1]
-        try:
-            if span.compact:
-                file.copy(chunk, places.get(number, []), data)
-            else:
-                data = file.load(chunk)
-        except DamageError as error:
-            lost.append(number)
-            file.damage.append(file.lost(chunk, error))
-    found = Excerpt(data, offset, entries)
-    return found.at(~np.isin(entries.chunk, lost)) if lost else found
-
-
-def _split_in_time(file: ChunkedFile[AnyChunk], messages: Messages, ordinal: Int64Array) -> list[MessageBlock]:
-    """Return messages as blocks, without those whose time is past what 63 bits hold."""
-    times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
-    if not times.all():
-        file.damage.append(Damage("time-invalid", file.name, messages_lost=int((~times).sum())))
-        messages, ordinal = messages.at(times), ordinal[times]
-    return messages.blocks(ordinal)
-
-
-def _note_index_disagreement(
-    file: ChunkedFile[AnyChunk], chunk: AnyChunk, messages: Messages, entries: Entries | None
-) -> None:
-    """Note where a chunk's index is broken, or names other messages than its records hold."""
-    lost = 0
-    if entries is None and (chunk.size > MAX_PLANNED_BYTES or not file.needs_index(chunk)):
-        return
-    if entries is not None:
-        held = messages.at(np.argsort(messages.offset, kind="stable"))
-        mine = np.stack([held.offset, held.channel, held.log_time_ns])
-        if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+    def _copy(self, chunk: AnyChunk, pieces: list[Piece], to: memoryview) -> None:
+        """Copy pieces of a chunk; what need not be read as a whole, to check or decompress it, is not."""
+        start = self.find_plain_data(chunk)
+        if start is not None:
+            self._bytes.read_pieces([(start + a, to[at : at + b - a]) for a, b, at in pieces])
             return
-        lost = max(len(entries.offset) - len(held.offset), 0)
-    known = 0 if file.is_proved(chunk) else lost or None
-    file.damage.append(Damage("chunk-index-damaged", file.name, chunk.offset, messages_lost=known))
+        data = self.load(chunk)
+        for a, b, at in pieces:
+            to[at : at + b - a] = data[a:b]
+
+    def _split_in_time(self, messages: Messages, ordinal: Int64Array) -> list[MessageBlock]:
+        """Return messages as blocks, without those whose time is past what 63 bits hold."""
+        times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
+        if not times.all():
+            self.damage.append(Damage("time-invalid", self.name, messages_lost=int((~times).sum())))
+            messages, ordinal = messages.at(times), ordinal[times]
+        return messages.blocks(ordinal)
+
+    def _note_index_disagreement(self, chunk: AnyChunk, messages: Messages, entries: Entries | None) -> None:
+        """Note where a chunk's index is broken, or names other messages than its records hold."""
+        lost = 0
+        if entries is None and (chunk.size > MAX_PLANNED_BYTES or not self.needs_index(chunk)):
+            return
+        if entries is not None:
+            held = messages.at(np.argsort(messages.offset, kind="stable"))
+            mine = np.stack([held.offset, held.channel, held.log_time_ns])
+            if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+                return
+            lost = max(len(entries.offset) - len(held.offset), 0)
+        self._note("chunk-index-damaged", chunk.offset, messages_lost=0 if self.is_proved(chunk) else lost or None)
 
 
 def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
@@ -331,9 +352,3 @@ def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Int64Array
     for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
         pieces.setdefault(chunk, []).append((place[0], place[1], place[2]))
     return pieces, offset, int((stop - start).sum())
-
-
-def copy_pieces(data: memoryview, pieces: list[Piece], to: memoryview) -> None:
-    """Copy pieces of ``data``."""
-    for start, stop, place in pieces:
-        to[place : place + stop - start] = data[start:stop]
