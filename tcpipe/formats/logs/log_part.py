@@ -329,10 +329,7 @@ class Bounds:
 def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
     """Return the ``size`` bytes that ``data`` holds; `DamageError` where it does not decompress, or not to ``size``.
 
-    Parameters
-    ----------
-    codec : ``lz4`` (frames), ``zstd`` or ``bz2``.
-    checked : a checksum of the result is compared afterwards.
+    ``codec`` is ``lz4`` (frames), ``zstd`` or ``bz2``; ``checked``: a checksum of the result is compared afterwards.
     """
     if size > MAX_CHUNK_BYTES or is_bomb(len(data), size, whole=True):
         raise DamageError("record-damaged")
