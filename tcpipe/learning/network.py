@@ -12,6 +12,7 @@ import io
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional
 
+from tcpipe.errors import ModelError
+from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.weights import check_arrays
 from tcpipe.learning.fitting import mean_loss
 from tcpipe.recipe import TrainConfig
@@ -257,6 +260,25 @@ class Trainer:
         self.network = network
         self._factors = torch.from_numpy(factors).to(find_device())
         self.optimizer = torch.optim.Adam(network.parameters(), eps=_EPSILON)
+
+    def write_state(self, path: Path, parts: Mapping[str, Any]) -> None:
+        """Write weights, the optimiser's memory and other parts of a training, whole or not at all."""
+        state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), **parts}
+        with write_atomic_file(path) as temporary:
+            torch.save(state, temporary)
+
+    def read_state(self, path: Path) -> dict[str, Any]:
+        """Go on from what `write_state` wrote, and return the other parts; `ModelError` where it is damaged."""
+        try:
+            state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+            self.network.load_state_dict(state.pop("network"))
+            self.optimizer.load_state_dict(state.pop("optimizer"))
+        except Exception as error:  # noqa: BLE001  those of torch, pickle and zipfile have no common base
+            reason = str(error).partition("\n")[0]
+            raise ModelError(
+                f"{path}: cut short or damaged ({reason}); remove it, or start again with --no-resume"
+            ) from None
+        return state
 
     def copy_weights(self) -> dict[str, Any]:
         """Return a copy of every weight by torch's name."""

@@ -21,7 +21,6 @@ from tcpipe.dataset.extra_features import (
     standardize_features,
 )
 from tcpipe.errors import ModelError
-from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.learning.fitting import FitConfig, TrainingTimes, compute_loss_factors
 from tcpipe.learning.predictor import (
     Fitted,
@@ -90,37 +89,18 @@ class _State:
     progress: TrainingProgress
     best: dict[str, Any]
     """Weights of the best epoch."""
-    held_out: Any
-    """Predictions of samples that were held out, a tensor of shape (N, outputs); NaN where there is none yet."""
+    held_out: NDArray[np.float64]
+    """Predictions of samples that were held out, shape (N, outputs); NaN where there is none yet."""
 
     def write(self, path: Path) -> None:
-        import torch  # noqa: PLC0415  takes seconds and half a gigabyte
-
-        state = {
-            "progress": asdict(self.progress), "best": self.best, "network": self.trainer.network.state_dict(),
-            "optimizer": self.trainer.optimizer.state_dict(), "held_out": self.held_out,
-        }  # fmt: skip
-        with write_atomic_file(path) as temporary:
-            torch.save(state, temporary)
+        parts = {"progress": asdict(self.progress), "best": self.best, "held_out": self.held_out.tolist()}
+        self.trainer.write_state(path, parts)
 
     def read(self, path: Path) -> None:
         """Go on from what `write` wrote; `ModelError` where it is damaged."""
-        import torch  # noqa: PLC0415
-
-        try:
-            state = torch.load(path, weights_only=True, map_location="cpu")
-            self.progress, self.best, self.held_out = (
-                TrainingProgress(**state["progress"]),
-                state["best"],
-                state["held_out"],
-            )
-            self.trainer.network.load_state_dict(state["network"])
-            self.trainer.optimizer.load_state_dict(state["optimizer"])
-        except Exception as error:  # noqa: BLE001  those of torch, pickle and zipfile have no common base
-            reason = str(error).partition("\n")[0]
-            raise ModelError(
-                f"{path}: cut short or damaged ({reason}); remove it, or start again with --no-resume"
-            ) from None
+        parts = self.trainer.read_state(path)
+        self.progress, self.best = TrainingProgress(**parts["progress"]), parts["best"]
+        self.held_out = np.array(parts["held_out"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,11 +141,8 @@ class NetworkModel(Predictor):
         config, is_held = samples.config, samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
         trainer, device = _make_trainer(fit)
-        import torch  # noqa: PLC0415
-
         model, times = cls(trainer.network, samples.inputs), TrainingTimes()
-        nothing = torch.full(samples.labels.shape, torch.nan, dtype=torch.float64)
-        state = _State(trainer, TrainingProgress(), trainer.copy_weights(), nothing)
+        state = _State(trainer, TrainingProgress(), trainer.copy_weights(), np.full(samples.labels.shape, np.nan))
         logger.info("%s: %d samples to fit, %d to stop by, on %s", job.name, len(fit), len(held), device)
         if job.checkpoint.exists():
             state.read(job.checkpoint)
@@ -185,7 +162,7 @@ class NetworkModel(Predictor):
                 state.write(job.checkpoint)
             _log_epoch(job.name, progress, config, times)
         trainer.network.load_state_dict(state.best)
-        held_out = state.held_out.numpy()
+        held_out = state.held_out
         held_out[is_held] = predict_samples(model, held).mean
         for fold in np.unique(samples.folds) if config.cross_fit else ():
             rows = samples.folds == fold

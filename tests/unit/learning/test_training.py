@@ -308,7 +308,7 @@ def _make_state():
     from tcpipe.learning.network import Trainer, make_resnet18
 
     trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), compute_loss_factors("nrmse", [1.0]))
-    return network_model._State(trainer, network_model.TrainingProgress(), trainer.copy_weights(), torch.zeros(2, 1))
+    return network_model._State(trainer, network_model.TrainingProgress(), trainer.copy_weights(), np.zeros((2, 1)))
 
 
 @given(st.data())
