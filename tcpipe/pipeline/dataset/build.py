@@ -212,7 +212,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
             workers.waiting.delete(entry.name)
         result = _make_result(place, "done", card, left_out)
         counts = {"runs": len(inputs.runs), "samples": card.samples}
-        written = sum(of.size_bytes for of in card.checksums.values())
+        written = sum(checksum.size_bytes for checksum in card.checksums.values())
         took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
         dataset = _describe_dataset(result, inputs)
         replaced = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)

@@ -284,9 +284,9 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     segments, distance_by_reason_m, unusable = _pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
     ranks = _rank_segments(segments, seed=recipe.split.seed)
-    sources = tuple(open_map(*of) for of in inputs.maps())
+    sources = tuple(open_map(*arguments) for arguments in inputs.maps())
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
-    shifts = [list_shifts(of) for of, _ in registered]
+    shifts = [list_shifts(registrations) for registrations, _ in registered]
     sampled, slot, spool = sample_all_segments(
         segments,
         ranks,
@@ -348,7 +348,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         sources=sources,
         split=result,
         distance_by_reason_m=_move_losses(distance_by_reason_m, {**lost_m, **unused_m}),
-        registrations=[of for of, _ in registered],
+        registrations=[registrations for registrations, _ in registered],
         covariates=covariates,
         exclusions=excluded.lists,
         excluded=excluded.table(take_rows(segments.select(["segment_id"]), sampled.kept).column(0)),
@@ -541,8 +541,8 @@ def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tu
     tags = {run.run_id: run.tags or {} for run in runs}
     place = pc.index_in(run_ids, value_set=pa.array(list(tags), pa.string()))
     columns, fields, findings = list[pa.Array](), list[pa.Field](), list[Finding]()
-    for key in sorted({key for of in tags.values() for key in of}):
-        texts = [of.get(key) for of in tags.values()]
+    for key in sorted({key for run_tags in tags.values() for key in run_tags}):
+        texts = [run_tags.get(key) for run_tags in tags.values()]
         different = {text for text in texts if text is not None}
         words = sorted(text for text in different if not _NUMBER.fullmatch(text.strip()))
         if words and len(words) < len(different):

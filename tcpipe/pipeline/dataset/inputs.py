@@ -120,8 +120,10 @@ def choose_inputs(
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
             "format": options.file_format,
-            **({"covariates": [(of.name, of.checksum) for of in covariates]} if covariates else {}),
-            **({"excluded": [(of.name, of.checksum, of.reason) for of in exclusions]} if exclusions else {}),
+            **({"covariates": [(table.name, table.checksum) for table in covariates]} if covariates else {}),
+            **(
+                {"excluded": [(table.name, table.checksum, table.reason) for table in exclusions]} if exclusions else {}
+            ),
             **({} if options.earlier is None else {"kept_split": _hash_table(options.earlier)}),
         }
     )
@@ -171,7 +173,11 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
     """Return one hash over the checksums of files, or of those below a directory."""
     start = f"{below}/" if below else ""
     return digest(
-        {name.removeprefix(start): (of.size_bytes, of.sha256) for name, of in files.items() if name.startswith(start)}
+        {
+            name.removeprefix(start): (checksum.size_bytes, checksum.sha256)
+            for name, checksum in files.items()
+            if name.startswith(start)
+        }
     )
 
 
@@ -243,8 +249,12 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
     yield "--map", tuple(entry.name for entry in card.maps), inputs.map_names
     regions = None if options.regions is None else regions_to_json(options.regions)
     yield "--split", _format_region(card.split.region), _format_region(regions)
-    yield "--covariates", tuple(of.name for of in card.covariates), tuple(of.name for of in inputs.covariates)
-    yield "--exclude", tuple(of.name for of in card.exclusions), tuple(of.name for of in inputs.exclusions)
+    yield (
+        "--covariates",
+        tuple(table.name for table in card.covariates),
+        tuple(table.name for table in inputs.covariates),
+    )
+    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in inputs.exclusions)
     yield "--format", card.format, options.file_format
     if not options.keeps_own_split:
         yield "--keep-split", card.split.kept is not None, options.earlier is not None
@@ -263,7 +273,7 @@ def _find_chosen_tags(card: DatasetCard, wanted: Mapping[str, str], inputs: Inpu
 
 
 def _find_shared_tags(tags: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    every = [set(of.items()) for of in tags]
+    every = [set(run_tags.items()) for run_tags in tags]
     return dict(sorted(set.intersection(*every))) if every else {}
 
 
