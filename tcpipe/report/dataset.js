@@ -257,7 +257,7 @@ page.start(async () => {
   fillSelect(at("layer"), (sheets?.layers ?? []).map((layer) => layer.name));
   if (sheets?.layers.some((layer) => layer.name === "ortho")) at("layer").value = "ortho";
   function drawPage() {
-    const key = orders[at("sort").value], rows = [...(selected.length ? selected : sheets?.rows ?? [])];
+    const key = orders[at("sort").value], rows = [...(filters.size ? selected : sheets?.rows ?? [])];
     if (key) {
       const value = (i) => (Number.isFinite(key(i)) ? key(i) : -Infinity);
       rows.sort((a, b) => value(b) - value(a) || a - b);

@@ -142,7 +142,8 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
 
 
 def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> Section:
-    text = "Positions of samples; dashed: region of the split. The buffer is in no split. A click selects the nearest sample (with shift one more), a drag in the plot or the histogram all within; filters combine."
+    text = "Dashed: region of the split; the buffer is in no split. A click selects the nearest sample, with shift one more; "
+    text += "a drag in the plot or the histogram selects all within. Filters combine."
     if len(shown.xy_m) < count:
         text += f" Of {count} samples {len(shown.xy_m)}, drawn at random, are shown."
     if not len(shown.xy_m):
