@@ -83,10 +83,8 @@ def coverage_line(quantity: str, length: int, errors: Errors, runs: list[Run]) -
         for first in range(0, len(of.predicted) - length + 1, length):
             rows = slice(first, first + length)
             said, class_id, measured = of.predicted[rows], of.class_id[rows], float(of.measured[rows].sum())
-            ends = (
-                errors.compute_intervals(said, class_id) if length == 1 else errors.compute_sum_interval(said, class_id)
-            )
-            low, high = (float(np.sum(end)) for end in ends)
+            alone, total = errors.compute_intervals(said, class_id), errors.compute_sum(said, class_id)
+            low, high = (float(end[0]) for end in alone) if length == 1 else total.interval
             inside.append(low <= measured <= high)
             names.append(run.name)
             widths.append((high - low) / 2.0 / float(np.abs(said).sum()))

@@ -127,8 +127,8 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     total, total_variance = _mix(weights, np.array(values).sum(axis=1), np.array(sums))
     wider = float(stdtrit(freedom, _UPPER_END))
     low, high = (end * wider / NORMAL_HALF_WIDTH * np.sqrt(variance) for end in (errors.low, errors.high))
-    half = np.hypot(wider * np.sqrt(total_variance), wider * errors.common_share * np.abs(mean).sum())
-    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), float(half)))
+    half, common = wider * float(np.sqrt(total_variance)), errors.common_share * float(np.abs(mean).sum())
+    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half, common))
 
 
 def _make_design(of: Metres, per_metre: float, per_second: float) -> Floats:
@@ -163,9 +163,9 @@ def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Fl
     return mean, np.tensordot(weights, variances + (values - mean) ** 2, 1)
 
 
-def _make_sum(middle: float, half: float) -> SumDistribution:
+def _make_sum(middle: float, half: float, common_std: float = 0.0) -> SumDistribution:
     """Return the distribution of a sum whose 90 % interval has this half-width."""
-    return SumDistribution(middle, half / NORMAL_HALF_WIDTH, half / NORMAL_HALF_WIDTH)
+    return SumDistribution(middle, half / NORMAL_HALF_WIDTH, half / NORMAL_HALF_WIDTH, common_std)
 
 
 @dataclass(frozen=True, slots=True)

@@ -276,7 +276,7 @@ def _sum_along(
             low, high = (
                 (None, None)
                 if errors is None
-                else errors[quantity].compute_sum_interval(predicted[:end], class_id[:end])
+                else errors[quantity].compute_sum(predicted[:end], class_id[:end]).interval
             )
             found.append(IntervalComparison(float(measured[:end].sum()), float(predicted[:end].sum()), low, high))
         return tuple(found)
