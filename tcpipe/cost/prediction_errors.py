@@ -349,8 +349,8 @@ def _estimate_run_variance(errors: Errors, error: Floats, spread: Floats, run: I
     (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
     """
     runs = np.unique(run)
-    if runs.size < 2:
-        return 0.0
+    if runs.size < 2:  # nothing but the farthest metres tell it
+        return max(float(errors.correlation[-1]), 0.0)
     weight = np.array([spread[run == of].sum() for of in runs])
     means = np.array([error[run == of].sum() for of in runs]) / weight
     of_metres = np.array([errors.compute_variance(spread[run == of], 0.0) for of in runs]) / weight**2
@@ -365,20 +365,17 @@ def _estimate_correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats
     products, far_m = _pair_errors(standard, held)
     order = np.argsort(far_m, kind="stable")
     products, far_m, far_pairs = products[order], far_m[order], max(far_m.size // 2, _FEWEST_PAIRS)
-    starts = [0]
-    for start in np.searchsorted(far_m, _LAGS_M[1:]).tolist():
+    edges, starts = [0.0], [0]
+    for edge, start in zip(_LAGS_M[1:].tolist(), np.searchsorted(far_m, _LAGS_M[1:]).tolist(), strict=True):
         if start - starts[-1] >= _FEWEST_PAIRS and far_m.size - start >= far_pairs:
-            starts.append(start)
-    edges = np.array([0.0, *far_m[starts[1:]]])
+            edges, starts = [*edges, edge], [*starts, start]
     pairs = np.diff([*starts, far_m.size]).astype(np.float64)
-    rho = (
-        np.add.reduceat(products, starts) / pairs / max(float(np.mean(standard**2)), 1e-12)
-        if far_m.size
-        else np.zeros(1)
-    )
+    if not far_m.size:
+        return np.zeros(1), np.zeros(1)
+    rho = np.add.reduceat(products, starts) / pairs / max(float(np.mean(standard**2)), 1e-12)
     if rho.size > 1:
         rho[1:] = np.maximum(isotonic_regression(rho[1:], weights=pairs[1:], increasing=False).x, 0.0)
-    return edges, np.clip(rho, -0.5, 1.0)
+    return np.array(edges), np.clip(rho, -0.5, 1.0)
 
 
 def _pair_errors(standard: Floats, held: _Held) -> tuple[Floats, Floats]:

@@ -53,7 +53,7 @@ from tcpipe.planning.cost_grid import (
     make_grid,
     read_classes,
 )
-from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, predict_segments
+from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, iterate_predictions
 from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
@@ -351,7 +351,7 @@ def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
                 "the same names"
             )
         frames = CellFrames(task.grid, where=f"map {source.name}")
-        return list(predict_segments(model, source, (frames.of(cells) for cells in task.blocks)))
+        return list(iterate_predictions(model, source, (frames.of(cells) for cells in task.blocks)))
     except TcpipeError as error:  # it may lack what is here: an extra, a file
         return type(error)(*(f"{os.uname().nodename}: {problem}" for problem in error.problems))
 
@@ -369,7 +369,7 @@ def _predict_missing(  # noqa: PLR0917
     ready: list[Cells] = []
     answers: Iterator[tuple[Cells, SegmentPredictions]]
     if cluster is None:
-        answers = zip(todo, predict_segments(model, source, (frames.of(cells) for cells in todo)), strict=True)
+        answers = zip(todo, iterate_predictions(model, source, (frames.of(cells) for cells in todo)), strict=True)
     else:
         answers = _ask_cluster(cluster, key, costs.grid, todo)
     for number, (cells, found) in enumerate(answers, 1):

@@ -26,8 +26,6 @@ from tcpipe.planning.cost_model import (
     SegmentPredictions,
     check_model,
     count_reasons,
-    iterate_batches,
-    join_predictions,
     predict_segments,
 )
 from tcpipe.planning.search import compute_turns, find_turning
@@ -133,7 +131,7 @@ def compute_path_cost(
     turn_radpm = compute_turns(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m
     usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
-    said = join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
+    said = predict_segments(model, source, frames, turn_radpm)
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _sum_costs(model, source, pieces, said, known)
 
