@@ -4,10 +4,10 @@
 
 Drives wander over the small site of `tcpipe demo` with the paper's robot. All of it is the product's way: logs are simulated, ingested,
 built into a dataset, a model is trained on the first drives; the further ones, in a store of their own, are predicted on the map as
-`tcpipe evaluate --drive` does; all of it for --models seeds. Paths follow one another along a drive. Coverage is of the measured labels, over all drives, with its 95 %
-interval (binomial, clustered by drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the further drives carry so many kg
-more. The line of budgets is of paths there and back: two consecutive parts of a drive. The second table predicts the rest of each
-further drive of the last seed after its first metres adapt the model, beside the mean of these metres.
+`tcpipe evaluate --drive` does; all of it for --models seeds. Paths follow one another along a drive. Coverage is of the measured labels,
+over all drives, with its 95 % interval (binomial, clustered by drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the
+further drives carry so many kg more. The line of budgets is of paths there and back: two consecutive parts of a drive. The second table
+predicts the rest of each further drive of the last seed after its first metres adapt the model, beside the mean of these metres.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import CostModel, Reason, check_model, predict_segments
-from tcpipe.planning.search import find_turning
+from tcpipe.planning.path_cost import find_added_turning
 from tcpipe.recipe import SampleConfig
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.stages.sample import Shifts
@@ -158,14 +158,16 @@ def predict_run(
     frames = make_patch_frames(start, end, values["chord_m"])
     said = predict_segments(model, source, frames, turn_radpm=turn_rad / length_m)
     duration, class_id = values["chord_m"] / said.velocity_mps, said.terrain_class
-    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+    turning = find_added_turning(model)
     turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, class_id, is_driven=True)
     distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start, axis=0), axis=1)), 0, 0.0)[: len(start)]
-    both = {
-        "duration": (duration, values["duration_s"]),
-        "energy": (said.power_watt * duration + np.nan_to_num(turn_joule), measured),
+    energy = said.power_watt * duration + np.nan_to_num(turn_joule)
+    both = {"duration": (duration, values["duration_s"]), "energy": (energy, measured)}
+    rise_m = length_m * np.tan(said.slope_rad)
+    metres = {
+        name: Metres(predicted, label, class_id, distance_m, length_m, duration, rise_m, turn_rad)
+        for name, (predicted, label) in both.items()
     }
-    rest = (class_id, distance_m, length_m, duration, length_m * np.tan(said.slope_rad), turn_rad)
     uncertain = np.hypot(values["position_std_m"], shift[2]) > (sample or SampleConfig()).max_position_std_m
     reasons = [
         [*flag_names(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * (not known)]
@@ -173,7 +175,7 @@ def predict_run(
             said.reasons, uncertain, np.isfinite(measured + values["duration_s"]), strict=True
         )
     ]
-    return DrivenMetres(Run(run.run_id, {name: Metres(*of, *rest) for name, of in both.items()}), reasons)
+    return DrivenMetres(Run(run.run_id, metres), reasons)
 
 
 def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:

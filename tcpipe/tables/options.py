@@ -12,6 +12,8 @@ from dataclasses import dataclass, field, fields
 from inspect import cleandoc, signature
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
+from tcpipe.errors import UsageError
+
 P = ParamSpec("P")
 O = TypeVar("O")
 R = TypeVar("R")
@@ -102,7 +104,9 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
     """Return the public function of a command: its keywords are the fields of the options, and ``run`` does the work."""
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        return run(options(*args, **kwargs))
+        asked = options(*args, **kwargs)
+        _check_bounds(asked, run.__name__.removeprefix("run_"))
+        return run(asked)
 
     shown = {of.name: of.metadata.get("option", Option()).about for of in fields(options)}  # type: ignore[arg-type]
     lines = [f"{name} : {about}" for name, about in shown.items() if about]
@@ -112,6 +116,24 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
     call.__doc__ = "\n".join([cleandoc(run.__doc__ or ""), "", "Parameters", "----------", *lines, "", more])
     call.__signature__ = signature(options).replace(return_annotation=signature(run).return_annotation)  # type: ignore[attr-defined]
     return call
+
+
+def _check_bounds(options: Any, function: str) -> None:
+    """Raise `UsageError` for each number that is out of its range, and each value that is no choice, as the command line does."""
+    problems = []
+    for of in fields(options):
+        kind, value = of.metadata.get("option", Option()).kind, getattr(options, of.name)
+        if value is None or not isinstance(kind, tuple):
+            continue
+        if isinstance(kind, Range):
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            above = is_number and (value > kind.least if kind.is_open else value >= kind.least)
+            ends = f"{'more than' if kind.is_open else 'at least'} {kind.least:g} and at most {kind.most:g}"
+            problems += [] if above and value <= kind.most else [f"{of.name} is {value!r}, expected a number of {ends}"]
+        elif value not in kind:
+            problems.append(f"{of.name} is {value!r}, expected one of {', '.join(kind)}")
+    if problems:
+        raise UsageError(*(f"{function}: {problem}" for problem in problems))
 
 
 EARLIER_COLUMNS = {
