@@ -134,8 +134,8 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     wider = float(stdtrit(freedom, _UPPER_END))
     low, high = (end * wider / NORMAL_HALF_WIDTH * np.sqrt(variance) for end in (errors.low, errors.high))
     half_sum = wider * float(np.sqrt(total_variance))
-    common = errors.common_share * float(np.abs(mean).sum())
-    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half_sum, common))
+    common_std = errors.common_share * float(np.abs(mean).sum())
+    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half_sum, common_std))
 
 
 def _make_design(of: Metres, per_metre: float, per_second: float) -> Floats:

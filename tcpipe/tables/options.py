@@ -7,9 +7,10 @@ Names of tcpipe 0.8 and data model 2.x, with their names since 0.9 and 3.0: tcpi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from inspect import cleandoc, signature
+from math import isfinite
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 from tcpipe.errors import UsageError
@@ -119,21 +120,32 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
 
 
 def _check_bounds(options: Any, function: str) -> None:
-    """Raise `UsageError` for each number that is out of its range, and each value that is no choice, as the command line does."""
+    """Raise `UsageError` for all numbers out of their range, values that are no choice, and points that are none."""
     problems = []
     for of in fields(options):
         kind, value = of.metadata.get("option", Option()).kind, getattr(options, of.name)
-        if value is None or not isinstance(kind, tuple):
+        if value is None or not (expected := _describe_mismatch(kind, value)):
             continue
-        if isinstance(kind, Range):
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            above = is_number and (value > kind.least if kind.is_open else value >= kind.least)
-            ends = f"{'more than' if kind.is_open else 'at least'} {kind.least:g} and at most {kind.most:g}"
-            problems += [] if above and value <= kind.most else [f"{of.name} is {value!r}, expected a number of {ends}"]
-        elif value not in kind:
-            problems.append(f"{of.name} is {value!r}, expected one of {', '.join(kind)}")
+        problems.append(f"{function}: {of.name} is {value!r}; expected {expected}")
     if problems:
-        raise UsageError(*(f"{function}: {problem}" for problem in problems))
+        raise UsageError(*problems)
+
+
+def _describe_mismatch(kind: Range | tuple[str, ...] | str, value: Any) -> str:
+    """Return what an option is to be, "" where it is that."""
+    if isinstance(kind, Range):
+        is_inside = (
+            _is_number(value) and kind.least <= value <= kind.most and not (kind.is_open and value == kind.least)
+        )
+        return "" if is_inside else f"a number {'above' if kind.is_open else 'from'} {kind.least:g} to {kind.most:g}"
+    if kind == "lonlat":
+        is_point = isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value))
+        return "" if is_point else "longitude and latitude in degrees"
+    return "" if isinstance(kind, str) or value in kind else f"one of {', '.join(kind)}"
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
 EARLIER_COLUMNS = {
