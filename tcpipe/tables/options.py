@@ -144,7 +144,7 @@ def _describe_mismatch(kind: Range | tuple[str, ...] | str, value: Any) -> str:
     return "" if isinstance(kind, str) or value in kind else f"one of {', '.join(kind)}"
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
