@@ -23,7 +23,7 @@ page.start(async () => {
     const part = (k) => Math.round(parseInt(ramp[low].slice(k, k + 2), 16) * (1 - share) + parseInt(ramp[low + 1].slice(k, k + 2), 16) * share);
     return `rgb(${part(1)},${part(3)},${part(5)})`;
   });
-  const digits = (value, name) => Number.isFinite(value) ? `${value.toFixed(kinds[name][2])}\u00a0${kinds[name][1]}` : "none";
+  const digits = (value, name) => Number.isFinite(value) ? `${page.fixed(value, kinds[name][2])}\u00a0${kinds[name][1]}` : "none";
 
   function coloured(name) {
     const legend = [];
@@ -91,8 +91,9 @@ page.start(async () => {
   // The selection: rows that pass all filters; none without a filter. `current` is the one of them that is shown in words.
   const filters = new Map();
   const passes = (i, without) => [...filters].every(([name, passed]) => name === without || passed(i));
-  let [selected, current] = [[], -1];
+  let [selected, current, isLone] = [[], -1, false];
   function setFilter(name, passed) {
+    if (name !== "picked" && isLone) filters.delete("picked");  // a single sample would leave nothing to filter
     if (passed) filters.set(name, passed);
     else filters.delete(name);
     selected = filters.size ? [...c.x.keys()].filter((i) => passes(i)) : [];
@@ -101,6 +102,7 @@ page.start(async () => {
   }
   function pick(rows) {
     if (rows.length === 1 && !passes(rows[0], "picked")) clear();
+    isLone = rows.length === 1;
     const picked = new Set(rows);
     setFilter("picked", rows.length ? (i) => picked.has(i) : null);
   }
@@ -269,7 +271,11 @@ page.start(async () => {
       const layer = picture?.[0].layers.find((one) => one.name === at("layer").value);
       button.append(picture ? page.patch(picture[0], layer, picture[1], 92) : make("span", "not in this page", { className: "patch" }));
       button.append(`${className(i)} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${splitName(i)}`);
-      button.onclick = () => (selected.length > 1 ? focus(i) : pick([i]));
+      button.onclick = () => {
+        if (selected.length > 1) focus(i);
+        else pick([i]);
+        at("gallery").querySelector("[aria-pressed=true]")?.focus();  // it is another button now
+      };
       return button;
     }));
     at("no-picture").hidden = !sheets || shown.every((i) => pictureOf(i));

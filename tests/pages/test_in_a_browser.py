@@ -8,6 +8,7 @@ from time import monotonic
 import pytest
 from synthetic_store import add_run, add_world, driven, lanes, make_noise_facts, segments
 
+import tcpipe
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
@@ -280,7 +281,7 @@ def test_ids_of_a_selection_open_and_exclude_these_samples(chromium, dataset, tm
         line = tab.locator("#python").inner_text()
         tab.locator("textarea").evaluate("(area) => area.remove()")
         shown = len(tab.evaluate(SELECTED))
-    chosen = eval(line.replace('"sample_ids.csv"', repr(str(tmp_path / "sample_ids.csv"))))  # noqa: S307  the line itself is tested
+    chosen = eval(line.replace("sample_ids.csv", f"{tmp_path}/sample_ids.csv"), {"tcpipe": tcpipe})  # noqa: S307  the line itself is tested
     assert chosen.column("sample_id").tolist() == copied
     assert set(chosen.column("split")) == {"test"}
     assert len(copied) == shown
@@ -353,18 +354,18 @@ def store_page(request, chromium, dataset):
 
 def test_the_store_s_page_fits_sorts_filters_and_leads_to_runs(store_page):
     fits_and_can_be_read_by_everyone(store_page)
-    first = store_page.locator("#s1 td a").first
+    first = store_page.locator("#s2 td a").first
     assert first.inner_text() == "south"
-    store_page.locator("#s1 th button").first.focus()
+    store_page.locator("#s2 th button").first.focus()
     store_page.keyboard.press("Enter")
     assert first.inner_text() == "north"
     store_page.fill("#find", "sou")
-    assert store_page.locator("#s1 td a").all_inner_texts() == ["south"]
+    assert store_page.locator("#s2 td a").all_inner_texts() == ["south"]
     chosen = "Bokeh.documents[0].get_model_by_name('used').data_source.selected"
     assert store_page.evaluate(f"{chosen}.indices") == [0]
     store_page.click("#clear")
     store_page.evaluate(f"{chosen}.indices = [1]")
-    assert store_page.locator("#s1 td a").all_inner_texts() == ["north"]
+    assert store_page.locator("#s2 td a").all_inner_texts() == ["north"]
     assert first.get_attribute("href").endswith("/report.html")
 
 
