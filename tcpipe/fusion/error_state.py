@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
-from tcpipe.fusion.densities import NoiseModel, fit_noise, inflate_unclaimed_fixes
+from tcpipe.fusion.densities import NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
     ACCEPTED,
@@ -46,7 +46,6 @@ from tcpipe.fusion.measurements import (
     Measurements,
     select_rows,
 )
-from tcpipe.fusion.noise_curves import describe_noise
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
