@@ -40,10 +40,13 @@ from tcpipe.fusion.hypotheses import (
 )
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
     IMU,
     STATED_ARM_STD_M,
     InitialState,
     Measurements,
+    Rejections,
+    Trajectory,
     select_rows,
 )
 from tcpipe.fusion.pair_residuals import find_residuals
@@ -60,7 +63,6 @@ from tcpipe.fusion.process import (
 )
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed, make_adjoint, smooth_ticks
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding

@@ -20,9 +20,19 @@ from tcpipe.fusion.checks.clock_offsets import POWER, PowerSignal, find_clock_of
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, BodyVelocities, InitialState
+from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
+    DOPPLER,
+    GNSS,
+    IMU,
+    BodyVelocities,
+    InitialState,
+    TrackSection,
+    Trajectory,
+    cut_sections,
+    make_track_stamps,
+)
 from tcpipe.fusion.signals import compute_seconds, hold_last, is_covered
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.logs.clocks import LOG_CLOCK

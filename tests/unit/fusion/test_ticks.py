@@ -8,9 +8,15 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.fusion import state
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.measurements import (
+    BodyVelocities,
+    InertialMeasurements,
+    Measurements,
+    Positions,
+    cut_sections,
+    make_track_stamps,
+)
 from tcpipe.fusion.ticks import build_ticks, find_tick_period_ns
-from tcpipe.fusion.trajectory import cut_sections, make_track_stamps
 
 NOWHERE = np.empty((0, 2), np.int64)
 TICK_NS = 50_000_000
