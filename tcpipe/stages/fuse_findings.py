@@ -28,6 +28,7 @@ from tcpipe.stages.fuse_inputs import (
     read_command,
     state_extrinsics,
 )
+from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import (
     AuditFacts,
     ChangeFacts,
@@ -188,11 +189,10 @@ def _find_span_s(each: StretchFacts | GateReset | ChangeFacts | Disagreement, fi
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
-def make_audit_findings(
-    found: Sequence[Disagreement], sections: Sequence[StretchFacts], inputs: FusionInputs, streams: Streams
-) -> StageReport[AuditFacts]:
+def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
     """Return every disagreement, wheels that are faster than any command, and the findings of both."""
-    first_ns = min((section.start_ns for section in sections), default=0)
+    found = fused.disagreements
+    first_ns = min((section.start_ns for section in fused.facts), default=0)
     findings = [_find_disagreement(found, first_ns)] if found else []
     faster = _compute_command_ratio(inputs, streams)
     if faster is not None:

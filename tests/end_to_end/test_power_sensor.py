@@ -13,7 +13,7 @@ from tcpipe.recipe.checking import from_values
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, read_truth, simulate
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import RasterSpec
-from tcpipe.stages.fuse import make_power_columns
+from tcpipe.stages.fuse_sections import make_power_columns
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import to_floats, to_integers

@@ -15,9 +15,9 @@ from tcpipe.fusion.measurements import (
     TrackSection,
 )
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.fuse import make_section_facts
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
+from tcpipe.stages.fuse_sections import Fused, make_section_facts
 from tcpipe.tables.facts import ChangeFacts, Disagreement, GateReset, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
@@ -165,17 +165,18 @@ def off(begin_s, end_s, size, *, sensor="gnss"):
 NOBODY = FusionInputs(None), Streams({}, {}, "husky")
 
 
-SECTIONS = [StretchFacts({}, {}, {}, start_ns=100 * SECOND_NS)]
+def fused(*found):
+    return Fused(facts=[StretchFacts({}, {}, {}, start_ns=100 * SECOND_NS)], disagreements=list(found))
 
 
 def test_nothing_is_said_where_nobody_disagrees():
-    told = make_audit_findings([], SECTIONS, *NOBODY)
+    told = make_audit_findings(fused(), *NOBODY)
     assert told.findings == ()
     assert (told.facts.disagreements, told.facts.undecided) == ((), ())
 
 
 def test_a_finding_holds_sensor_what_window_size_and_what_was_expected():
-    told = make_audit_findings([off(110, 130, 2.0), off(160, 220, 4.9)], SECTIONS, *NOBODY)
+    told = make_audit_findings(fused(off(110, 130, 2.0), off(160, 220, 4.9)), *NOBODY)
     (shared,) = told.findings
     assert (shared.code, shared.subject.name, shared.action) == ("distance-disagrees", "gnss", "inflated")
     assert shared.numbers == {"off_m": 4.9, "expected_std_m": 0.02, "event_count": 2, "total_s": 80.0}
@@ -197,8 +198,8 @@ def wheels_alone(speed_mps):
 
 
 def test_wheels_faster_than_any_command_bear_no_segment_where_nothing_else_tells_how_long_a_metre_is():
-    assert make_audit_findings([], SECTIONS, *wheels_alone(0.9)).facts.undecided == ()
-    told = make_audit_findings([], SECTIONS, *wheels_alone(1.25))
+    assert make_audit_findings(fused(), *wheels_alone(0.9)).facts.undecided == ()
+    told = make_audit_findings(fused(), *wheels_alone(1.25))
     assert told.facts.undecided == ("wheel_odometry",)
     (finding,) = told.findings
     assert (finding.code, finding.numbers) == ("faster-than-commanded", {"speed_ratio": pytest.approx(1.25)})

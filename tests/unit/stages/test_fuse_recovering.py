@@ -7,8 +7,8 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages import fuse as stage
-from tcpipe.stages.fuse import Fused
 from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.findings import Subject
 from tcpipe.tables.levels import Sensor, Streams
 

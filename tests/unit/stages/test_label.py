@@ -15,7 +15,7 @@ from tcpipe.recipe import LabelConfig, MaskConfig, Recipe, SegmentConfig
 from tcpipe.simulation import Faults, find_scenario
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
-from tcpipe.stages.fuse import make_power_columns
+from tcpipe.stages.fuse_sections import make_power_columns
 from tcpipe.stages.label import add_physics, compute_segment_costs, label_segments
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.message_arrays import make_rails
