@@ -31,7 +31,6 @@ from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_l
 from tcpipe.execution import Executor, run_all, unwrap_result
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
-from tcpipe.formats.geopackage import make_raster_style
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
@@ -39,6 +38,7 @@ from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, find_wrong_files
+from tcpipe.formats.qgis_styles import make_raster_style
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,

@@ -176,11 +176,6 @@ def find_quantity(topic: str) -> Literal["voltage", "current"] | None:
     return "voltage" if found[-1].startswith("v") else "current"
 
 
-def find_bare_unit(type_name: str, topic: str) -> str | None:
-    """Return the unit of a bare number on a topic, V or A, None where neither its type nor the name says so."""
-    return {"voltage": "V", "current": "A", None: None}[find_quantity(topic) if type_name in FLOAT_TYPES else None]
-
-
 def make_rail_name(topic: str) -> str:
     """Return the rail's name: the topic's without its quantity, so that a rail's voltage and current share it."""
     return _QUANTITY.sub("", topic.lower().removesuffix(_CORRECTED)).rstrip("/_")
