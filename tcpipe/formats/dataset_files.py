@@ -31,7 +31,7 @@ from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decode_chunk, open_sharded
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS, READ_VERSIONS
@@ -464,27 +464,6 @@ def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int,
     ]
     starts = np.concatenate([[0], np.cumsum([rows for *_, rows in groups])]).astype(np.int64)
     return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
-
-
-def has_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
-    """Tell whether the ids beside the patches of a Zarr dataset are these; `StoreError` if they cannot be read.
-
-    They are compared as Zarr encodes them (vlen-utf8: a count, and each text after its length), so that no more is decoded than that.
-    """
-    place = directory / PATCHES / "sample_id"
-    for number, first in enumerate(range(0, len(ids), SHARD_ROWS)):
-        here = list(ids[first : first + SHARD_ROWS])
-        texts = [name.encode() for name in here + [""] * (SHARD_ROWS - len(here))]
-        wanted = SHARD_ROWS.to_bytes(4, "little") + b"".join(len(text).to_bytes(4, "little") + text for text in texts)
-        path = place / "c" / str(number)
-        try:
-            if decode_chunk(place, path.read_bytes(), len(wanted)) != wanted:
-                return False
-        except FileNotFoundError:
-            raise StoreError(f"{path}: is missing") from None
-        except (OSError, ValueError, RuntimeError) as error:
-            raise StoreError(f"{path}: does not contain the ids of the samples ({error})") from None
-    return True
 
 
 def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDArray[np.int64]:

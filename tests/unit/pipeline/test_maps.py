@@ -216,7 +216,7 @@ def test_map_and_picture_are_replaced_together(site, store, tmp_path, monkeypatc
     add(store, "m", **site)
     old, other = Store(store).map_picture("m").read_bytes(), other_height(tmp_path)
     with monkeypatch.context() as killed:
-        killed.setattr(maps, "write_quick_look", lambda *_: pytest.fail("killed"))
+        killed.setattr(maps, "write_overview", lambda *_: pytest.fail("killed"))
         with pytest.raises(pytest.fail.Exception):
             add(store, "m", height=other, force=True)
     assert len(open_map(Store(store).map_path("m")).layers) == 3
