@@ -148,9 +148,7 @@ class Store:
     def new_map(self, name: str, *, after: int = 0) -> Iterator[Path]:
         """Yield where a map is to be written, and beside it a picture ``.png``; in the end it is this store's, under ``after`` + 1.
 
-        Raises
-        ------
-        StoreError : it cannot be written, or another process has added a map of that name meanwhile, which stays.
+        `StoreError`: another process has added a map of that name meanwhile, which stays.
         """
         maps = self.place.below("maps")
         with maps.workshop() as directory:
@@ -428,9 +426,7 @@ def _refuse_earlier(place: Place, version: str | None) -> None:
 def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     """Return the store and the finished ingestions of a run's directory, or the one of a recipe's; None for any other path.
 
-    Raises
-    ------
-    StoreError : it is a run's, but holds no finished run of this data-model version.
+    `StoreError`: it holds no finished run of this data-model version.
     """
     inside = find_store_above(path)
     if inside is None:
@@ -456,13 +452,7 @@ def find_store_above(path: Path | str) -> tuple[Store, str, str | None] | None:
 
 
 def open_store(root: str | Path, *, create: bool = False) -> Store:
-    """Return the store at a path or URL.
-
-    Raises
-    ------
-    UsageError : it is missing (unless ``create``), a file, or of an earlier layout.
-    StoreError : it cannot be reached or made, or is of a data model that this version does not know.
-    """
+    """Return the store at a path or URL."""
     if is_url(root) and not is_bucket(root):
         raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)

@@ -114,25 +114,13 @@ class FetchedShards:
 
 
 def fetch_directory(path: str | Path) -> Path:
-    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs.
-
-    Raises
-    ------
-    UsageError : there is no card at the URL.
-    StoreError : it cannot be read, or a file is not as the card says.
-    """
+    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs."""
     return Path(path) if not is_url(path) else _fetch_copy(str(path).rstrip("/"), lambda _: True)[0]
 
 
 @contextmanager
 def fetch_unproved(url: str) -> Iterator[Path]:
-    """Yield a copy of what a card in a bucket lists, as it lies there now: nothing is taken from the cache, and nothing proved.
-
-    Raises
-    ------
-    UsageError : there is no card at the URL.
-    StoreError : it cannot be read.
-    """
+    """Yield a copy of what a card in a bucket lists, as it lies there now: nothing is taken from the cache, and nothing proved."""
     card = require_card(url)
     with make_scratch_directory() as held:
         root = _make_subdirectory(held, url)

@@ -151,12 +151,7 @@ def make_zarr_writers(
 ) -> list[Drawer]:
     """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written to ``out``.
 
-    Parameters
-    ----------
-    pixels : the patches of all rows.
-    sample_ids : gives the ids of the rows from one up to another.
-    compression : what the layers are encoded with.
-    threads : chunks of a shard encoded side by side; the bytes do not depend on it.
+    ``sample_ids`` gives the ids of the rows from one up to another; ``threads`` does not change the bytes.
     """
     n, px = len(pixels.slots), pixels.patch_px
     shard = _choose_shard_rows(n)
@@ -224,11 +219,7 @@ def make_parquet_writers(
 ) -> list[Drawer]:
     """Return ``data/<split>-*.parquet``, to be written to ``out``: the columns of the samples and each layer as a plain fixed-size list.
 
-    Parameters
-    ----------
-    pixels : the patches of all rows.
-    samples : gives, for some rows, what gives these rows of the samples table.
-    split : split of every row, shape (N,).
+    ``samples`` gives, for some rows, what gives these rows of the samples table.
     """
     drawers = list[Drawer]()
     for name in SPLITS:
@@ -257,9 +248,7 @@ def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array
 def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     """Return the card of the dataset in ``directory``, of any data model.
 
-    Raises
-    ------
-    DatasetError : there is none; or it is of this data model and not as it was written, unless that is not to be ``proved``.
+    One of this data model is ``proved`` against its seal.
     """
     if not directory.exists():
         raise UsageError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
@@ -295,10 +284,6 @@ def read_current_card(directory: Path) -> DatasetCard:
     """Return the card of a dataset of this data model, whose samples and descriptions of patches are as they were written.
 
     Patches carry checksums of their own, which are proved when they are read.
-
-    Raises
-    ------
-    DatasetError : there is none, it is of another data model, or not as it was written.
     """
     card = read_card(directory)
     if card.data_model_version not in READ_VERSIONS:
@@ -416,10 +401,6 @@ def open_patches(
 
     Where that is to be ``proved``, shards are held against the card: on this machine at once, in a bucket each before it is first read.
     A digest is found once and remembered, so that to open the dataset again costs a look at each file.
-
-    Raises
-    ------
-    DatasetError : they are gone, or not what the card says, as where a folder was copied in part over another build.
     """
     px, samples = card.patch_px, card.samples
     layers = sort_layers(read_layers(card.layers, card.classes, directory / CARD))

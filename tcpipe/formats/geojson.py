@@ -45,10 +45,7 @@ def read_regions(path: Path) -> Regions:
     Inside (``train_test``) is the union of the polygons, unless features carry the property ``split``: ``train_test``,
     ``unseen`` or ``exclude``. No other property is interpreted. ``exclude`` may lie over the other two and carves out of them.
 
-    Raises
-    ------
-    RegionError : not GeoJSON, no polygon, empty or self-crossing geometry, coordinates that are no lon/lat, an unknown ``split``,
-        train_test and unseen over the same ground, no train_test region: all problems at once.
+    One `RegionError` lists all problems.
     """
     polygons: dict[str, list[BaseGeometry]] = {kind: [] for kind in KINDS}
     features, problems = read_polygons(path)
@@ -107,12 +104,7 @@ class FeatureCollection:
 
 
 def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
-    """Read the polygon features of a file in their order, and one line for every unsound geometry.
-
-    Raises
-    ------
-    RegionError : not GeoJSON, or in another CRS.
-    """
+    """Read the polygon features of a file in their order, and one line for every unsound geometry."""
     features: list[PolygonFeature] = []
     problems: list[str] = []
     for where, properties, geometry in _iterate_features(path):
@@ -273,12 +265,7 @@ class LineFeature(Generic[P]):
 
 
 def read_line(path: Path) -> NDArray[np.float64]:
-    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2.
-
-    Raises
-    ------
-    PathError : not GeoJSON, in another CRS, no line or several, a line of one point, coordinates that are no lon/lat.
-    """
+    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2."""
     try:
         features = list(_iterate_features(path))
     except RegionError as error:

@@ -41,12 +41,7 @@ class VectorLayer:
 
 
 def write_geopackage(path: Path, layers: Sequence[VectorLayer]) -> None:
-    """Write a GeoPackage, whole or not at all.
-
-    Raises
-    ------
-    UsageError : pyogrio is not installed, or ``path`` is there and holds something else than such layers.
-    """
+    """Write a GeoPackage, whole or not at all."""
     ogr = _import_pyogrio()
     if path.exists() and not _is_of(ogr, path, {layer.name for layer in layers}):
         raise UsageError(f"{path}: exists and is not a GeoPackage of tcpipe; give another name")

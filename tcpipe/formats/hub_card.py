@@ -31,14 +31,7 @@ _SHOWN_LAYERS = 12
 
 
 def format_hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, picture: str) -> str:
-    """Return the document: a YAML head (as JSON, which is YAML) and what a reader wants to know.
-
-    Parameters
-    ----------
-    card : the dataset's, with the checksums of its files so far.
-    samples : schema of its table of samples.
-    samples_file, picture : where that table and an overview lie in the dataset.
-    """
+    """Return the document: a YAML head (as JSON, which is YAML) and what a reader wants to know."""
     text = "\n".join(_iterate_lines(card, picture))
     head = _make_head(card, samples, samples_file)
     yaml = "".join(f"{key}: {json.dumps(value, ensure_ascii=True)}\n" for key, value in head.items())
@@ -228,20 +221,7 @@ def format_croissant(
 ) -> str:
     """Return the document as text.
 
-    Parameters
-    ----------
-    name, description, licence, creator : as the recipe says; an empty one is left out.
-    attributions : licences of others' data that it contains.
-    files : size [byte] and sha256 (hex) of every file by its path inside the dataset.
-    samples_file : which of them holds the samples.
-    samples : its Arrow schema; the fields' metadata give their meanings.
-    version : of the dataset.
-    shards, layers : pattern of the Parquet files that hold the patches, and of each layer how many values a patch has and of which kind
-        (numpy's letter); None where patches are no Parquet.
-
-    Returns
-    -------
-    JSON-LD.
+    ``shards`` is the pattern of the Parquet files that hold the patches, ``layers`` how many values a patch has and of which kind.
     """
     samples_source = {"fileObject": {"@id": samples_file}}
     records = [

@@ -65,15 +65,7 @@ def seal_document(value: object) -> dict[str, Json]:
 def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True) -> dict[str, Json]:
     """Read a JSON object that `write_sealed` wrote, and prove it.
 
-    Parameters
-    ----------
-    path : the document.
-    ours : tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
-        refuse.
-
-    Raises
-    ------
-    StoreError : it cannot be read, or is not as it was written.
+    What is not ``ours``, by kind and version, is returned unproved, for the caller to refuse.
     """
     return verify_document(read_document(path), path, ours=ours)
 

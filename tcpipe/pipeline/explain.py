@@ -169,12 +169,6 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
 
     Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data model, or the store no
     longer holds the sample's run.
-
-    Parameters
-    ----------
-    sample_id : its id.
-    dataset : the dataset's directory.
-    store : the store it was built from.
     """
     opened = open_store(store)
     directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)

@@ -94,10 +94,7 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
     Raises `UsageError`: the path is none of these, or no store and to be brought elsewhere, or of a data model that this version does not
     know.
 
-    Parameters
-    ----------
-    path : the store, map (``.zarr``) or dataset; a store or dataset also by its URL.
-    to : where a store is brought to, a directory or URL; what is there of it already is not copied again. None: where it is.
+    ``to``: where a store is brought to; what is there of it already is not copied again. None: where it is.
     """
     source = open_place(path)
     if is_outdated(source):

@@ -134,14 +134,7 @@ def find_status(
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or nothing is known of its sources.
 
-    Parameters
-    ----------
-    logs
-        Logs and folders; none: those that the store's latest calls of ingest were given.
-    min_age_s
-        A log that was written since so many seconds is growing.
-    create
-        The store need not be there.
+    Without ``logs``: those that the latest calls of ingest were given. With ``create`` the store need not be there.
     """
     ruling = resolve_recipe(recipe)
     opened = Store(store if is_url(store) else check_local_output(store)) if create else open_store(store)
