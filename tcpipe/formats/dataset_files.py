@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
-from tcpipe.formats.integrity import read_sealed
-from tcpipe.formats.json_files import parse_typed
+from tcpipe.formats.integrity import verify_document
+from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
@@ -257,21 +257,27 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     if not (directory / CARD).is_file():
         raise UsageError(f"{directory}: not a dataset: it has no {CARD}")
     with _convert_errors():
-        found = read_sealed(directory / CARD, ours=lambda found: proved and _is_current(found))
+        data = read_document(directory / CARD)
+    return parse_card(data, directory / CARD, proved=proved)
+
+
+def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> DatasetCard:
+    """Return the card in the bytes of a file; as `read_card`."""
+    with _convert_errors():
+        found = verify_document(data, where, ours=lambda found: proved and _is_current(found))
     if found.get("kind") != KIND:
-        raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
+        raise DatasetError(f"{where}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
     if not _is_current(found) or "verdict" not in found:  # before data model 3.0 its findings were sentences
         found.pop("findings", None)
     try:
-        return parse_typed(found, DatasetCard, directory / CARD)
+        return parse_typed(found, DatasetCard, where)
     except (StoreError, RecipeError) as error:
-        problems = (
-            error.problems if _is_current(found) else (_describe_outdated(directory, found.get("data_model_version")),)
-        )
+        directory, version = str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")
+        problems = error.problems if _is_current(found) else (_describe_outdated(directory, version),)
         raise DatasetError(*problems) from None
 
 
-def _describe_outdated(directory: Path, version: object) -> str:
+def _describe_outdated(directory: Path | str, version: object) -> str:
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
     return f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}"
 

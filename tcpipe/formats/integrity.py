@@ -21,9 +21,6 @@ T = TypeVar("T")
 SEAL = "document_sha256"
 """Key of a sealed document that holds the sha256 (hex) of its canonical JSON without this key."""
 
-MOST_PAGE_BYTES = 256 << 20
-"""A sealed page is at most so large [byte]."""
-
 CHECKSUMS = "checksums.json"
 """In a directory whose files cannot be listed elsewhere: a sealed document with the key ``checksums``."""
 
@@ -108,18 +105,8 @@ def describe_broken(path: Path | str) -> str:
     return f"{path}: has changed since it was written: its checksum differs"
 
 
-def find_broken_seal(path: Path) -> str | None:
-    """Return in one line why a sealed file (``.json``, ``.html``) is not as it was written, None if it is."""
-    try:
-        if path.stat().st_size > MOST_PAGE_BYTES:
-            return f"{path}: is larger than {MOST_PAGE_BYTES >> 20} MB, which no page is"
-        return find_broken_seal_in(path.read_bytes(), path)
-    except OSError as error:
-        return f"{path}: cannot be read ({error.strerror})"
-
-
-def find_broken_seal_in(data: bytes | None, where: Path | str) -> str | None:
-    """Return the same of the bytes of a file that lies at ``where``; None: it is not there."""
+def find_broken_seal(data: bytes | None, where: Path | str) -> str | None:
+    """Return in one line why a sealed file (``.json``, ``.html``) at ``where`` is not as it was written; None if it is."""
     if data is None:
         return f"{where}: is missing"
     is_whole = _is_whole_page(data) if Path(where).suffix == ".html" else _is_whole_document(data)

@@ -32,7 +32,6 @@ from tcpipe.formats.run_documents import (
     Manifest,
     RunJson,
     StoreDocument,
-    is_outdated,
     read_layout,
     read_sealed_at,
     split_number,
@@ -97,10 +96,6 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
     ``to``: where a store is brought to; what is there of it already is not copied again. None: where it is.
     """
     source = open_place(path)
-    if is_outdated(source):
-        raise UsageError(
-            f"{path}: is a store of data model 1, which this version does not read, or an incomplete copy (no {MARK})"
-        )
     if (version := read_layout(source)) is not None:
         if version not in _KNOWN_VERSIONS:
             raise UsageError(f"{path}: is of data model {version}, this version knows {', '.join(_KNOWN_VERSIONS)}")

@@ -12,7 +12,7 @@ from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
 from tcpipe.formats.commit_log import LOG, commit_name, make_snapshot_name, read_commit, read_snapshot
 from tcpipe.formats.commits import Commit, State, fold
-from tcpipe.formats.integrity import CHECKSUMS, Checksum, find_broken_seal_in, read_checksums
+from tcpipe.formats.integrity import CHECKSUMS, Checksum, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.parquet import read_row_count
 from tcpipe.formats.place import Place, find_wrong_files
@@ -43,7 +43,7 @@ _INDEX = "index"
 def verify_store(store: Store) -> Iterator[CheckResult]:
     """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
     place = store.place
-    yield find_broken_seal_in(place.read(MARK), place.where(MARK)) or ("files", 1)
+    yield find_broken_seal(place.read(MARK), place.where(MARK)) or ("files", 1)
     for name in place.files():
         if name == _REPORT:
             yield from _verify_seals(place, [name])
@@ -140,7 +140,7 @@ def _list_documents(place: Place) -> set[str]:
 
 def _verify_seals(place: Place, names: Iterable[str]) -> Iterator[CheckResult]:
     for name in names:
-        yield find_broken_seal_in(place.read(name), place.where(name)) or ("files", 1)
+        yield find_broken_seal(place.read(name), place.where(name)) or ("files", 1)
 
 
 def _verify_maps(store: Store) -> Iterator[CheckResult]:

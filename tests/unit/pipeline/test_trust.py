@@ -73,16 +73,16 @@ def test_a_store_its_runs_and_its_map_verify(made):
     found = verify(made / "store")
     assert (found.problems, found.kind, found.read["runs"], found.read["maps"]) == ((), "store", 2, 1)
     assert verify(made / "store" / "runs" / "north").kind == "run"
-    assert verify(Store(made / "store").map_path("site")).kind == "map"
+    assert verify(Store(made / "store").map_files("site")[0]).kind == "map"
 
 
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
     open_log(store).commit("seen", Entries(seen=(LogSnapshot(("/logs/north.mcap",), (), "north"),)))
     with store.new_map("site", after=1) as path:
-        shutil.copytree(store.map_path("site"), path)
+        shutil.copytree(store.map_files("site")[0], path)
         write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
-    shutil.rmtree(store.map_path("site").parents[1] / replaced(store))
+    shutil.rmtree(store.map_files("site")[0].parents[1] / replaced(store))
     (store.root / "maps" / "site-1.json").unlink()
     sensor = Sensor("/power", "x/msg/Power", "base", "the only one", None, None)
     for run in store.runs():
@@ -121,7 +121,7 @@ def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
     for path in set(whole) - set(listed):
         for place in (0.0, *rng.random(8), 1.0):
             flip(path, place, bit=int(rng.integers(8)))
-            problems = find_broken_seal(path) if place else "".join(verify(directory).problems)
+            problems = find_broken_seal(path.read_bytes(), path) if place else "".join(verify(directory).problems)
             assert str(path) in (problems or ""), (path, place)
             path.write_bytes(whole[path])
     assert verify(directory).problems == ()
@@ -158,7 +158,7 @@ def test_files_that_went_or_came_are_found(copy):
 
 def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
     store = copy("store")
-    layers = Store(store).map_path("site")
+    layers = Store(store).map_files("site")[0]
     flip(files(layers / "height" / "c")[0])
     shutil.rmtree(layers / "ortho" / "c")
     shutil.rmtree(Store(store).recipes_of("north")[0].where)
@@ -181,7 +181,7 @@ def test_a_manifest_that_counts_otherwise_is_found(copy):
 
 def test_strange_files_in_a_store_are_named_and_what_a_killed_command_left_behind(copy):
     store = copy("store")
-    stored, map_path = Store(store), Store(store).map_path("site").relative_to(store)
+    stored, map_path = Store(store), Store(store).map_files("site")[0].relative_to(store)
     recipe = Path(stored.recipes_of("south")[0].where).relative_to(store)
     strange = ("notes.txt", "maps/notes.txt", "runs/north/notes.txt", f"{recipe}/notes.txt")
     for name in (*strange, f"{map_path}/height/notes.txt"):
