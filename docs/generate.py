@@ -1,9 +1,10 @@
-"""Write docs/reference/{cli,columns,documents,findings,recipe,robots}.md from the code; `make docs` runs it and a test compares."""
+"""Write docs/reference/{cli,columns,documents,findings,recipe,robots}.md and stable.json from the code; a test compares."""
 
 from __future__ import annotations
 
 import ast
 import inspect
+import json
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import cast
 
 import click
+from stable import FILE, describe_stable, find_lost_names
 
 from tcpipe.cli import cli
 from tcpipe.cli.site_commands import json_output_types
@@ -46,6 +48,7 @@ def pages() -> dict[str, str]:
         "findings.md": _findings(),
         "recipe.md": _recipe(),
         "robots.md": _robots(),
+        FILE.name: json.dumps(describe_stable(), indent=1, ensure_ascii=False) + "\n",
     }
 
 
@@ -340,6 +343,8 @@ def _robots() -> str:
 
 if __name__ == "__main__":
     REFERENCE.mkdir(exist_ok=True)
+    if FILE.exists() and (lost := find_lost_names(json.loads(FILE.read_text(encoding="utf-8")), describe_stable())):
+        raise SystemExit(lost)
     for name, text in pages().items():
         (REFERENCE / name).write_text(text, encoding="utf-8")
     sys.stdout.write(f"wrote {len(pages())} pages to {REFERENCE}\n")

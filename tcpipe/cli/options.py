@@ -87,13 +87,13 @@ class RenamedOption(click.Option):
 
     def __init__(self, *declarations: Any, earlier: str, **settings: Any) -> None:
         super().__init__(*declarations, **settings)
-        self._earlier = earlier
+        self.earlier = earlier
 
     def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
         """Let click read both names."""
-        self.opts.append(self._earlier)
+        self.opts.append(self.earlier)
         super().add_to_parser(parser, ctx)
-        self.opts.remove(self._earlier)
+        self.opts.remove(self.earlier)
 
 
 Option: TypeAlias = Callable[[Any], Any]

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-
-from tcpipe.compiled import compile_kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.signedinteger]
@@ -87,7 +85,7 @@ def _count_crossing(
 
 
 class Ground:
-    """Ground of footprints ``rows`` among all, whose corners are counter-clockwise, shape (N, 4, 2) [m]."""
+    """Ground of footprints ``rows`` among all, whose corners are in order around each square, shape (N, 4, 2) [m]."""
 
     def __init__(self, corners_xy_m: Floats, rows: Ints) -> None:
         self.corners_xy_m, self.rows = corners_xy_m, rows
@@ -152,11 +150,9 @@ def find_near_pairs(queries_xy_m: Floats, tree: cKDTree, *, within_m: float) -> 
 
 
 def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Ints) -> Floats:
-    """Return the share of the ground of ``queries[i]`` that ``references[j]`` covers too, (P,); corners counter-clockwise, (N, 4, 2)."""
-    shared_m2 = np.empty(len(i))
-    pair_overlaps(queries, references, i, j, shared_m2)
-    side_m = np.linalg.norm(queries[:, 1] - queries[:, 0], axis=1)
-    return np.asarray(shared_m2 / side_m[i] ** 2)
+    """Return the share of the ground of ``queries[i]`` that ``references[j]`` covers too, (P,); corners in order around, (N, 4, 2)."""
+    ours, theirs = shapely.polygons(queries), shapely.polygons(references[j])
+    return np.asarray(shapely.area(shapely.intersection(ours[i], theirs)) / shapely.area(ours)[i])
 
 
 def compute_nearest_m(queries: Floats, ground: Ground) -> Floats:
@@ -171,9 +167,8 @@ def compute_nearest_m(queries: Floats, ground: Ground) -> Floats:
         rows, wanted = pending.pop()
         asked = min(wanted, count)
         distances_m, j = ground.tree.query(queries[rows].mean(axis=1), k=np.arange(1, asked + 1))
-        apart_m, near = np.empty(j.size), ground.rows[j.reshape(-1)]
-        pair_distances(queries, ground.corners_xy_m, np.repeat(rows, asked), near, apart_m)
-        best_m[rows] = apart_m.reshape(-1, asked).min(axis=1)
+        near = shapely.polygons(ground.corners_xy_m[ground.rows[j]])
+        best_m[rows] = shapely.distance(shapely.polygons(queries[rows])[:, None], near).min(axis=1)
         # squares are nearer than their centres by at most two half diagonals: what is farther still cannot win
         doubtful = rows[(best_m[rows] > np.asarray(distances_m)[:, -1] - reach_m) & (best_m[rows] > 0.0)]
         if asked < count:
@@ -188,86 +183,3 @@ def _split_points(rows: Ints, size: int) -> list[Ints]:
 def _compute_half_diagonal_m(corners: Floats) -> float:
     across: Floats = corners[:, 2] - corners[:, 0]
     return float(np.hypot(across[:, 0], across[:, 1]).max(initial=0.0)) / 2.0
-
-
-@compile_kernel
-def pair_distances(
-    queries: Floats, references: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats
-) -> None:
-    """Write the distance between squares ``queries[i]`` and ``references[j]`` to ``out``, (P,), 0 if they touch; corners (N, 4, 2)."""
-    for pair in range(i.size):
-        a, b = queries[i[pair]], references[j[pair]]
-        out[pair] = (
-            0.0 if _touch(a, b) else np.sqrt(min(_compute_corner_distance(a, b), _compute_corner_distance(b, a)))
-        )
-
-
-@compile_kernel
-def pair_overlaps(queries: Floats, references: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats) -> None:
-    """Write the area that squares ``queries[i]`` and ``references[j]`` share to ``out``, (P,); corners run counter-clockwise."""
-    polygon, clipped = np.empty((8, 2)), np.empty((8, 2))
-    for pair in range(i.size):
-        a, b = queries[i[pair]], references[j[pair]]
-        for k in range(4):  # not as slices, see `tcpipe.fusion.state_kernel.copy_values`
-            polygon[k, 0], polygon[k, 1] = a[k, 0], a[k, 1]
-        corners = 4
-        for edge in range(4):
-            corners = _clip(polygon, corners, b[edge], b[(edge + 1) % 4], clipped)
-            polygon, clipped = clipped, polygon
-        area = 0.0
-        for k in range(corners):
-            px, py = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
-            qx, qy = polygon[(k + 1) % corners, 0] - polygon[0, 0], polygon[(k + 1) % corners, 1] - polygon[0, 1]
-            area += px * qy - py * qx
-        out[pair] = area / 2.0
-
-
-@compile_kernel
-def _compute_side(p: Floats, q: Floats, x: float, y: float) -> Any:
-    """Return twice the signed area of p, q and (x, y): positive to the left of p → q."""
-    return (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
-
-
-@compile_kernel
-def _touch(a: Floats, b: Floats) -> bool:
-    """Tell whether no edge of either square has the other wholly to its right."""
-    for one, other in ((a, b), (b, a)):
-        for edge in range(4):
-            apart = True
-            for k in range(4):
-                if _compute_side(one[edge], one[(edge + 1) % 4], other[k, 0], other[k, 1]) >= 0.0:
-                    apart = False
-            if apart:
-                return False
-    return True
-
-
-@compile_kernel
-def _compute_corner_distance(a: Floats, b: Floats) -> float:
-    """Return the smallest squared distance from a corner of ``a`` to an edge of ``b``."""
-    best = np.inf
-    for k in range(4):
-        for edge in range(4):
-            p, q = b[edge], b[(edge + 1) % 4]
-            dx, dy = q[0] - p[0], q[1] - p[1]
-            ex, ey = a[k, 0] - p[0], a[k, 1] - p[1]
-            t = min(max((ex * dx + ey * dy) / (dx * dx + dy * dy), 0.0), 1.0)
-            best = min(best, (ex - t * dx) ** 2 + (ey - t * dy) ** 2)
-    return best
-
-
-@compile_kernel
-def _clip(polygon: Floats, corners: int, p: Floats, q: Floats, out: Floats) -> int:
-    """Keep what lies to the left of p → q (Sutherland and Hodgman 1974); return its corners."""
-    kept = 0
-    for k in range(corners):
-        a, b = polygon[k], polygon[(k + 1) % corners]
-        left, right = _compute_side(p, q, a[0], a[1]), _compute_side(p, q, b[0], b[1])
-        if left >= 0.0:
-            out[kept, 0], out[kept, 1] = a[0], a[1]
-            kept += 1
-        if left * right < 0.0:
-            for c in range(2):
-                out[kept, c] = a[c] + (b[c] - a[c]) * (left / (left - right))
-            kept += 1
-    return kept

@@ -1,6 +1,7 @@
 """Stores and datasets of data models 2.0 and 2.1, kept as they were written (tests/data/make_kept_store.py)."""
 
 import json
+import os
 import re
 import shutil
 import tarfile
@@ -12,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from changed_drives import make
+from installed_command import run_script
 from object_gateway import in_environment
 from storage_server import object_store
 
@@ -19,6 +22,7 @@ import tcpipe
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.integrity import seal_document, write_sealed
 from tcpipe.formats.json_files import to_json
+from tcpipe.formats.logs.writing import write_mcap
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import Place
 from tcpipe.pipeline import migrate as migrating
@@ -142,6 +146,25 @@ def test_a_dataset_that_0_8_wrote_into_a_bucket_is_migrated_there_and_read(untou
         ours_read, theirs = (tcpipe.open_dataset(path)["train"] for path in ("s3://sets/ds", untouched / "zarr"))
         assert np.array_equal(ours_read.patches, theirs.patches)
         assert verify("s3://sets/ds").problems == ()
+
+
+def test_the_upgrade_notes_work_as_they_are_written(untouched):
+    """Of a store that 0.8 wrote, whose own log is gone, and a new log away from its map."""
+    page = (DATA.parents[1] / "CHANGELOG.md").read_text()
+    (script,) = re.findall(r"^### Upgrade.*?^```bash\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (untouched / "store").rename(untouched / "tcpipe-store")
+    (untouched / "zarr").rename(untouched / "dataset")
+    (untouched / "logs").mkdir()
+    write_mcap(untouched / "logs" / "run.mcap", make().messages)
+    around = shapely.box(17.59, 46.99, 17.61, 47.0)
+    (untouched / "region.geojson").write_text(shapely.to_geojson(around))
+    printed = run_script(script, cwd=untouched, env=dict(os.environ))
+    assert "no such" not in printed
+    assert "see tcpipe" not in printed
+    assert "code: tcpipe_version 0." in printed
+    old, new = (tcpipe.open_dataset(untouched / name) for name in ("dataset", "dataset-1.0"))
+    assert sum(map(len, old.values())) == sum(map(len, new.values())) == 10
+    assert len(open_store(untouched / "tcpipe-store").runs()) == 2
 
 
 def test_a_map_alone_is_current(untouched):

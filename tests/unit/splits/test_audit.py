@@ -9,8 +9,6 @@ from tcpipe.splits.audit import (
     compute_nearest_m,
     compute_shared_fraction,
     find_near_pairs,
-    pair_distances,
-    pair_overlaps,
 )
 
 
@@ -61,31 +59,6 @@ def test_the_nearest_square_is_found_though_many_centres_are_nearer(count):
     ours = squares([(0.0, 0.0)])
     assert compute_nearest_m(ours, ground(squares(centres, course))) == pytest.approx([3.1 - np.sqrt(0.5) - 0.5])
     assert compute_nearest_m(ours, ground(squares(centres[:-1]))) == pytest.approx([2.0])
-
-
-def both(a, b):
-    one, zero, distance, area = np.zeros(1, np.int64), np.zeros(1, np.int64), np.empty(1), np.empty(1)
-    pair_distances(a, b, one, zero, distance)
-    pair_overlaps(a, b, one, zero, area)
-    return float(distance[0]), float(area[0])
-
-
-@pytest.mark.parametrize(
-    ("centre", "distance", "area"),
-    [
-        ((0, 0), 0, 1),
-        ((1, 0), 0, 0),  # they share an edge
-        ((1, 1), 0, 0),  # and a corner
-        ((0.5, 0.5), 0, 0.25),
-        ((0, -0.75), 0, 0.25),
-        ((3, 0), 2, 0),
-        ((0, 3), 2, 0),
-        ((4, 5), 5, 0),
-    ],
-)
-def test_squares_along_the_axes(centre, distance, area):
-    assert both(squares([(0, 0)]), squares([centre])) == pytest.approx((distance, area), abs=1e-12)
-    assert both(squares([centre]), squares([(0, 0)])) == pytest.approx((distance, area), abs=1e-12)
 
 
 def test_each_footprint_is_held_against_its_nearest_however_many_there_are():

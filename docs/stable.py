@@ -1,0 +1,125 @@
+"""docs/reference/stable.json: every name that a version 1.x keeps. `docs/generate.py` adds to it and never takes away."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+import tcpipe
+from tcpipe.cli import cli
+from tcpipe.cli.options import RenamedOption
+from tcpipe.cli.site_commands import json_output_types
+from tcpipe.dataset import Dataset, Split
+from tcpipe.formats.contracts import DOCUMENTS, make_contracts
+from tcpipe.formats.logs.log_file import Log
+from tcpipe.learning.evaluation_files import EvaluationResult
+from tcpipe.learning.training import TrainResult
+from tcpipe.pipeline.dataset.build import BuildResult
+from tcpipe.pipeline.ingest import IngestSummary
+from tcpipe.pipeline.maps import AddedMap
+from tcpipe.planning.drives import DrivesResult
+from tcpipe.planning.path_cost import PIECES
+from tcpipe.planning.path_files import PathResult, PlanResult
+from tcpipe.tables.levels import LABELLED_SEGMENTS, MASKED_TRACK, REJECTIONS, SAMPLES, STREAMS
+from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_COLUMNS, EARLIER_KEYS
+
+FILE = Path(__file__).parent / "reference" / "stable.json"
+_RESULTS = (
+    AddedMap, BuildResult, Dataset, DrivesResult, EvaluationResult, IngestSummary, Log, PathResult, PlanResult, Split, TrainResult,
+)  # fmt: skip
+_TABLES = (*STREAMS.values(), MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
+_LOST = (
+    "version 1.x keeps every name in docs/reference/stable.json, and these are gone:\n{names}\nKeep each of them, as a hidden alias if it "
+    "is renamed. A removal belongs into the next major version: delete the file, run 'make docs' and state it in the changelog."
+)
+
+
+def describe_stable() -> dict[str, list[str]]:
+    """Return what is stable, a line for each name."""
+    schemas = {name: json.loads(text) for name, text in make_contracts(json_output_types()).items()}
+    keys = {
+        name: sorted({*_iterate_keys(schemas[f"{name}.schema.json"], f"{name}.schema.json", schemas)})
+        for name in ("recipe", *DOCUMENTS, *json_output_types())
+    }
+    keys |= {
+        name: [key for key in found if "." not in key] for name, found in keys.items() if name in json_output_types()
+    }
+    recipe = keys.pop("recipe")
+    return {
+        "python": [*_iterate_python()],
+        "commands": [line for name, command in cli.commands.items() for line in _iterate_options(name, command)],
+        "recipe": recipe + [f"{key} = {name}" for key, name in EARLIER_KEYS.items()],
+        "columns": [
+            line for table in _TABLES for column in table.columns for line in _describe_column(table.name, column)
+        ] + [f"{earlier} = {name}" for earlier, name in EARLIER_COLUMNS.items()],
+        "documents": [f"{name}: {key}" for name, found in sorted(keys.items()) for key in found],
+    }  # fmt: skip
+
+
+def find_lost_names(before: Mapping[str, list[str]], now: Mapping[str, list[str]]) -> str:
+    """Return the message on names that were stable and are gone; empty where none is."""
+    lost = [f"  {section}: {name}" for section, names in before.items() for name in names if name not in now[section]]
+    return _LOST.format(names="\n".join(lost)) if lost else ""
+
+
+def _iterate_python() -> Iterator[str]:
+    for name in tcpipe.__all__:
+        yield name
+        if inspect.isroutine(function := getattr(tcpipe, name)):
+            parameters = inspect.signature(function).parameters.values()
+            yield from (f"{name}({of.name}{'' if of.default is of.empty else '='})" for of in parameters)
+    for cls in _RESULTS:
+        fields = getattr(cls, "__dataclass_fields__", {})
+        yield from (f"{cls.__name__}.{name}" for name in sorted({*dir(cls), *fields}) if not name.startswith("_"))
+    for name, cls in sorted(vars(tcpipe.errors).items()):
+        if inspect.isclass(cls) and issubclass(cls, tcpipe.errors.TcpipeError):
+            yield f"errors.{name}({cls.__base__.__name__}): exit code {cls.exit_code}"
+
+
+def _iterate_options(name: str, command: click.Command) -> Iterator[str]:
+    yield name
+    for parameter in command.params:
+        flags = [*parameter.opts, *parameter.secondary_opts]
+        if isinstance(parameter, RenamedOption):
+            flags.append(parameter.earlier)
+        choices = [*parameter.type.choices] if isinstance(parameter.type, click.Choice) else []
+        choices += [earlier for earlier, choice in EARLIER_CHOICES.items() if choice in choices]
+        for flag in (
+            flags if isinstance(parameter, click.Option) else [str(parameter.make_metavar(click.Context(command)))]
+        ):
+            yield f"{name} {flag}"
+            yield from (f"{name} {flag} {choice}" for choice in choices)
+
+
+def _describe_column(table: str, column: Any) -> Iterator[str]:
+    unit = f" [{column.unit}]" if column.unit else ""
+    yield f"{table}.{column.name}: {column.dtype}{unit}"
+    for bit in column.flags or ():
+        yield f"{table}.{column.name}: bit {int(bit)} {str(bit.name).lower()}"
+
+
+def _iterate_keys(
+    schema: Any, file: str, schemas: Mapping[str, Any], path: str = "", above: tuple[str, ...] = ()
+) -> Iterator[str]:
+    """Yield the path of each key of a document; ``*`` is any name, ``[]`` any item."""
+    if reference := schema.get("$ref"):
+        other, _, pointer = reference.partition("#/$defs/")
+        file = other or file
+        if pointer in above:
+            return
+        yield from _iterate_keys(schemas[file]["$defs"][pointer], file, schemas, path, (*above, pointer))
+    for key, value in schema.get("properties", {}).items():
+        yield f"{path}{key}"
+        yield from _iterate_keys(value, file, schemas, f"{path}{key}.", above)
+    for word, place in (("items", "[]."), ("additionalProperties", "*.")):
+        if isinstance(value := schema.get(word), dict):
+            yield from _iterate_keys(
+                value, file, schemas, f"{path.rstrip('.')}[]." if place == "[]." else f"{path}*.", above
+            )
+    for choice in schema.get("anyOf", ()):
+        yield from _iterate_keys(choice, file, schemas, path, above)
