@@ -260,7 +260,7 @@ def read_line(path: Path) -> NDArray[np.float64]:
     if more or line.geom_type != "LineString":
         name = "several lines or other parts" if more else repr(line.geom_type)
         raise PathError(f"{where}: geometry is {name}, expected one LineString")
-    lonlat = shapely.get_coordinates(line)
+    lonlat: NDArray[np.float64] = shapely.get_coordinates(line)
     if (lonlat == lonlat[0]).all():
         raise PathError(f"{where}: its line is one point; expected a path from one point to another")
     check_lonlat(where, lonlat)

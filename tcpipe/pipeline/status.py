@@ -234,7 +234,10 @@ def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
             Subject("column", measure),
             severity="note" if measure == _USED else None,
             names={"robot": robot, "unit": unit},
-            **shift,
+            before=shift["before"],
+            after=shift["after"],
+            earlier_count=shift["earlier_count"],
+            latest_count=shift["latest_count"],
         )
         for (robot, measure, unit), shift in found
     )

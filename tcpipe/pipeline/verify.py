@@ -93,7 +93,7 @@ def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str,
     card: DatasetCard | None = None
     with suppress(TcpipeError):  # a problem that is found again
         card = parse_card(found.data, found.place.where(CARD), proved=False) if found.name == CARD else None
-    redaction = card and card.redaction
+    redaction = None if card is None else card.redaction
     notes = () if redaction is None else ("It is redacted.", *redaction.lines())
     return _KINDS[found.name], _verify_directory(found, str(path)), notes
 
