@@ -5,6 +5,7 @@
     dataset.json  croissant.json  README.md  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
     drive-next.geojson                                       where to drive for what is thin
+    excluded.csv                                             samples that a user excluded, and why
     report-patches/                                          pictures of all patches, after `tcpipe report --patches`
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
     data/<split>-00000-of-00001.parquet                      --format parquet: the same layers, a row a sample
@@ -12,6 +13,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -53,6 +55,7 @@ OVERVIEW = "overview.png"
 RELIEF = "relief.png"
 CLASSES = "classes.png"
 DRIVE_NEXT = "drive-next.geojson"
+EXCLUDED = "excluded.csv"
 
 CHUNK_ROWS = 256
 """Patches that are decoded together."""
@@ -460,3 +463,38 @@ def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDAr
         rows = np.concatenate([np.flatnonzero(splits == name) for name in SPLITS])
         places[rows] = np.arange(len(rows))
     return places
+
+
+_ID_COLUMNS = ("sample_id", "segment_id")
+
+
+def read_sample_ids(path: Path) -> list[str]:
+    """Return the ids of a list, each once, in its order: the column sample_id or segment_id of a CSV file, or the lines of a text.
+
+    `DatasetError` if it cannot be read, has other columns or no id.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        separator = next((mark for mark in ";\t" if lines and mark in lines[0]), ",")
+        rows = list(csv.reader(lines, delimiter=separator))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DatasetError(f"{path}: the list of sample ids cannot be read ({error})") from None
+    header = [name.strip() for name in rows[0]] if rows else []
+    column = next((header.index(name) for name in _ID_COLUMNS if name in header), None)
+    if column is None and len(header) > 1:
+        raise DatasetError(f"{path}: its columns are {', '.join(header)}; expected {' or '.join(_ID_COLUMNS)}")
+    texts = lines if column is None else [row[column] for row in rows[1:] if len(row) > column]
+    ids = list(dict.fromkeys(text.strip() for text in texts if text.strip()))
+    if not ids:
+        raise DatasetError(f"{path}: contains no sample id; expected a column sample_id, or one id a line")
+    return ids
+
+
+def read_exclusion_reason(directory: Path, sample_id: str) -> str | None:
+    """Return by which list and why a sample was excluded from a dataset; None if it was not."""
+    path = directory / EXCLUDED
+    if not path.is_file():
+        return None
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["sample_id"] == sample_id]
+    return f"{rows[0]['list']}: {rows[0]['reason']}" if rows else None

@@ -272,7 +272,7 @@ class MapPlan:
 
     def __str__(self) -> str:
         """Return the rasters, their licence and what is to be read, as plain lines."""
-        read = sum(of.to_read_bytes for of in self.origins) / 1e6
+        read = sum(origin.to_read_bytes for origin in self.origins) / 1e6
         return clean_lines((*origin_lines(self.origins), f"{read:.2f} MB to read, less what is in the cache"))
 
 
@@ -323,7 +323,7 @@ def fetch_open_data(
                         directory / f"{len(origins):04d}-{re.sub('[^A-Za-z0-9_.-]', '_', item.id)[:80]}.tif"
                     )
                     window.copy(files[layer][-1])
-        if layer not in {of.layer for of in origins}:
+        if layer not in {origin.layer for origin in origins}:
             raise MapError(
                 f"{collection}: no raster has a pixel around the tracks, but the catalogue says {len(items)} do"
             )

@@ -295,6 +295,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
             for grid in card.maps
         ),
         *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs),
+        *(("excluded", str(of)) for of in card.exclusions),
         ("licence", card.licence or "none given"),
         *(("licence of open data", line) for line in card.attributions),
         ("creator", card.creator or "none given"),

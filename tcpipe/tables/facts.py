@@ -174,7 +174,7 @@ class FuseFacts:
     @property
     def longest(self) -> StretchFacts:
         """The longest section."""
-        return max(self.stretches, key=lambda of: of.end_ns - of.start_ns)
+        return max(self.stretches, key=lambda section: section.end_ns - section.start_ns)
 
 
 @dataclass(frozen=True, slots=True)

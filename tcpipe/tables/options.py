@@ -104,7 +104,7 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         return run(options(*args, **kwargs))
 
-    shown = {of.name: of.metadata.get("option", Option()).about for of in fields(options)}  # type: ignore[arg-type]
+    shown = {entry.name: entry.metadata.get("option", Option()).about for entry in fields(options)}  # type: ignore[arg-type]
     lines = [f"{name} : {about}" for name, about in shown.items() if about]
     more = f"`{getattr(options, '__module__', '')}` describes each of them."
     call.__name__ = call.__qualname__ = run.__name__.removeprefix("run_")

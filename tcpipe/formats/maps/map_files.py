@@ -125,12 +125,12 @@ class MapFile:
     def select(self, layers: Collection[str]) -> MapFile:
         """Return the map with these of its layers alone."""
         kept = {name: layer for name, layer in self.layers.items() if name in layers}
-        return replace(self, layers=kept, banded={name: of for name, of in self.banded.items() if name in layers})
+        return replace(self, layers=kept, banded={name: bands for name, bands in self.banded.items() if name in layers})
 
     @property
     def all_layers(self) -> dict[str, Layer]:
         """All layers, those of several bands last."""
-        return {**self.layers, **{name: of.layer for name, of in self.banded.items()}}
+        return {**self.layers, **{name: bands.layer for name, bands in self.banded.items()}}
 
     def summary(self) -> MapSummary:
         """Return what the map is as a whole."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -12,24 +14,101 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import KeptSplit, SplitResult
+from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.dataset_card import Exclusion, KeptSplit, SplitResult
+from tcpipe.formats.dataset_files import read_sample_ids
 from tcpipe.formats.geojson import PolygonGeometry
+from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.formats.parquet import take_rows
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
-from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits, hash_ranks
+from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, SPLITS, Assignment, assign_splits, hash_ranks
 from tcpipe.splits.audit import audit_leakage
 from tcpipe.splits.regions import Regions, project_regions
 from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import to_integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.target_grid import MapGrid
 
 _ROWS = 1 << 16
 """Rows whose ids are in memory together."""
+_NAMED_IDS = 3
+"""So many ids that match nothing are named in a finding."""
 _MARGIN_DEG = 0.05
 """Regions are cut this far around the samples (3 km or more below 60° latitude)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExcludedIds:
+    """A list of samples that a user excludes: the file's name and checksum, why, and the ids."""
+
+    name: str
+    checksum: Checksum
+    reason: str
+    ids: tuple[str, ...]
+
+
+def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Sequence[str]) -> tuple[ExcludedIds, ...]:
+    """Return the lists of samples to exclude; `UsageError` unless each has a reason, `DatasetError` if one cannot be read."""
+    paths = [Path(of) for of in ([files] if isinstance(files, str | Path) else files)]
+    texts = [text.strip() for text in ([reasons] if isinstance(reasons, str) else reasons)]
+    if len(texts) != len(paths) or not all(texts):
+        raise UsageError(
+            f"--exclude: {len(paths)} lists of samples and {len([text for text in texts if text])} reasons; "
+            "give each list its --reason TEXT, in the same order"
+        )
+    return tuple(
+        ExcludedIds(path.name, compute_checksum(path), text, tuple(read_sample_ids(path)))
+        for path, text in zip(paths, texts, strict=True)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ExcludedSamples:
+    """What lists exclude: the number of its list for each of N samples (-1: none), the lists for the card, and findings."""
+
+    number: NDArray[np.int64]
+    lists: tuple[Exclusion, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """Which samples are excluded, shape (N,)."""
+        return self.number >= 0
+
+    def table(self, ids: pa.ChunkedArray) -> pa.Table:
+        """Return id, list and reason of the excluded ones of N samples, by id."""
+        found = self.number[self.mask]
+        columns = [[getattr(self.lists[number], name) for number in found] for name in ("name", "reason")]
+        table = pa.table([ids.filter(pa.array(self.mask)), *map(pa.array, columns)], ["sample_id", "list", "reason"])
+        return table.sort_by("sample_id")
+
+
+def find_excluded(
+    lists: Sequence[ExcludedIds], segment_ids: pa.ChunkedArray, kept: NDArray[np.int64]
+) -> ExcludedSamples:
+    """Return which samples the lists exclude; ``kept`` are the rows of ``segment_ids`` that are samples, (N,)."""
+    number, told, findings = np.full(len(kept), -1), list[Exclusion](), list[Finding]()
+    for at, of in enumerate(lists):
+        ids = pa.array(of.ids, pa.string())
+        listed = pc.is_in(segment_ids, value_set=ids).to_numpy()[kept] & (number < 0)
+        number[listed] = at
+        told.append(Exclusion(of.name, of.checksum, of.reason, len(of.ids), int(listed.sum())))
+        missing = ids.filter(pc.invert(pc.is_in(ids, value_set=segment_ids.combine_chunks())))
+        if len(missing):
+            names = {"example": ", ".join(missing[:_NAMED_IDS].to_pylist())}
+            subject = Subject("file", of.name)
+            findings.append(
+                make_finding(
+                    "exclusion-unmatched",
+                    subject,
+                    names=names,
+                    unmatched_count=len(missing),
+                    listed_count=len(ids),
+                )
+            )
+    return ExcludedSamples(number, tuple(told), tuple(findings))
 
 
 def draw_splits(
@@ -39,11 +118,13 @@ def draw_splits(
     regions: Regions | None,
     recipe: Recipe,
     *,
+    excluded: NDArray[np.bool_],
     earlier: pa.Table | None = None,
     tags: Mapping[str, str] | None = None,
 ) -> tuple[Assignment, SplitResult]:
     """Assign every patch of ``sampled`` to a split by its whole footprint, and audit the result.
 
+    ``excluded`` samples, (N,), take part in the draw, so that all others have the split and fold that they would have without exclusion.
     ``regions`` are in WGS84 lon/lat; None: everything is train and test. ``earlier`` has ``sample_id``, ``split`` and ``fold`` of a dataset
     whose samples keep their split; ``tags`` the holdout's tag by run. `DatasetError` if no footprint lies inside the region.
     """
@@ -76,6 +157,9 @@ def draw_splits(
     del ranks
     if regions is not None and not assigned.is_in("train", "test").any():
         raise DatasetError(_describe_nothing_inside(regions, sampled.footprint_lonlat_deg, assigned))
+    assigned = assigned.exclude(excluded)
+    if excluded.any() and not assigned.is_in(*SPLITS).any():
+        raise DatasetError(f"the lists of excluded samples (--exclude) name all {len(rows)} samples; shorten them")
     held = {name: assigned.is_in(name) for name in ("test", "unseen")}
     audit = audit_leakage(assigned.is_in("train"), held, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
     counts = None
