@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,7 +195,7 @@ def _read_geometry(geometry: Json) -> NDArray[np.object_]:
     try:
         shape = None if geometry is None else shapely.from_geojson(json.dumps(geometry))
     except shapely.GEOSException as error:
-        reason = re.sub(r".*(?:: |\] )(.+?)'?", r"\1", str(error))
+        reason = str(error).partition(": ")[2].rpartition("] ")[2].rstrip("'")
         raise ValueError(
             f"its geometry cannot be read ({reason}); expected [lon, lat] positions, and closed rings"
         ) from None

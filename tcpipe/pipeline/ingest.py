@@ -39,7 +39,7 @@ from tcpipe.pipeline.calls import (
     stored_bytes,
 )
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_queue import Item, LogQueue, hold_claims
+from tcpipe.pipeline.log_queue import Item, LogQueue, hold_claims, make_tasks
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -49,7 +49,7 @@ from tcpipe.pipeline.log_sources import (
     select_shard,
 )
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, make_tasks
+from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.recipe import TimeWindow
 from tcpipe.store import Store, open_store

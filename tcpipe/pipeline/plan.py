@@ -19,8 +19,7 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
-from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, make_definitions_key, recall_hash
-from tcpipe.pipeline.options import IngestOptions
+from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding, Verdict, select_problems
@@ -62,19 +61,6 @@ class IngestTask:
         return digest(
             {**how, "content": self.source.sha256 or self.source.files_digest, "message_definitions": self.definitions}
         )[:32]
-
-
-def make_tasks(
-    sources: Iterable[LogSource], options: IngestOptions, root: Path | str, recipe: Recipe
-) -> list[IngestTask]:
-    """Return the task of each log; on a cluster, whose workers are elsewhere, with absolute paths."""
-    definitions = None if options.message_definitions is None else Path(options.message_definitions)
-    if options.cluster is not None:
-        root = root.absolute() if isinstance(root, Path) else root
-        definitions = definitions and definitions.absolute()
-    robot, tags = options.robot or recipe.robot, dict(options.tags or {})
-    how = (root, recipe, robot, tags, options.force, definitions, make_definitions_key(definitions))
-    return [IngestTask(source, *how, options.retry_failed, options.min_age_s) for source in sources]
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,9 +32,10 @@ from tcpipe.pipeline.calls import (
     is_below,
     list_begun_calls,
 )
+from tcpipe.pipeline.log_queue import make_tasks
 from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, LogState, Step, make_tasks, plan
+from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.robust import estimate_robust_std
 from tcpipe.store import Store, open_store
