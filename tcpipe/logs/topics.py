@@ -62,13 +62,8 @@ class Topic:
 class Damage:
     """A damaged place of a log, and what it cost where that is known.
 
-    Attributes
-    ----------
-    cause : code in the catalogue of findings.
-    file : the file; of a directory its name and that of the file.
-    offset : byte of the file.
-    places : how many there are, where they are counted together.
-    reason : what the template of the cause needs beside numbers.
+    ``cause`` is a code in the catalogue of findings, ``file`` of a directory its name and that of the file, ``places`` how many are counted
+    together, ``reason`` what the template of the cause needs beside numbers.
     """
 
     cause: str

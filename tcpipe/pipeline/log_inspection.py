@@ -114,10 +114,8 @@ def inspect_log(
 ) -> InspectedLog:
     """Return what a log holds.
 
-    Parameters
-    ----------
-    full : read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
-    reads_roles : read all messages of the used topics for the proposed recipe, not the first ones.
+    With ``full`` every message is read: counts, gaps, stamps, clock steps and damage; with ``reads_roles`` those of the used topics, for
+    the proposed recipe.
     """
     known = load_profiles(recipe)
     config = find_read_config(recipe, log.topics)

@@ -242,6 +242,8 @@ def _draw_track(axes: tuple[str, str], xy_m: Floats) -> Plot:
     )
     figure = plot.figure
     corners = {"xs": [[low[0], high[0]]], "ys": [[low[1], high[1]]], "colour": ["#00000000"]}
+    none = {"xs": list[list[float]](), "ys": list[list[float]](), "colour": list[str]()}
+    figure.multi_line("xs", "ys", color="colour", line_width=14, line_alpha=0.5, source=none, name="findings")
     track = figure.multi_line("xs", "ys", color="colour", line_width=3, source=corners, name="track")
     ends = {end: list[float]() for end in ("x0", "y0", "x1", "y1", "colour")}
     figure.segment("x0", "y0", "x1", "y1", color="colour", line_width=6, line_cap="butt", source=ends, name="segments")

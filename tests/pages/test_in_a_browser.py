@@ -201,18 +201,18 @@ def store_page(request, chromium, dataset):
 
 def test_the_store_s_page_fits_sorts_filters_and_leads_to_runs(store_page):
     fits_and_can_be_read_by_everyone(store_page)
-    first = store_page.locator("#s1 td a").first
+    first = store_page.locator("#s2 td a").first
     assert first.inner_text() == "south"
-    store_page.locator("#s1 th button").first.focus()
+    store_page.locator("#s2 th button").first.focus()
     store_page.keyboard.press("Enter")
     assert first.inner_text() == "north"
     store_page.fill("#find", "sou")
-    assert store_page.locator("#s1 td a").all_inner_texts() == ["south"]
+    assert store_page.locator("#s2 td a").all_inner_texts() == ["south"]
     chosen = "Bokeh.documents[0].get_model_by_name('used').data_source.selected"
     assert store_page.evaluate(f"{chosen}.indices") == [0]
     store_page.click("#clear")
     store_page.evaluate(f"{chosen}.indices = [1]")
-    assert store_page.locator("#s1 td a").all_inner_texts() == ["north"]
+    assert store_page.locator("#s2 td a").all_inner_texts() == ["north"]
     assert first.get_attribute("href").endswith("/report.html")
 
 

@@ -6,8 +6,7 @@ field of all of them is a strided view. Only what a walk cannot do goes message 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
 from tcpipe.logs.wire_cursors import Dialect, LayoutError, RaggedError, WalkResult, find_dialect, walk
 from tcpipe.logs.wire_types import (
     Record,
-    find_field_units,
     iterate_flat_fields,
 )
 from tcpipe.tables.arrays import number_column
@@ -51,26 +49,17 @@ _Gathered = list[tuple[_Int64, NDArray[np.uint8], _Int64]]
 def make_arrow_schema(message: Record) -> pa.Schema:
     """Return the schema of a topic's table: both times, then the message's fields by dotted name.
 
-    The metadata of a field says its ``unit`` where that is known; of an array of messages, ``units`` of their fields as JSON.
     A field of the message that is called like one of the times gets ``_`` behind its name.
     """
-    units = find_field_units(message)
-    fields = [pa.field(name, pa.int64(), metadata={"unit": "ns"}) for name in (LOG_TIME, PUBLISH_TIME)]
+    fields = [pa.field(name, pa.int64()) for name in (LOG_TIME, PUBLISH_TIME)]
     taken = {LOG_TIME, PUBLISH_TIME}
     for name, of in iterate_flat_fields(message):
         column = name
         while column in taken:
             column += "_"
         taken.add(column)
-        fields.append(pa.field(column, find_arrow_type(of), metadata=_make_unit_metadata(name, units)))
+        fields.append(pa.field(column, find_arrow_type(of)))
     return pa.schema(fields)
-
-
-def _make_unit_metadata(name: str, units: Mapping[str, str]) -> dict[str, str] | None:
-    if name in units:
-        return {"unit": units[name]}
-    inner = {path.removeprefix(f"{name}."): unit for path, unit in units.items() if path.startswith(f"{name}.")}
-    return {"units": json.dumps(inner)} if inner else None
 
 
 class TopicTable:

@@ -64,15 +64,6 @@ def find_autopilot(path: Path) -> AutopilotKind | None:
     return next((kind for start, kind in _AUTOPILOTS.items() if magic.startswith(start)), None)
 
 
-def find_container(path: Path, fetched: FetchedFile | None) -> str:
-    """Return ``bag``, ``mcap`` or ``rosbag2``."""
-    name = path.name.removesuffix(".zstd")
-    magic = _read_magic(path, fetched)
-    if magic.startswith(bag_records.MAGIC):
-        return "bag"
-    return "mcap" if magic.startswith(mcap_records.MAGIC) or name.endswith(".mcap") else "rosbag2"
-
-
 def _read_magic(path: Path, fetched: FetchedFile | None) -> bytes:
     if fetched is not None and not fetched.is_whole:
         return fetched.read(0, 16)

@@ -18,7 +18,7 @@ import pyarrow as pa
 from tcpipe.errors import LogError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.arrow_columns import TopicTable
-from tcpipe.formats.logs.log_container import WANTED, find_autopilot, find_container, open_part
+from tcpipe.formats.logs.log_container import WANTED, find_autopilot, open_part
 from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
@@ -53,13 +53,10 @@ _FILE_SYSTEMS_OWN = ("lost+found",)
 
 
 def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
-    """Open a log, whatever its container; `LogError` says what was found where the path is no log.
+    """Open a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; `LogError` says what else it is.
 
-    Parameters
-    ----------
-    path : a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``): of an .mcap
-        or .bag with an index only what is asked for is fetched, anything else is copied until the log is closed.
-    message_definitions : a directory of .msg files for types that the log does not define.
+    Or the URL of one (``s3://…``): of an .mcap or .bag with an index only what is asked for is fetched, anything else is copied until the
+    log is closed. ``message_definitions``: a directory of .msg files for types that the log does not define.
     """
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}
@@ -73,8 +70,8 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
         if path.is_dir():
             opened = _open_directory(path, stack, fetched)
         else:
-            part, kind = open_part(path, path.name, stack, fetched.get(path)), find_container(path, fetched.get(path))
-            opened = _OpenFiles(kind, Rosbag2Files((path,)), (part,), fetched)
+            part = open_part(path, path.name, stack, fetched.get(path))
+            opened = _OpenFiles(part.container, Rosbag2Files((path,)), (part,), fetched)
         return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
 
 
@@ -216,11 +213,6 @@ class Log(OpenLog):
         return [[stat.st_size, stat.st_mtime_ns] for stat in found]
 
     @property
-    def fetched_bytes(self) -> int | None:
-        """How much of a log in object storage was fetched so far, other than what was copied; None of one on this machine."""
-        return sum(file.fetched_bytes for file in self._fetched) if self._fetched else None
-
-    @property
     def outline(self) -> str:
         """A hash (hex) of the sizes and indexes of all files, the same wherever they lie; "" where a file has no index."""
         outlines = [part.outline for part in self._parts]
@@ -266,13 +258,13 @@ class Log(OpenLog):
             raise LogError(f"{self.path}: topic {topic} cannot be read: {self._message_type(topic)}")
         return tables[topic]
 
-    def tables(self, topics: Iterable[str], *, threads: int = 1) -> dict[str, pa.Table]:
-        """Return the tables of several topics, read in one pass; the result does not depend on ``threads``.
+    def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+        """Return the tables of several topics, read in one pass.
 
         A table has one row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
         A topic that cannot be decoded is missing and named in `findings`. `LogError`: a topic is not in the log.
         """
-        (tables,) = self.batches(topics, batch_bytes=None, threads=threads)
+        (tables,) = self.batches(topics, batch_bytes=None)
         return tables
 
     def first_rows(self, topics: Iterable[str]) -> dict[str, pa.Table]:
@@ -286,9 +278,7 @@ class Log(OpenLog):
                     break
         return found
 
-    def batches(
-        self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES, threads: int = 1
-    ) -> Iterator[dict[str, pa.Table]]:
+    def batches(self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES) -> Iterator[dict[str, pa.Table]]:
         """Yield the tables of several topics piece by piece, as `tables`, in memory that does not grow with the log.
 
         Each dict holds the next rows of some topics (those that hold most); the last one names every topic. Rows are in the order of
@@ -301,7 +291,7 @@ class Log(OpenLog):
         held, size = 0, self.size_bytes
         meter, messages = Meter("reading", size), sum(self.topics[name].message_count or 0 for name in collected)
         for index in range(len(self._parts)):
-            for topic_table, block in self._blocks(index, collected, threads):
+            for topic_table, block in self._blocks(index, collected):
                 meter.add(size * len(block.offsets) / max(messages, 1))
                 held -= topic_table.held_bytes
                 topic_table.add(block)
@@ -340,9 +330,7 @@ class Log(OpenLog):
                 )
         return {name: TopicTable(of, self.topics[name].encoding) for name, of in types.items()}
 
-    def _blocks(
-        self, index: int, collected: Mapping[str, TopicTable], threads: int
-    ) -> Iterator[tuple[TopicTable, MessageBlock]]:
+    def _blocks(self, index: int, collected: Mapping[str, TopicTable]) -> Iterator[tuple[TopicTable, MessageBlock]]:
         """Yield one file's blocks, each with its topic's table; channels that differ from their topic's type are set aside."""
         part, channels = self._parts[index], {}
         for number, channel in part.channels.items():
@@ -353,7 +341,7 @@ class Log(OpenLog):
                     reason = f"the topic changes its type to {channel.type_name} ({channel.encoding})"
                     self._note_undecoded(part.name, channel.name, channel.message_count, reason)
         if channels:
-            for block in decompress_blocks(part, frozenset(channels), threads=threads):
+            for block in decompress_blocks(part, frozenset(channels)):
                 later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
                 yield channels[block.channel], later
 
@@ -374,15 +362,21 @@ class Log(OpenLog):
         self._damage.append(Damage("messages-not-decoded", file, topic=topic, messages_lost=count, reason=reason))
 
     def _resolved(self, channel: Topic) -> MessageType | DefinitionError:
-        try:
-            return self._types.message_type(
-                channel.type_name,
-                definition=channel.definition,
-                schema_encoding=channel.schema_encoding,
-                ros1=channel.encoding == "ros1",
-            )
-        except DefinitionError as error:
-            return error
+        return self._types.find_type(
+            channel.type_name,
+            definition=channel.definition,
+            schema_encoding=channel.schema_encoding,
+            ros1=channel.encoding == "ros1",
+        )
+
+    def _find_problem(self, channel: Topic) -> str | None:
+        """Return why messages cannot be decoded; a definition that cannot be used is found when they are read."""
+        if channel.encoding not in ("cdr", "ros1"):
+            return f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
+        if not channel.type_name:
+            return "the log does not state the type of its messages"
+        found = None if channel.definition.strip() else self._resolved(channel)
+        return str(found) if isinstance(found, DefinitionError) else None
 
     def _note_losses(self, name: str, topic_table: TopicTable, rows: int) -> None:
         missing = (self.topics[name].message_count or 0) - rows - topic_table.undecodable
@@ -401,7 +395,7 @@ class Log(OpenLog):
         topics: dict[str, Topic] = {}
         channels = [channel for part in self._parts for channel in part.channels.values()]
         for channel in sorted(channels, key=lambda c: (c.name, -(c.message_count or 0), not c.definition)):
-            topic = replace(channel, problem=_find_problem(channel, self._types))
+            topic = replace(channel, problem=self._find_problem(channel))
             first = self._channel_of.setdefault(channel.name, channel)
             if channel is first:
                 topics[channel.name] = topic
@@ -410,18 +404,6 @@ class Log(OpenLog):
             elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
                 topics[channel.name] = topics[channel.name].joined(topic)
         return topics
-
-
-def _find_problem(channel: Topic, types: TypeLibrary) -> str | None:
-    """Return why messages cannot be decoded; a definition that cannot be used is found when they are read."""
-    if channel.encoding not in ("cdr", "ros1"):
-        return f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
-    if not channel.type_name:
-        return "the log does not state the type of its messages"
-    if channel.definition.strip() or types.knows(channel.type_name):
-        return None
-    where = "the log contains no definition of it, and none is bundled"
-    return f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
 
 
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:

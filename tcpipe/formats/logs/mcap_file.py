@@ -10,28 +10,22 @@ import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from tcpipe.errors import LogError
 from tcpipe.formats.logs.chunk_reading import (
     MAX_PLANNED_BYTES,
+    ChunkedPart,
     Entries,
     Excerpt,
     Messages,
-    copy_pieces,
-    read_chunk_blocks,
     sort_by_place,
 )
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
-    Bounds,
-    ByteSource,
     DamageError,
-    FetchedFile,
     Int64Array,
     MessageBlock,
     decompress,
@@ -82,29 +76,16 @@ class _Tally:
     end_ns: int | None = None
 
 
-class McapPart:
+class McapPart(ChunkedPart[Chunk]):
     """One .mcap file, open for reading."""
 
-    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
-        self.name = name
-        self.damage: list[Damage] = []
-        self._bytes = ByteSource(path, fetched)
+    container = "mcap"
+
+    def _open(self) -> dict[int, Topic]:
         self._tallies: dict[int, _Tally] = {}
         self._untimed = 0
         self._complete = False
         self._without_crc: set[int] = set()
-        self._bounds = Bounds(path, self._bytes.size)
-        try:
-            self._read_index()
-            self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
-            self._note_twins()
-        except LogError:
-            self.close()
-            raise
-        self.channels = {number: self._topic(number) for number in sorted(self._contents.channels)}
-
-    def _read_index(self) -> None:
-        """Read the summary, or, where it cannot be used, walk the file."""
         try:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
                 self._note("record-damaged", 0, messages_lost=0)
@@ -122,10 +103,9 @@ class McapPart:
             self._complete = True
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
             self._count_messages()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._bytes.close()
+        self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
+        self._note_twins()
+        return {number: self._topic(number) for number in sorted(self._contents.channels)}
 
     @property
     def outline(self) -> str:
@@ -137,14 +117,11 @@ class McapPart:
         """Whether chunks were read that carry no CRC."""
         return bool(self._without_crc)
 
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels."""
         if not self._complete:
             self._fill_gaps()
-        if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
-            self._bytes.skips()
-
-        yield from read_chunk_blocks(self, wanted, threads=threads)
+        yield from super().blocks(wanted)
         self._note_odd_ones_without_crc()
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
@@ -154,6 +131,8 @@ class McapPart:
             if chunk.index is None or not wanted.isdisjoint(chunk.index):
                 found.append((base, chunk))
             base += min(chunk.size, MAX_CHUNK_BYTES)
+        if len(found) < len(self._contents.chunks):
+            self._bytes.skips()
         return found
 
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
@@ -170,20 +149,20 @@ class McapPart:
         self._bounds.walk(chunk.offset, len(records))
         return records, end
 
-    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
+    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; where these end too early, or are none, that is noted."""
         records, end = self._records(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
         if lost := every - len(messages.offset):
-            noted.append(Damage("time-invalid", self.name, chunk.offset, messages_lost=lost))
+            self._note("time-invalid", chunk.offset, messages_lost=lost)
         if end < len(data) and not chunk.cut:
-            noted.append(Damage("record-damaged", self.name, chunk.offset, bytes_lost=len(data) - end))
+            self._note("record-damaged", chunk.offset, bytes_lost=len(data) - end)
         unknown = [n for n in np.unique(messages.channel).tolist() if n not in self._contents.channels]
         counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
         if unknown and not counted:
             lost = int(np.isin(messages.channel, unknown).sum())
-            noted.append(Damage("channel-undeclared", self.name, chunk.offset, messages_lost=lost))
+            self._note("channel-undeclared", chunk.offset, messages_lost=lost)
         return messages.at(np.isin(messages.channel, sorted(wanted)))
 
     def is_proved(self, chunk: Chunk) -> bool:
@@ -194,13 +173,12 @@ class McapPart:
         """Tell whether a broken index is worth a word: nothing else proves what the chunk holds."""
         return chunk.index is not None and not chunk.cut and not self._crc(chunk)
 
-    def copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
-        """Copy pieces (start, stop, place) of a chunk; what need not be read as a whole, to check or decompress it, is not."""
+    def find_plain_data(self, chunk: Chunk) -> int | None:
+        """Return where the records of a chunk begin that is neither compressed nor has a CRC."""
         if chunk.compression or self._crc(chunk):
-            copy_pieces(self.load(chunk, once=True), places, to)
-            return
+            return None
         self._without_crc.add(chunk.offset)
-        self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in places])
+        return chunk.data_offset
 
     def _crc(self, chunk: Chunk) -> int:
         """Return the CRC of a chunk's records; 0 where there is none."""
@@ -231,29 +209,21 @@ class McapPart:
         self._bytes.expect([(chunk.offset, RECORD_HEAD + CHUNK_HEAD) for chunk in chunks])
         return any(self._crc(chunk) for chunk in chunks)
 
-    def load(self, chunk: Chunk, *, once: bool = False) -> memoryview:
-        """Return the chunk's records, its CRC checked; of a chunk that the file's end cuts, what can still be had.
-
-        With ``once`` they may be overwritten when this thread reads again.
-        """
+    def load(self, chunk: Chunk) -> memoryview:
+        """Return the chunk's records, its CRC checked."""
         crc = self._crc(chunk)
         if not crc:
             self._without_crc.add(chunk.offset)
+        data, size = self._bytes.read_once(chunk.data_offset, chunk.data_bytes), chunk.uncompressed_bytes
         if chunk.cut:
-            return self._load_cut(chunk, self._bytes.read(chunk.data_offset, chunk.data_bytes))
+            kept = decompress_prefix(chunk.compression, data, size) if chunk.compression else data
+            self._note("file-cut", chunk.offset, bytes_lost=size - len(kept))
+            return kept
         if chunk.compression:
-            data = self._bytes.read_once(chunk.data_offset, chunk.data_bytes)
-            data = decompress(chunk.compression, data, chunk.uncompressed_bytes, checked=bool(crc))
-        else:
-            data = (self._bytes.read_once if once else self._bytes.read)(chunk.data_offset, chunk.data_bytes)
+            data = decompress(chunk.compression, data, size, checked=bool(crc))
         if crc and crc32(data) != crc:
             raise DamageError("chunk-damaged")
         return data
-
-    def _load_cut(self, chunk: Chunk, data: memoryview) -> memoryview:
-        kept = decompress_prefix(chunk.compression, data, chunk.uncompressed_bytes) if chunk.compression else data
-        self._note("file-cut", chunk.offset, bytes_lost=chunk.uncompressed_bytes - len(kept))
-        return kept
 
     def entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of several chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
@@ -523,19 +493,6 @@ class McapPart:
         for channel, of in group_by_key(channels):
             stamps = gather_integers(data, messages[of] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
-
-    def _note(
-        self,
-        cause: str,
-        offset: int,
-        *,
-        messages_lost: int | None = None,
-        bytes_lost: int | None = None,
-        reason: str = "",
-    ) -> None:
-        self.damage.append(
-            Damage(cause, self.name, offset, messages_lost=messages_lost, bytes_lost=bytes_lost, reason=reason)
-        )
 
     def lost(self, chunk: Chunk, error: DamageError) -> Damage:
         """Return the damage of a chunk that is lost as a whole, counted by the message index beside it."""

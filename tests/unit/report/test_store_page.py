@@ -92,8 +92,8 @@ def test_the_verdict_is_that_of_the_current_runs_with_findings_by_code(store):
     box = html.split('<section class="verdict"')[1].split("</section>")[0]
     assert '<span class="usable">position <b>usable</b></span>' in box
     assert '<span class="usable-with-care">time <b>usable with care</b></span>' in box
-    assert "2 of 3 runs: Most of the drive was commanded below" in box
-    assert "(command; 60 % to 70 %)" in box
+    assert "Most of the drive was commanded below" in box
+    assert "2 of 3 runs: command; 60 % to 70 %" in box
 
 
 def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
