@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import click
 
@@ -236,14 +236,14 @@ def print_result(result: object, *, as_json: bool) -> None:
         print_lines(result)
 
 
-def print_json(value: Any) -> None:
+def print_json(value: object) -> None:
     """Print one JSON object on stdout, with unprintable characters as JSON escapes."""
     from tcpipe.formats.json_files import to_json
 
     click.echo(_format_value(to_json(value)), nl=False)
 
 
-def print_json_line(value: Any) -> None:
+def print_json_line(value: object) -> None:
     """Print one JSON object on one line of stdout, as `print_json` does."""
     from tcpipe.formats.json_files import to_json_line
 
