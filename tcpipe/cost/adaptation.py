@@ -68,8 +68,8 @@ class Metres:
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        values: list[Any] = [getattr(self, of.name) for of in fields(self)]
-        return Metres(*(None if of is None else of[rows] for of in values))
+        values: dict[str, Any] = {of.name: getattr(self, of.name) for of in fields(self)}
+        return Metres(**{name: None if of is None else of[rows] for name, of in values.items()})
 
 
 @dataclass(frozen=True, slots=True)
