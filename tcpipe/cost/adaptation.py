@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from hashlib import sha256
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +67,8 @@ class Metres:
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        values: dict[str, Any] = {of.name: getattr(self, of.name) for of in fields(self)}
-        return Metres(**{name: None if of is None else of[rows] for name, of in values.items()})
+        known = [getattr(self, of.name)[rows] for of in fields(self)[:-1]]
+        return Metres(*known, None if self.stated_std is None else self.stated_std[rows])
 
 
 @dataclass(frozen=True, slots=True)
