@@ -164,7 +164,12 @@ def _inspect_index(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
         played = "transforms", "places the sensors"
     role, why = played or (None, cast.left_out.get(topic.name) or topic.problem)
     return InspectedTopic(
-        name=topic.name, type=topic.type_name, messages=topic.message_count, rate_hz=topic.rate_hz, role=role, why=why
+        name=topic.name,
+        type=topic.type_name,
+        messages=topic.message_count,
+        rate_hz=topic.rate_hz and round(topic.rate_hz, 2),
+        role=role,
+        why=why,
     )
 
 
@@ -219,7 +224,7 @@ def _find_slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, 
         choices = find_sources(
             topic.type_name, name, known.power_sources, platform=robot.platform, husky_power=recipe.read.husky_power
         )
-        rate_hz = topic.rate_hz
+        rate_hz = topic.rate_hz and round(topic.rate_hz, 2)
         if isinstance(choices, Finding) or rate_hz is None or not any(of.current or of.energy for of in choices[0]):
             continue  # a voltage alone may be slow
         averaged = {"auto": choices[0][0].averaged, "yes": True, "no": False}[recipe.read.power_averaged]
