@@ -50,7 +50,8 @@ class Topic:
     @property
     def rate_hz(self) -> float | None:
         """Messages a second."""
-        return (self.message_count - 1) / self.span_s if self.message_count is not None and self.span_s else None
+        span_s = self.span_s or 0.0
+        return (self.message_count - 1) / span_s if self.message_count is not None and span_s > 0.0 else None
 
     def joined(self, other: Topic) -> Topic:
         """Return this topic with the messages of ``other``, the same topic in another file."""
