@@ -95,8 +95,8 @@ def make_plot(
 def make_map_plot(
     *, alt: str, axes: tuple[str, str], height_px: float, tools: str = "pan,wheel_zoom,box_zoom,reset,save"
 ) -> Plot:
-    """Return an empty map, true to scale, of a height between 330 and 600 pixels."""
-    height = int(np.clip(height_px, 330, 600))
+    """Return an empty map, true to scale, of a height that leaves room on the first screen."""
+    height = int(np.clip(height_px, 330, 420))
     plot = make_plot("map", alt=alt, axes=axes, height_px=height, tools=tools, drag="pan", match_aspect=True)
     plot.figure.xgrid.visible = plot.figure.ygrid.visible = False
     plot.figure.axis.formatter.use_scientific = False
