@@ -2,16 +2,16 @@
 
 The trained model is the prior. With p what it predicts of the metres of the new run, and y what was measured there::
 
-    y = p + X b + e,   b ~ N(0, s² (t q)² (1 - r + r L)),   e ~ N(0, s² S R S)
+    y = p + X b + e,   b ~ N(0, s² q² (t² + f² L)),   e ~ N(0, s² S R S)
 
 The columns of X are in the unit of y: p itself (scale), and what a usual metre or second of the run costs times its length (offset),
 predicted duration (idle power), slope (payload; 10 % count as a metre) and turn (0.3 rad count as a metre). b is relative to them, and
-changes along the run: a share r of its variance is of the place, warmth or wear, whose correlation L falls over tens or hundreds of
-metres, so that what the known metres show counts less far away. Were only errors of metres allowed to fade, the same misfit would be a
-lasting property of the robot in most cases, because b reaches further. S are the spreads that the model states of a metre, R the
+has a part that lasts and one of the place, warmth or wear, whose correlation L falls over tens or hundreds of metres: what the known
+metres show of it counts less far away, and nothing on another way. Were only errors of metres allowed to fade, the same misfit would be
+taken for a lasting property of the robot, because b reaches further. S are the spreads that the model states of a metre, R the
 correlation of neighbours. s² has an inverse-gamma prior of mean about 1, so that all that is stated has Student's t (Gelman et al.,
-Bayesian Data Analysis, 2013, 14.2). How far the prior reaches, t, and how b changes are not known: all of a small grid are averaged, each
-with the evidence that the metres give it (ibid., 7.4). It is a Gaussian process (Rasmussen and Williams, 2006, 2.2).
+Bayesian Data Analysis, 2013, 14.2). How far both parts reach, t and f, and L are not known: all of a small grid are averaged, each with
+the evidence that the metres give it (ibid., 7.4). It is a Gaussian process (Rasmussen and Williams, 2006, 2.2).
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from hashlib import sha256
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +33,10 @@ Floats = NDArray[np.float64]
 
 _PRIOR = 0.05
 """q: standard deviation of a coefficient at the least reach, of what it multiplies."""
-_REACHES = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""t."""
-_FADES = ((0.0, 20.0), (0.5, 20.0), (0.5, 200.0), (0.9, 20.0), (0.9, 200.0))
-"""r, nothing, half and nearly all, and the distance over which L falls [m]."""
+_REACHES = (1.0, 4.0, 16.0)
+"""t and f, of which one may also be 0."""
+_FADES_M = (20.0, 200.0)
+"""Distances over which L falls."""
 _RISE_M, _TURN_RAD = 0.1, 0.3
 """What costs about as much as a metre."""
 _FREEDOM = 4.0
@@ -68,8 +70,9 @@ class Metres:
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        known = [getattr(self, of.name)[rows] for of in fields(self)[:-1]]
-        return Metres(*known, None if self.stated_std is None else self.stated_std[rows])
+        values = (getattr(self, of.name) for of in fields(self))
+        columns: list[Any] = [None if of is None else of[rows] for of in values]
+        return Metres(*columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,22 +115,23 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     gram, cross = design @ design.T, design @ design_there.T
     far_m, alone = np.abs(known.distance_m[:, None] - there.distance_m), (design_there**2).sum(axis=1)
     noise_sum, lasting = _sum_neighbours(spread_there, there, neighbour), float((design_there.sum(axis=0) ** 2).sum())
+    fading_sums = {fade_m: sum(_sum_fading(column, there, fade_m) for column in design_there.T) for fade_m in _FADES_M}
     freedom, evidences, values, variances, sums = _FREEDOM + len(residual), [], [], [], []
-    for share, fade_m in _FADES:
-        like, like_there = (1.0 - share + share * np.exp(-of_m / fade_m) for of_m in (apart_m, far_m))
-        fading = sum(_sum_fading(column, there, fade_m) for column in design_there.T)
-        for variance in (_PRIOR * np.array(_REACHES)) ** 2:
-            factor = cho_factor(noise + variance * gram * like, lower=True)
-            common = variance * cross * like_there
-            solved, shares = cho_solve(factor, residual), cho_solve(factor, common)
-            misfit = float(residual @ solved)
-            log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
-            evidences.append(-0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM)))
-            scale = (_FREEDOM + misfit) / freedom
-            values.append(there.predicted + common.T @ solved)
-            variances.append(scale * (spread_there**2 + variance * alone - np.einsum("ij,ij->j", common, shares)))
-            of_sum = noise_sum + variance * ((1.0 - share) * lasting + share * fading)
-            sums.append(scale * (of_sum - float(common.sum(axis=1) @ shares.sum(axis=1))))
+    grid = [(_FADES_M[0], reach, 0.0) for reach in _REACHES] + [*product(_FADES_M, (0.0, *_REACHES), _REACHES)]
+    for fade_m, reach, fading in grid:
+        lasts, fades = (_PRIOR * reach) ** 2, (_PRIOR * fading) ** 2
+        factor = cho_factor(noise + gram * (lasts + fades * np.exp(-apart_m / fade_m)), lower=True)
+        common = cross * (lasts + fades * np.exp(-far_m / fade_m))
+        solved, shares = cho_solve(factor, residual), cho_solve(factor, common)
+        misfit, log_det = float(residual @ solved), 2.0 * float(np.log(np.diag(factor[0])).sum())
+        evidences.append(-0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM)))
+        scale = (_FREEDOM + misfit) / freedom
+        values.append(there.predicted + common.T @ solved)
+        variances.append(scale * (spread_there**2 + (lasts + fades) * alone - np.einsum("ij,ij->j", common, shares)))
+        of_sum = (
+            noise_sum + lasts * lasting + fades * fading_sums[fade_m] - float(common.sum(axis=1) @ shares.sum(axis=1))
+        )
+        sums.append(scale * of_sum)
     weights = np.exp(np.array(evidences) - max(evidences))
     weights /= weights.sum()
     mean, variance = _mix(weights, np.array(values), np.array(variances))
