@@ -319,7 +319,7 @@ def test_a_network_takes_a_channel_for_each_band(datasets, tmp_path):
 def test_ground_unlike_that_of_training_in_a_layer_of_one_s_own_is_named(models):
     """A band far from all training samples, or a class that none had; the same patches as in training are inside."""
     model = load_model(models / "model-bands")
-    split = tcpipe.open_dataset(models / "zarr")["train"]
+    split = tcpipe.open_dataset(models / "zarr")["train"].with_channels("embedding")
     known, layer = model.card.training_range.layers["embedding"], model.card.layout.known["embedding"]
     patches = split.layers(np.arange(len(split)))["embedding"]
     inside = known.compute_distance(layer.compute_means(patches))
