@@ -12,12 +12,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntFlag
+from itertools import islice
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import BiasCorrection, fit_bias_correction
+from tcpipe.cost.prediction_errors import fit_bias_correction
 from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.errors import ModelError
@@ -121,14 +122,6 @@ class CostModel(Protocol):
         """Return power [W] and velocity [m/s], shape (N, 2), of tensors of shape (N, px, px, channels), and what is known beside them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Predicted:
-    """Power [W] and velocity [m/s] of N patches, shape (N,); NaN where the model was not asked or answered no velocity."""
-
-    power_watt: Floats
-    velocity_mps: Floats
-
-
 def _make_layout(model: CostModel) -> TensorLayout:
     return TensorLayout(model.channels, model.layers, model.patch_px)
 
@@ -159,34 +152,6 @@ def check_model(model: CostModel, source: MapReader) -> None:
         )
     if problems:
         raise ModelError(*problems)
-
-
-def predict_patches(
-    model: CostModel, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats | None = None
-) -> Predicted:
-    """Return what the model says of the patches that it is asked about, shape (N,); tensors are formed batch by batch.
-
-    ``turn_radpm`` is how far a metre of each turns; NaN, or nothing, is as usual, and so is the speed that is commanded.
-
-    Raises
-    ------
-    ModelError : it gives something else than power and velocity.
-    """
-    form = _make_layout(model)
-    pixels = {layer: patches.pixels[layer] for layer in form.layers}
-    out, unknown = np.full((asked.size, 2), np.nan), np.full(asked.size, np.nan)
-    turns = unknown if turn_radpm is None else turn_radpm
-    extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
-    chosen = np.flatnonzero(asked)
-    for rows in (chosen[first : first + form.batch_rows] for first in range(0, chosen.size, form.batch_rows)):
-        said = model.predict(form.form(pixels, rows), extra_features.take(rows))
-        if said.shape != (rows.size, 2):
-            raise ModelError(
-                f"{model.name}: gives {said.shape[-1]} numbers a patch, expected two: power and velocity; train it on both labels"
-            )
-        out[rows] = said
-    out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan
-    return Predicted(out[:, 0].copy(), out[:, 1].copy())
 
 
 LANE_M = 0.7
@@ -234,14 +199,7 @@ def count_reasons(bits: Bits) -> dict[str, int]:
 
 
 def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, source: MapReader) -> Bits:
-    """Return the reasons of each patch, shape (N,).
-
-    Parameters
-    ----------
-    patches : N sampled patches.
-    on_map : whether each lies wholly on the map, shape (N,).
-    model, source : who is to judge them, and the map that they are from.
-    """
+    """Return the reasons of each patch of a map, shape (N,); ``on_map`` says whether it lies wholly on it, shape (N,)."""
     bits = np.zeros(on_map.size, np.uint16)
     bits[patches.valid_fraction < 1.0] |= np.uint16(Reason.NODATA)
     ranges = {
@@ -316,57 +274,67 @@ def iterate_predictions(
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
     after another; without it all turn as usual.
     """
-    source = source.select({*PAPER_LAYERS, *_make_layout(model).layers})
-    centring, tiles = (
-        fit_bias_correction(model.residuals),
-        TilePool(choose_level(source, model.patch_m / model.patch_px)),
-    )
+    layout = _make_layout(model)
+    source = source.select({*PAPER_LAYERS, *layout.layers})
+    correction = fit_bias_correction(model.residuals)
+    tiles = TilePool(choose_level(source, model.patch_m / model.patch_px))
 
-    def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
+    def sample(frames: PatchFrames) -> tuple[Patches, NDArray[np.bool_]]:
         chord_m = np.full(len(frames.centre_xy_m), model.chord_m)
         on_map = count_corners_on(source.grid, compute_footprints(frames, model.patch_m)) == 4
         patch_m, patch_px = model.patch_m, model.patch_px
-        found = sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles)
-        return found, on_map, None if turn_radpm is None else turn_radpm[first : first + len(chord_m)]
+        return sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles), on_map
 
+    def judge(patches: Patches, on_map: NDArray[np.bool_], first: int) -> SegmentPredictions:
+        bits = find_reasons(patches, on_map, model, source)
+        asked = (bits & NO_COST == 0) & ask
+        turns = np.full(on_map.size, np.nan) if turn_radpm is None else turn_radpm[first : first + on_map.size]
+        said = _predict_patches(model, layout, patches, asked, turns)
+        power_watt, velocity_mps = correction.apply(said[:, 0], said[:, 1], patches.terrain_class)
+        bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
+        known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
+        horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0
+        middle = patches.pixels["height"][:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
+        return SegmentPredictions(
+            reasons=bits,
+            power_watt=power_watt,
+            velocity_mps=velocity_mps * horizontal,
+            terrain_class=patches.terrain_class,
+            slope_rad=np.where(known, patches.slope_rad, np.nan),
+            cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),
+            height_m=np.where(known, patches.height_min_m + middle, np.nan),
+        )
+
+    rest, first = iter(batches), 0
     with ThreadPoolExecutor(max_workers=1) as ahead:
-        waiting, first = None, 0
-        for frames in batches:
-            following, first = ahead.submit(sampled, frames, first), first + len(frames.centre_xy_m)
-            if waiting is not None:
-                yield _predict_batch(model, source, *waiting.result(), centring=centring, ask=ask)
-            waiting = following
-        if waiting is not None:
-            yield _predict_batch(model, source, *waiting.result(), centring=centring, ask=ask)
+        waiting = [ahead.submit(sample, frames) for frames in islice(rest, 1)]
+        while waiting:
+            patches, on_map = waiting.pop().result()
+            waiting = [ahead.submit(sample, frames) for frames in islice(rest, 1)]
+            yield judge(patches, on_map, first)
+            first += on_map.size
 
 
-def _predict_batch(
-    model: CostModel,
-    source: MapReader,
-    patches: Patches,
-    on_map: NDArray[np.bool_],
-    turn_radpm: Floats | None,
-    *,
-    centring: BiasCorrection,
-    ask: bool,
-) -> SegmentPredictions:
-    bits = find_reasons(patches, on_map, model, source)
-    asked = (bits & NO_COST == 0) & ask
-    said = predict_patches(model, patches, asked, turn_radpm)
-    power_watt, velocity_mps = centring.apply(said.power_watt, said.velocity_mps, patches.terrain_class)
-    bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
-    known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
-    horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0
-    middle = patches.pixels["height"][:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
-    return SegmentPredictions(
-        reasons=bits,
-        power_watt=power_watt,
-        velocity_mps=velocity_mps * horizontal,
-        terrain_class=patches.terrain_class,
-        slope_rad=np.where(known, patches.slope_rad, np.nan),
-        cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),
-        height_m=np.where(known, patches.height_min_m + middle, np.nan),
-    )
+def _predict_patches(
+    model: CostModel, layout: TensorLayout, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats
+) -> Floats:
+    """Return power and velocity of the patches that the model is asked about, shape (N, 2), else NaN; tensors are formed in batches.
+
+    ``turn_radpm`` is how far a metre of each turns; NaN is as usual, and so is the speed that is commanded.
+    """
+    pixels = {layer: patches.pixels[layer] for layer in layout.layers}
+    out, unknown = np.full((asked.size, 2), np.nan), np.full(asked.size, np.nan)
+    extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turn_radpm, unknown)
+    chosen = np.flatnonzero(asked)
+    for rows in (chosen[first : first + layout.batch_rows] for first in range(0, chosen.size, layout.batch_rows)):
+        said = model.predict(layout.form(pixels, rows), extra_features.take(rows))
+        if said.shape != (rows.size, 2):
+            raise ModelError(
+                f"{model.name}: gives {said.shape[-1]} numbers a patch, expected two: power and velocity; train it on both labels"
+            )
+        out[rows] = said
+    out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan
+    return out
 
 
 def predict_segments(

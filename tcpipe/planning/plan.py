@@ -117,11 +117,6 @@ def plan_paths(
     allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
     risk : the probability with which a path shall take no more than what is least; None: its prediction is least.
     step : is told how many blocks of how many are looked at, or predicted, in each round.
-
-    Raises
-    ------
-    PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
-    ModelError : the model states no errors for ``risk``.
     """
     errors = fit_errors(survey.model.residuals)
     if risk is not None and errors is None:
