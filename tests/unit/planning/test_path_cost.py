@@ -16,7 +16,7 @@ from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
 MODEL = PhysicsModel()
-TURNS = PhysicsFit(500, (PhysicsTerm("turning", "all", 80.0, 2.0, "J/rad"),), {}, 0.4, 8.0, {}, None, None, 0.05, None)
+TURNS = PhysicsFit(500, (PhysicsTerm("turning", "all", 80.0, 2.0, "J/rad"),), {}, 0.4, 8.0, {}, None, 0.05)
 SCALE = 1.0 / 0.9996
 """Ground metres a map metre on the central meridian of a UTM zone."""
 

@@ -252,7 +252,7 @@ USUAL_RADPM = 0.05
 
 def physics(**joule_per_rad):
     terms = tuple(PhysicsTerm("turning", name, value, 5.0, "W s/rad") for name, value in joule_per_rad.items())
-    return PhysicsFit(500, terms, {}, 0.4, 8.0, {}, None, None, USUAL_RADPM, None)
+    return PhysicsFit(500, terms, {}, 0.4, 8.0, {}, None, USUAL_RADPM)
 
 
 def cost(source, *points, fit=None):
