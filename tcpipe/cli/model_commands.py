@@ -104,10 +104,7 @@ def reproduce(
 
     with show_progress("reproduce", quiet=quiet):
         result = run(directory, size="quick" if quick else size, seeds=seeds, jobs=jobs, baselines=baselines)
-    if as_json:
-        print_json(result.values)
-    else:
-        print_lines(result)
+    print_result(result, as_json=as_json)
 
 
 @click.command("predict-path")

@@ -146,7 +146,7 @@ _ANSWERS = {
     "predict-path.answer": "planning.path_files.PathResult",
     "preflight.answer": "pipeline.preflight.Preflight",
     "prune.answer": "pipeline.prune.Pruned",
-    "reproduce.answer": "experiment.reproduction.ReproductionSummary",
+    "reproduce.answer": "experiment.reproduction.Reproduction",
     "route-graph.answer": "planning.route_graph.RouteGraphResult",
     "simulate.answer": "simulation.SimulatedSite",
     "status.answer": "pipeline.status.Status",

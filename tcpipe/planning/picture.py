@@ -57,7 +57,7 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
     """Draw plans between the same points as PNG, a panel each; the same plans give the same bytes."""
     bounds = _crop(source, np.concatenate([plan.xy_m for plan in plans]))
     backdrop = _Backdrop(source, bounds)
-    tables = [plan.cost.pieces for plan in plans]
+    tables = [plan.cost.path_segments for plan in plans]
     spent = [to_floats(table, "energy_joule") / to_floats(table, "arc_length_m") for table in tables]
     known = np.concatenate(spent)
     known = known[np.isfinite(known)]
@@ -161,7 +161,7 @@ def _draw_path(axes: Axes, plan: Plan, values: Array, scale: Normalize) -> LineC
     """Draw the path, coloured by what its metres cost; return the coloured line."""
     points = plan.xy_m
     length = _compute_distance(points)
-    ends = np.r_[to_floats(plan.cost.pieces, "distance_m"), plan.totals.length_m]
+    ends = np.r_[to_floats(plan.cost.path_segments, "distance_m"), plan.totals.length_m]
     at = ends / ends[-1] * length[-1]
     cuts = np.stack([np.interp(at, length, points[:, axis]) for axis in (0, 1)], axis=1)
     axes.plot(*points.T, color="white", lw=7.0, solid_capstyle="round", solid_joinstyle="round")

@@ -133,7 +133,9 @@ def plan_paths(
     plans = {}
     for objective in objectives:
         of_all = [_judge(cost, objective, risk) for cost in costs]
-        best = min(range(len(lines)), key=lambda at, of_all=of_all: (costs[at].totals.pieces_without_cost, of_all[at]))  # type: ignore[misc]
+        best = min(
+            range(len(lines)), key=lambda at, of_all=of_all: (costs[at].totals.path_segments_without_cost, of_all[at])
+        )  # type: ignore[misc]
         totals = convert_record(
             costs[best].totals,
             PlanTotals,
