@@ -179,7 +179,7 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
 def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, seconds: Counter[str]) -> Evaluation:
     here, dataset = place / f"seed-{seed}", place / "dataset"
     with _measure_time(seconds, "train"):
-        train(dataset, here / "model", config=replace(plan.fitting, seed=seed), disposable=True)
+        train(dataset, here / "model", config=replace(plan.fitting, seed=seed))
     with _measure_time(seconds, "evaluate"):
         known = partial(compute_true_costs, replace(made.world, resistance=()), made.drives[0].robot)
         config = replace(plan.evaluating, seed=seed)

@@ -26,7 +26,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, fit_errors
+from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
@@ -38,6 +38,7 @@ from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.formats.qgis_styles import make_raster_style
+from tcpipe.learning.models import Model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
@@ -52,7 +53,7 @@ from tcpipe.planning.cost_grid import (
     make_grid,
     read_classes,
 )
-from tcpipe.planning.cost_model import CostModel, Reason, check_model, iterate_predictions
+from tcpipe.planning.cost_model import Reason, check_model, iterate_predictions
 from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
@@ -157,13 +158,13 @@ class CostMapResult:
         )
 
 
-def make_cost_map_key(model: CostModel, source: MapFile, cell_size_m: float) -> str:
+def make_cost_map_key(model: Model, source: MapFile, cell_size_m: float) -> str:
     """Return what a cost map is made from, as a digest."""
     return digest({"model": model.checksum, "map": source.summary(), "cell_size_m": cell_size_m, "version": VERSION})
 
 
 def make_cost_map(
-    model: CostModel,
+    model: Model,
     source: MapFile,
     out: Path | str,
     *,
@@ -208,11 +209,11 @@ def make_cost_map(
         else:
             costs = _predict_cells(model, source, place, key, grid, step)
         with write_atomic_directory(out) as directory:
-            strips = _Strips(costs, fit_errors(model.residuals), read_classes(source, grid))
+            strips = _Strips(costs, model.errors, read_classes(source, grid))
             scales = _write_files(directory, strips, origin_m)
             cells, shares = _compute_shares(costs)
             card = CostMapCard(
-                key=key, map=source.name, model=model.checksum, robot=model.robot, label_energy=model.label_energy, grid=grid,
+                key=key, map=source.name, model=model.checksum, robot=model.card.robot, label_energy=model.card.label_energy, grid=grid,
                 nav2_scale=scales, cells=cells, reason_share=shares, checksums=compute_checksums(directory), origin_deg=origin_deg,
             )  # fmt: skip
             write_sealed(directory / CARD, card)
@@ -259,7 +260,7 @@ def _claim_spool(out: Path) -> Iterator[Path]:
 
 
 def _predict_cells(  # noqa: PLR0917
-    model: CostModel, source: MapFile, place: Path, key: str, grid: MapGrid, step: Step
+    model: Model, source: MapFile, place: Path, key: str, grid: MapGrid, step: Step
 ) -> CostGrid:
     """Return the costs of all cells, in files of ``place`` that outlive an interruption; what is done of ``key`` is not done again."""
     if _read_job(place) != key:
