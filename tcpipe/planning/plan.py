@@ -133,9 +133,7 @@ def plan_paths(
     plans = {}
     for objective in objectives:
         of_all = [_judge(cost, objective, risk) for cost in costs]
-        best = min(
-            range(len(lines)), key=lambda at, of_all=of_all: (costs[at].totals.path_segments_without_cost, of_all[at])
-        )  # type: ignore[misc]
+        best = min((cost.totals.path_segments_without_cost, of_all[at], at) for at, cost in enumerate(costs))[-1]
         totals = convert_record(
             costs[best].totals,
             PlanTotals,
