@@ -411,11 +411,16 @@ def _render_page(values: Drives) -> str:
         verdict=show_verdict(values.verdict, values.findings, labels=PREDICTED),
         sections=[
             Section(
-                drive.run_id,
-                " ".join(f"{line}." for line in format_drive(drive)),
-                plots=list(_draw_sums(number, drive)),
+                "Drives",
+                parts=[
+                    Section(
+                        drive.run_id,
+                        " ".join(f"{line}." for line in format_drive(drive)),
+                        plots=list(_draw_sums(number, drive)),
+                    )
+                    for number, drive in enumerate(values.drives)
+                ],
             )
-            for number, drive in enumerate(values.drives)
         ],
     )
 
