@@ -6,7 +6,7 @@ A function imports what it needs when it is called: a model of physics needs no 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, overload
 
@@ -168,28 +168,13 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     The result has the totals of each objective, and ``lonlat_deg``, the points of the path; ``str`` of it is what the command prints.
     Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used, or there is no path.
     """
-    from tcpipe.formats.bucket_directories import fetch_directory
     from tcpipe.learning.models import choose_model
-    from tcpipe.planning.path_files import PlanRequest, choose_map, plan
-    from tcpipe.recipe.checking import from_values
+    from tcpipe.planning.path_files import choose_map, plan
 
-    names = ("objective", "cell_size_m", "allow_extrapolation", "risk", "budget_joule", "round_trip")
-    asked = {name: getattr(options, name) for name in names}
-    asked |= {"start_deg": options.start, "goal_deg": options.goal}
-    request = from_values(PlanRequest, asked, where="plan_path")
-    if options.cost_map is not None:
-        request = replace(request, cost_map=fetch_directory(options.cost_map))
-    source = choose_map(options.store, options.map_name)
-    return plan(
-        choose_model(
-            options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
-        ),
-        source,
-        request,
-        out=Path(options.out),
-        picture=None if options.picture is None else Path(options.picture),
-        step=options.on_step or (lambda _, __: None),
+    asked = choose_model(
+        options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
     )
+    return plan(asked, choose_map(options.store, options.map_name), options)
 
 
 plan_path = as_function(PlanPathOptions, run_plan_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,8 +48,8 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
     labels; all with the values of the paper. OUT keeps the networks that the command trains, for the next call; predictions.parquet has
     every prediction. OUT may be a URL in a bucket, where each evaluation is a generation.
 
-    With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals and figures, in
-    drives.json and drives.html of OUT; DATASET, which MODEL was trained on, shows whether a drive was held back.
+    With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in drives.json of OUT;
+    DATASET, which MODEL was trained on, shows whether a drive was held back.
 
     With --adapt: errors and coverage on the rest of each run after its first metres adapt MODEL, in adaptation.json of OUT; DATASET may
     be of another robot.
@@ -148,17 +147,8 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with one band per course, the reasons where MODEL cannot predict, and
     maps for Nav2. An interrupted call resumes; OUT may be a URL in a bucket, where each map is a generation.
     """
-    from tcpipe.planning.cost_map import Cluster, make_cost_map
+    from tcpipe.planning.cost_map import make_cost_map
 
-    cluster = options.cluster
-    if cluster is not None:  # its workers have another working directory
-        from tcpipe.formats.object_storage import make_absolute
-
-        own = options.predictor
-        own = str(Path(own).absolute()) if own is not None and Path(own.split(":")[0]).is_file() else own
-        options = replace(
-            options, model=make_absolute(options.model), store=make_absolute(options.store), predictor=own
-        )
     with show_progress("cost-map", quiet=quiet) as shown:
         result = make_cost_map(
             *_load_inputs(options),
@@ -166,7 +156,6 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
             cell_size_m=options.cell_size_m,
             origin_deg=options.origin_deg,
             step=shown.count,
-            cluster=None if cluster is None else Cluster(cluster, partial(_load_inputs, options)),
         )
     print_result(result, as_json=as_json)
 

@@ -70,12 +70,18 @@ class Metres:
 
 @dataclass(frozen=True, slots=True)
 class Adapted:
-    """What an adapted model says of metres, shape (N,), with the ends of their intervals, and of their sum."""
+    """What a model, adapted or not, says of metres, shape (N,), with the ends of their intervals, and of their sum."""
 
     value: Floats
     low: Floats
     high: Floats
     total: SumDistribution
+
+
+def predict(errors: Errors, there: Metres) -> Adapted:
+    """Return what a model says of metres as it is."""
+    low, high = errors.compute_intervals(there.predicted, there.class_id)
+    return Adapted(there.predicted, low, high, errors.compute_sum(there.predicted, there.class_id))
 
 
 def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
@@ -127,8 +133,9 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     total, total_variance = _mix(weights, np.array(values).sum(axis=1), np.array(sums))
     wider = float(stdtrit(freedom, _UPPER_END))
     low, high = (end * wider / NORMAL_HALF_WIDTH * np.sqrt(variance) for end in (errors.low, errors.high))
-    half = np.hypot(wider * np.sqrt(total_variance), wider * errors.common_share * np.abs(mean).sum())
-    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), float(half)))
+    half_sum = wider * float(np.sqrt(total_variance))
+    common_std = errors.common_share * float(np.abs(mean).sum())
+    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half_sum, common_std))
 
 
 def _make_design(of: Metres, per_metre: float, per_second: float) -> Floats:
@@ -163,9 +170,9 @@ def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Fl
     return mean, np.tensordot(weights, variances + (values - mean) ** 2, 1)
 
 
-def _make_sum(middle: float, half: float) -> SumDistribution:
+def _make_sum(middle: float, half: float, common_std: float = 0.0) -> SumDistribution:
     """Return the distribution of a sum whose 90 % interval has this half-width."""
-    return SumDistribution(middle, half / NORMAL_HALF_WIDTH, half / NORMAL_HALF_WIDTH)
+    return SumDistribution(middle, half / NORMAL_HALF_WIDTH, half / NORMAL_HALF_WIDTH, common_std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,11 +244,7 @@ def _find_driven(of: Metres) -> Floats:
 def _predict_rest(errors: Errors, known: Metres, rest: Metres, predictor: str) -> Adapted:
     if predictor == MEAN:
         return _predict_mean(known, rest)
-    if len(known.predicted):
-        return adapt(errors, known, rest)
-    low, high = errors.compute_intervals(rest.predicted, rest.class_id)
-    total = errors.compute_sum(rest.predicted, rest.class_id)
-    return Adapted(rest.predicted, low, high, total)
+    return adapt(errors, known, rest) if len(known.predicted) else predict(errors, rest)
 
 
 def _predict_mean(known: Metres, rest: Metres) -> Adapted:

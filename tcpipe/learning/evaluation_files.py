@@ -96,7 +96,7 @@ def run_evaluation(
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)
     clear(place)
-    ours = {JSON, PAGE, SAMPLES, NETWORKS, ADAPTATION, "drives.json", "drives.html"}
+    ours = {JSON, PAGE, SAMPLES, NETWORKS, ADAPTATION, "drives.json"}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError
-from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, CostModel, Reason, SegmentPredictions, predict_segments
+from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, CostModel, Reason, SegmentPredictions, iterate_predictions
 from tcpipe.terrain.projection import make_metres_from_plane, parse_crs
 from tcpipe.terrain.sampling import PatchFrames, find_classes_at
 from tcpipe.terrain.target_grid import MapGrid
@@ -242,7 +242,7 @@ class LazyCostGrid:
 
     def _learn(self, wanted: Mask, step: Callable[[int, int], None], *, ask: bool) -> None:
         todo = list(iterate_blocks(self.source, self.model, self.costs.grid, wanted))
-        answers = predict_segments(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
+        answers = iterate_predictions(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
         for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
             self.costs.put(cells, found)
             step(number, len(todo))

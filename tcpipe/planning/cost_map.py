@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.cost.prediction_errors import Errors, fit_errors
-from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.execution import Executor, run_all, unwrap_result
+from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
@@ -53,7 +52,7 @@ from tcpipe.planning.cost_grid import (
     make_grid,
     read_classes,
 )
-from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, predict_segments
+from tcpipe.planning.cost_model import CostModel, Reason, check_model, iterate_predictions
 from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
@@ -69,7 +68,7 @@ KIND = "tcpipe cost map"
 VERSION = "1.2"
 
 _BLOCKS_KEPT = 8
-"""Blocks after which what is done is on disk, and those of a task."""
+"""Blocks after which what is done is on disk."""
 
 _QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
 _BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)
@@ -167,7 +166,6 @@ def make_cost_map(
     cell_size_m: float,
     origin_deg: tuple[float, float] | None = None,
     step: Step = lambda _, __: None,
-    cluster: Cluster | None = None,
 ) -> CostMapResult:
     """Write the cost map of a whole map to ``out``, whole or not at all; an interrupted call goes on where it was.
 
@@ -180,12 +178,6 @@ def make_cost_map(
     origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
         without.
     step : is told how many blocks of how many are done.
-    cluster : whose workers ask the model instead of this process; the bytes are the same.
-
-    Raises
-    ------
-    ModelError, MapError : the map cannot give what the model wants, is smaller than a cell, or cannot be read.
-    UsageError, StoreError : ``out`` is something else, or cannot be written; the origin is far from the map.
     """
     check_model(model, source)
     key = make_cost_map_key(model, source, cell_size_m)
@@ -195,9 +187,7 @@ def make_cost_map(
         if known is not None and (known.key, known.origin_deg) == (key, origin_deg):
             return CostMapResult(url, "unchanged", known)
         with write_generation(url, CARD) as place:
-            made = make_cost_map(
-                model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step, cluster=cluster
-            )
+            made = make_cost_map(model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step)
         return replace(made, path=url)
     out = Path(out)
     clear_beside(out)
@@ -213,7 +203,7 @@ def make_cost_map(
             costs = open_cost_map(out, found)
         else:
             spool = _open_spool(place, key, grid)
-            _predict_missing(model, source, spool, key, step, cluster)
+            _predict_missing(model, source, spool, step)
             costs = spool.costs
         with write_atomic_directory(out) as directory:
             card = replace(_write_files(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
@@ -311,55 +301,8 @@ def _read_job(place: Path) -> str | None:
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class Cluster:
-    """A Dask scheduler's address or an executor, and what gives its workers the model and the map, by files that they see."""
-
-    address: str | Executor
-    inputs: Callable[[], tuple[CostModel, MapFile]]
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """Blocks of cells for one worker, and what the cost map is made from."""
-
-    inputs: Callable[[], tuple[CostModel, MapFile]]
-    key: str
-    grid: MapGrid
-    blocks: tuple[Cells, ...]
-
-
-def _ask_cluster(
-    cluster: Cluster, key: str, grid: MapGrid, todo: Sequence[Cells]
-) -> Iterator[tuple[Cells, SegmentPredictions]]:
-    """Yield what a cluster's workers say of each block, as their tasks end."""
-    parts = [tuple(todo[first : first + _BLOCKS_KEPT]) for first in range(0, len(todo), _BLOCKS_KEPT)]
-    tasks = [_Task(cluster.inputs, key, grid, part) for part in parts]
-    with closing(run_all(_answer, tasks, jobs=1, cluster=cluster.address)) as outcomes:
-        for outcome in outcomes:
-            found: list[SegmentPredictions] = unwrap_result(outcome)
-            yield from zip(tasks[outcome.index].blocks, found, strict=True)
-
-
-def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
-    """Ask the model about the blocks of a task, on a worker."""
-    try:
-        model, source = task.inputs()
-        if make_cost_map_key(model, source, task.grid.pixel_size_m) != task.key:
-            raise UsageError(
-                f"a worker finds another map {source.name} or model {model.name} than the caller; expected the same files under "
-                "the same names"
-            )
-        frames = CellFrames(task.grid, where=f"map {source.name}")
-        return list(predict_segments(model, source, (frames.of(cells) for cells in task.blocks)))
-    except TcpipeError as error:  # it may lack what is here: an extra, a file
-        return type(error)(*(f"{os.uname().nodename}: {problem}" for problem in error.problems))
-
-
-def _predict_missing(  # noqa: PLR0917
-    model: CostModel, source: MapFile, spool: _Spool, key: str, step: Step, cluster: Cluster | None
-) -> None:
-    """Ask the model, here or on a cluster, about every cell that is not done."""
+def _predict_missing(model: CostModel, source: MapFile, spool: _Spool, step: Step) -> None:
+    """Ask the model about every cell that is not done."""
     costs = spool.costs
     frames = CellFrames(costs.grid, where=f"map {source.name}")
     missing = (spool.done == 0).reshape(costs.grid.rows, costs.grid.cols)
@@ -367,12 +310,8 @@ def _predict_missing(  # noqa: PLR0917
     if not missing.all():
         logger.info("resuming: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
     ready: list[Cells] = []
-    answers: Iterator[tuple[Cells, SegmentPredictions]]
-    if cluster is None:
-        answers = zip(todo, predict_segments(model, source, (frames.of(cells) for cells in todo)), strict=True)
-    else:
-        answers = _ask_cluster(cluster, key, costs.grid, todo)
-    for number, (cells, found) in enumerate(answers, 1):
+    answers = iterate_predictions(model, source, (frames.of(cells) for cells in todo))
+    for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
         costs.put(cells, found)
         ready.append(cells)
         if len(ready) == _BLOCKS_KEPT or number == len(todo):

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -303,7 +303,7 @@ class SegmentPredictions:
     height_m: Floats
 
 
-def predict_segments(
+def iterate_predictions(
     model: CostModel,
     source: MapReader,
     batches: Iterable[PatchFrames],
@@ -369,17 +369,14 @@ def _predict_batch(
     )
 
 
-def join_predictions(parts: Iterable[SegmentPredictions]) -> SegmentPredictions:
-    """Return the verdicts of all batches as one."""
-    found = list(parts)
-    columns: dict[str, Any] = {
-        entry.name: np.concatenate([getattr(part, entry.name) for part in found])
-        for entry in fields(SegmentPredictions)
-    }
-    return SegmentPredictions(**columns)
-
-
-def iterate_batches(frames: PatchFrames) -> Iterator[PatchFrames]:
-    """Yield frames in batches of `BATCH`, in order."""
-    for first in range(0, len(frames.centre_xy_m), BATCH):
-        yield frames.rows(np.arange(first, min(first + BATCH, len(frames.centre_xy_m))))
+def predict_segments(
+    model: CostModel, source: MapReader, frames: PatchFrames, turn_radpm: Floats | None = None
+) -> SegmentPredictions:
+    """Return what is said of all frames, in batches of `BATCH`; ``turn_radpm`` is how far a metre of each turns."""
+    count = len(frames.centre_xy_m)
+    starts = range(0, max(count, 1), BATCH)
+    batches = (frames.rows(np.arange(first, min(first + BATCH, count))) for first in starts)
+    found = list(iterate_predictions(model, source, batches, turn_radpm=turn_radpm))
+    return SegmentPredictions(
+        *(np.concatenate([getattr(of, name) for of in found]) for name in SegmentPredictions.__slots__)
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
-from tcpipe.cost.adaptation import ELSEWHERE_M, Metres, Run, adapt
+from tcpipe.cost.adaptation import ELSEWHERE_M, Adapted, Metres, Run, adapt, predict
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
@@ -26,13 +26,12 @@ from tcpipe.planning.cost_model import (
     SegmentPredictions,
     check_model,
     count_reasons,
-    iterate_batches,
-    join_predictions,
     predict_segments,
 )
-from tcpipe.planning.search import compute_turns, find_turning
+from tcpipe.planning.search import Turning, compute_turns, find_turning
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.tables.findings import LEFT_OUT
 from tcpipe.terrain.projection import Projection, compute_area, make_metres_from_plane
 from tcpipe.terrain.sampling import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
@@ -42,8 +41,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathTotals:
-    """What a path costs in all, over the pieces that have a cost; ``complete`` says whether all have."""
+    """What a path costs in all, over the pieces that have a cost, by which model, on which map, for which robot."""
 
+    model: str
+    map: str
+    robot: str
+    label_energy: str = "total"
+    """``total`` or ``net``: which energy it is."""
+    adapted_by: str | None = field(default=None, metadata=LEFT_OUT)
+    """Run whose metres adapted the model."""
     length_m: float
     pieces: int
     pieces_without_cost: int
@@ -55,8 +61,10 @@ class PathTotals:
     """Of the energy, what turns cost beyond those of the segments that the model knows; None where its robot's physics is not known, and
     where the model was told the turns: its energies hold them."""
     duration_interval_s: tuple[float, float] | None
-    """None, as that of energy, without held-out samples."""
+    """Of what the robot's own sensors will measure; None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
+    energy_common_std_joule: float | None = None
+    """Standard deviation of what these sensors measure against the truth (gain and zero of the power sensor); in no interval."""
     coverage: float = COVERAGE
     """Share of drives that an interval is to cover."""
     held_out_samples: int = 0
@@ -65,11 +73,12 @@ class PathTotals:
     reasons: Mapping[str, int]
     """Pieces by reason; a piece may have several."""
     complete: bool
+    """Whether all pieces have a cost."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathCost:
-    """What a path costs; ``pieces`` is a checked table (`path_table.PIECES`), one row a piece in order."""
+    """What a path costs; ``pieces`` is a checked table (`PIECES`), one row a piece in order."""
 
     pieces: pa.Table
     totals: PathTotals
@@ -119,27 +128,23 @@ def compute_path_cost(
     where : what the path is called in errors.
     known : metres of a run of the robot that is to drive the path.
     shortest_m : the least length of a path, without it that of a piece.
-
-    Raises
-    ------
-    ModelError, MapError : the map cannot give what the model wants, or cannot be read.
-    PathError : the path is shorter, or nowhere on the map.
     """
     check_model(model, source)
-    pieces = cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where, shortest_m=shortest_m)
+    pieces = _cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where, shortest_m=shortest_m)
     frames = pieces.frames(model.chord_m)
     if not count_corners_on(source.grid, compute_footprints(frames, model.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
-    turn_radpm = compute_turns(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m
+    turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
+    turn_radpm = turn_rad / pieces.arc_m
     usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
-    said = join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
+    said = predict_segments(model, source, frames, turn_radpm)
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
-    return _sum_costs(model, source, pieces, said, known)
+    return _sum_costs(model, source, pieces, said, turn_rad, known)
 
 
-def cut_into_pieces(
-    source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None = None
+def _cut_into_pieces(
+    source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None
 ) -> Pieces:
     """Return the pieces of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
     projection = find_projection(source)
@@ -159,41 +164,41 @@ def cut_into_pieces(
     return pieces
 
 
-def _sum_costs(
-    model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions, known: Run | None
+def find_added_turning(model: CostModel) -> Turning | None:
+    """Return what turns cost beside what a model predicts; None where it was told them, or the robot's physics is not known."""
+    return None if model.takes_turns else find_turning(model.physics, model.classes)
+
+
+def _sum_costs(  # noqa: PLR0917
+    model: CostModel,
+    source: MapReader,
+    pieces: Pieces,
+    said: SegmentPredictions,
+    turn_rad: Floats,
+    known: Run | None,
 ) -> PathCost:
-    bits, class_id, errors = said.reasons, said.terrain_class, fit_errors(model.residuals)
-    duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
-    turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
-    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+    class_id, errors, turning = said.terrain_class, fit_errors(model.residuals), find_added_turning(model)
+    nothing = np.full(len(class_id), np.nan)
+    duration = pieces.arc_m / said.velocity_mps
     turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
-    (fast, slow), (least, most), sums = (nothing, nothing), (nothing, nothing), None
-    if known is not None:
-        if errors is None:
-            raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
+    found = {
+        name: Adapted(of, nothing, nothing, SumDistribution(0.0, 0.0, 0.0))
+        for name, of in (("duration", duration), ("energy", energy))
+    }
+    if known is not None and errors is None:
+        raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
+    if errors is not None:
         begin_m, rise_m = ELSEWHERE_M + np.cumsum(pieces.arc_m), pieces.arc_m * np.tan(said.slope_rad)
-        adapted = {
-            name: adapt(
-                errors[name],
-                known.metres[name],
-                Metres(of, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad),
+        for name, of in found.items():
+            there = Metres(of.value, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad)
+            found[name] = (
+                predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
             )
-            for name, of in (("duration", duration), ("energy", energy))
-        }
-        duration, energy = adapted["duration"].value, adapted["energy"].value
-        (fast, slow), (least, most) = ((of.low, of.high) for of in (adapted["duration"], adapted["energy"]))
-        sums = {name: of.total for name, of in adapted.items()}
-    elif errors is not None:
-        fast, slow = errors["duration"].compute_intervals(duration, class_id)
-        least, most = errors["energy"].compute_intervals(energy, class_id)
-        sums = {
-            "duration": errors["duration"].compute_sum(duration, class_id),
-            "energy": errors["energy"].compute_sum(energy, class_id),
-        }
+    time, joule = found["duration"], found["energy"]
     table = PIECES.table(
-        piece=np.arange(len(bits)),
+        piece=np.arange(len(class_id)),
         **_locate_pieces(source, pieces),
         terrain_class=class_id,
         terrain_name=source.classes.names()[class_id].tolist(),
@@ -201,31 +206,38 @@ def _sum_costs(
         cross_slope_rad=said.cross_slope_rad,
         power_watt=said.power_watt,
         velocity_mps=said.velocity_mps,
-        duration_s=duration,
-        duration_low_s=fast,
-        duration_high_s=slow,
+        duration_s=time.value,
+        duration_low_s=time.low,
+        duration_high_s=time.high,
         turn_rad=turn_rad,
         turn_energy_joule=turn_joule,
-        energy_joule=energy,
-        energy_low_joule=least,
-        energy_high_joule=most,
-        reasons=bits,
-        reason_names=[" ".join(flag_names(int(value), Reason)) for value in bits],
+        energy_joule=joule.value,
+        energy_low_joule=joule.low,
+        energy_high_joule=joule.high,
+        reasons=said.reasons,
+        reason_names=[" ".join(flag_names(int(value), Reason)) for value in said.reasons],
     )
     without_cost = int(table.column("duration_s").null_count)
+    sums = None if errors is None else {name: of.total for name, of in found.items()}
     totals = PathTotals(
+        model=model.name,
+        map=source.name,
+        robot=model.robot,
+        label_energy=model.label_energy,
+        adapted_by=None if known is None else known.name,
         length_m=float(pieces.arc_m.sum()),
         pieces=table.num_rows,
         pieces_without_cost=without_cost,
-        duration_s=float(np.nansum(duration)),
-        energy_joule=float(np.nansum(energy)),
+        duration_s=float(np.nansum(time.value)),
+        energy_joule=float(np.nansum(joule.value)),
         turn_rad=float(turn_rad.sum()),
         turn_energy_joule=None if turning is None else float(np.nansum(turn_joule)),
         duration_interval_s=sums["duration"].interval if sums else None,
         energy_interval_joule=sums["energy"].interval if sums else None,
+        energy_common_std_joule=sums["energy"].common_std if sums else None,
         held_out_samples=errors["energy"].samples if errors else 0,
         held_out_runs=errors["energy"].runs if errors else 0,
-        reasons=count_reasons(bits),
+        reasons=count_reasons(said.reasons),
         complete=not without_cost,
     )
     return PathCost(table, totals, sums)

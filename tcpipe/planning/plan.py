@@ -67,6 +67,7 @@ class PlanTotals(PathTotals):
 
     objective: Objective
     """What it is the least of."""
+    allow_extrapolation: bool
     finalists: int
     """Paths that were judged; this one is the best of them."""
     predicted_cells: int
@@ -142,6 +143,7 @@ def plan_paths(
             costs[best].totals,
             PlanTotals,
             objective=objective,
+            allow_extrapolation=allow_extrapolation,
             finalists=len(lines),
             predicted_cells=predicted_cells,
             negative_steps=negative.get(objective, 0),

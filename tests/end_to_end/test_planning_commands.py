@@ -57,7 +57,8 @@ def test_a_path_is_costed_and_its_pieces_add_up(place: Path):
 
 
 def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
-    assert "cells with a cost" in _run("cost-map", "model", "costs", "--cell-size", "2", cwd=place)
+    made = _run("cost-map", "model", "costs", "--cell-size", "2", "--store", "tcpipe-store", "--quiet", cwd=place)
+    assert "cells with a cost" in made
     plan = ("plan-path", "model", "--from", _FROM, "--to", _TO, "--objective", "time", "--cost-map", "costs")
     outputs = ("--out", "plan.geojson", "--picture", "plan.png")
     said = json.loads(_run(*plan, *outputs, "--json", "--quiet", cwd=place))

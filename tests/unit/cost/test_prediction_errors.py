@@ -10,7 +10,7 @@ _GRASS = np.uint8(4)
 
 
 def _width(errors, count):
-    low, high = errors.compute_sum_interval(np.full(count, 100.0), np.full(count, _GRASS))
+    low, high = errors.compute_sum(np.full(count, 100.0), np.full(count, _GRASS)).interval
     return (high - low) / (100.0 * count)
 
 
@@ -40,7 +40,7 @@ def test_a_model_that_is_off_on_average_is_centred_and_lies_in_its_interval():
     assert power == pytest.approx(120.0, rel=0.003)
     assert velocity == pytest.approx(0.8)
     energy = power / velocity
-    low, high = fit_errors(residuals)["energy"].compute_sum_interval(energy, np.full(50, _GRASS))
+    low, high = fit_errors(residuals)["energy"].compute_sum(energy, np.full(50, _GRASS)).interval
     assert 0.97 * energy.sum() < low < energy.sum() < high < 1.03 * energy.sum()
 
 
@@ -118,7 +118,7 @@ def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
 
 def test_pieces_without_a_cost_add_nothing():
     errors = fit_errors(made_residuals(1000))["energy"]
-    some = errors.compute_sum_interval(np.array([100.0, np.nan, 100.0]), np.full(3, _GRASS))
+    some = errors.compute_sum(np.array([100.0, np.nan, 100.0]), np.full(3, _GRASS)).interval
     assert np.isfinite(some).all()
     assert some[0] < 200.0 < some[1]
 
@@ -127,8 +127,8 @@ def test_too_few_held_out_samples_say_nothing():
     assert fit_errors(made_residuals(19)) is None
 
 
-def test_what_all_labels_have_in_common_adds_up_linearly_along_a_path():
-    """Labels of one sensor whose gain is known to 2 %: no residual shows it, and no length makes it smaller."""
+def test_what_all_labels_have_in_common_adds_up_linearly_and_counts_against_the_truth_alone():
+    """Labels of one sensor whose gain is known to 2 %: no residual shows it, no length makes it smaller, and the same sensor repeats it."""
     exact = made_residuals(4000, sigma=0.02)
     stated = {
         **exact,
@@ -136,11 +136,35 @@ def test_what_all_labels_have_in_common_adds_up_linearly_along_a_path():
         "duration_common_std_s": np.zeros(4000),
         "energy_common_std_joule": 0.02 * exact["power_watt"] * 1.25,
     }
-    without, with_common = (fit_errors(residuals) for residuals in (exact, stated))
     for count in (10, 1000):
-        added = np.sqrt(_width(with_common["energy"], count) ** 2 - _width(without["energy"], count) ** 2)
-        assert added == pytest.approx(2.0 * 1.645 * 0.02, rel=0.02)
-        assert _width(with_common["duration"], count) == _width(without["duration"], count)
+        said, ground = np.full(count, 100.0), np.full(count, _GRASS)
+        without, with_common = (fit_errors(of)["energy"].compute_sum(said, ground) for of in (exact, stated))
+        assert with_common.common_std == pytest.approx(2.0 * count, rel=0.02)
+        assert with_common.interval == without.interval
+        added = np.sqrt(
+            (with_common.compute_quantile(0.95) - 100.0 * count) ** 2
+            - (without.compute_quantile(0.95) - 100.0 * count) ** 2
+        )
+        assert added == pytest.approx(1.645 * 2.0 * count, rel=0.02)
+        assert fit_errors(stated)["duration"].compute_sum(said, ground).common_std == 0.0
+
+
+@pytest.mark.parametrize("metres", [0.0, 2.0])
+def test_intervals_of_long_paths_cover_new_runs_whose_neighbours_err_alike(metres):
+    """Errors of neighbours correlate and those of runs do not: means of runs differ by it, which is no error of the run."""
+    covered = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        rho, white = np.exp(-1.0 / metres) if metres else 0.0, rng.normal(size=(12, 200))
+        errors = white.copy()
+        for at in range(1, 200):
+            errors[:, at] = rho * errors[:, at - 1] + np.sqrt(1.0 - rho**2) * white[:, at]
+        held = made_residuals(1200, runs=6)
+        held["power_watt"] = 150.0 * (1.0 + 0.1 * errors[:6].reshape(-1))
+        total = fit_errors(held)["energy"].compute_sum(np.full(100, 187.5), np.full(100, _GRASS))
+        measured = 187.5 * (100.0 + 0.1 * errors[6:].reshape(6, 2, 100).sum(axis=2))
+        covered.append(np.mean((total.interval[0] <= measured) & (measured <= total.interval[1])))
+    assert 0.87 < np.mean(covered) < 0.955
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.5])
