@@ -83,14 +83,23 @@ def make_faults() -> Iterator[Fault]:
     yield Fault("negative_current", "?", drive.changed("power", times(-1.0, *currents)))
     yield Fault("milliamps", "?", drive.changed("power", times(1000.0, *currents)))
     yield Fault("frozen", "frozen", drive.changed("gnss", freeze))
-    yield Fault("swapped", "?", drive.changed("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]}))
+    yield Fault(
+        "swapped", "?", drive.changed("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]})
+    )
     yield Fault("jump", "?", drive.changed("gnss", shift_half))
     yield Fault("slow_power", "?", keep(drive, "power", lambda t: np.diff(np.floor(t / 1.0), prepend=-1.0) > 0))
     yield Fault("power_gap", "?", keep(drive, "power", lambda t: (t < 20.0) | (t > 50.0)))
     yield Fault("gnss_gap", "?", keep(drive, "gnss", lambda t: (t < 20.0) | (t > 50.0)))
-    yield Fault("wheels_dead", "?", drive.changed("wheels", times(0.0, "twist.twist.linear.x", "twist.twist.angular.z", "pose.pose.position.x", "pose.pose.position.y")))
+    yield Fault(
+        "wheels_dead",
+        "?",
+        drive.changed(
+            "wheels",
+            times(0.0, "twist.twist.linear.x", "twist.twist.angular.z", "pose.pose.position.x", "pose.pose.position.y"),
+        ),
+    )
     yield Fault("no_acceleration", "?", drive.changed("imu", times(0.0, *(f"linear_acceleration.{a}" for a in "xyz"))))
-    yield Fault("accel_g", "?", drive.changed("imu", times(1/9.80665, *(f"linear_acceleration.{a}" for a in "xyz"))))
+    yield Fault("accel_g", "?", drive.changed("imu", times(1 / 9.80665, *(f"linear_acceleration.{a}" for a in "xyz"))))
     yield Fault("imu_still", "?", drive.changed("imu", times(0.0, *gyro)))
     yield Fault("half_log_power", "?", keep(drive, "power", lambda t: t < 30.0))
 
