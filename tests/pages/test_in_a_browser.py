@@ -1,11 +1,11 @@
 """Pages in Chromium as a person has them: wide and on a phone, by day and by night (``make test-pages``; skipped without its parts)."""
 
 import shutil
-from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 
 import pytest
+from browser_page import quiet_page
 from synthetic_store import add_run, add_world, driven, lanes, make_noise_facts, segments
 
 from tcpipe.learning.evaluation_facts import EvaluateConfig
@@ -17,11 +17,7 @@ from tcpipe.pipeline.report import report
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: make test-pages")
 axe = pytest.importorskip("axe_core_python.sync_playwright", reason="axe-core-python is not installed: make test-pages")
-CHROMIUM = shutil.which("chromium")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed: apt-get install chromium")
-
 LOOKS = [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")]
 
 PLACE = """([name, x, y]) => {
@@ -46,33 +42,6 @@ def dataset(tmp_path_factory):
         add_run(store, run, table, findings=[make_finding("no-command", Subject("role", "command"))])
     build_dataset(here / "dataset", store=store.root)
     return here / "dataset"
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
-@contextmanager
-def quiet_page(chromium, path, look):
-    """A page, drawn; at the end it must have asked for nothing and complained of nothing."""
-    width, scheme = look
-    context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
-    context.set_default_timeout(120_000)  # a busy machine is no fault of a page
-    tab, complaints, asked = context.new_page(), [], []
-    tab.on("console", lambda said: complaints.append(said.text) if said.type in {"error", "warning"} else None)
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.on("request", lambda sent: asked.append(sent.url) if not sent.url.startswith(("data:", "blob:")) else None)
-    url = path.as_uri()
-    tab.goto(url)
-    tab.wait_for_selector("html[data-ready]")
-    yield tab
-    assert complaints == []
-    assert asked == [url]
-    context.close()
 
 
 def until(tab, holds):
