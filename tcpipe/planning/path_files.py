@@ -18,7 +18,7 @@ from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
-from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_sealed_as, write_sealed
+from tcpipe.formats.integrity import compute_checksum, describe_broken, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.geometry.rotation import wrap_to_pi
@@ -359,7 +359,7 @@ def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
     if card is None:
         if not (path / CARD).is_file():
             raise UsageError(f"{path}: not a cost map; make one with tcpipe cost-map")
-        raise ModelError(f"{find_broken_seal(path / CARD)}; make one with tcpipe cost-map")
+        raise ModelError(f"{describe_broken(path / CARD)}; make one with tcpipe cost-map")
     if card.key != make_cost_map_key(model, source, card.grid.pixel_size_m):
         raise ModelError(
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"

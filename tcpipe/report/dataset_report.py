@@ -42,7 +42,7 @@ from tcpipe.report.page import (
     render_page,
     show_verdict,
 )
-from tcpipe.report.plots import Plot, draw_waterfall, label_histograms
+from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
@@ -98,8 +98,7 @@ def render_dataset_report(
         warnings=lost,
         sections=[
             _make_map_section(shown, card.samples, plots),
-            *([] if patches is None else [_GALLERY]),
-            *_make_label_sections(samples),
+            *([_SELECTION] if samples.num_rows else []),
             make_quality_section(quality, "samples"),
             *_make_finding_sections(card),
             *make_physics_sections(dict(card.physics)),
@@ -123,10 +122,8 @@ def _make_verdict(card: DatasetCard) -> VerdictBox:
     return show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups)
 
 
-_GALLERY = Section(
-    "Patches",
-    "Examples of every split, class and slope. Travel is to the right; click one to select the sample on the map.",
-    controls="gallery.html",
+_SELECTION = Section(
+    "Selected samples", "Patches and table show the selection. Travel is to the right.", controls="selection.html"
 )
 
 
@@ -145,7 +142,8 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
 
 
 def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> Section:
-    text = "Positions of samples; dashed: region of the split. The buffer is in no split. A box in the plot selects on the map."
+    text = "Dashed: region of the split; the buffer is in no split. A click selects the nearest sample, with shift one more; "
+    text += "a drag in the plot or the histogram selects all within. Filters combine."
     if len(shown.xy_m) < count:
         text += f" Of {count} samples {len(shown.xy_m)}, drawn at random, are shown."
     if not len(shown.xy_m):
@@ -199,12 +197,6 @@ def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
     """Return the existing pages of the stores of these runs' pages (`_find_run_pages`)."""
     stores = sorted({href.split("/")[1] for href in hrefs.values()})
     return [Link(f"All runs of {name}", f"../{name}/{_PAGE}") for name in stores if (beside / name / _PAGE).is_file()]
-
-
-def _make_label_sections(samples: pa.Table) -> list[Section]:
-    if not samples.num_rows:
-        return []
-    return [Section("Labels", "One value per sample.", plots=label_histograms(samples, "samples"))]
 
 
 def _make_audit_section(card: DatasetCard) -> Section:
