@@ -307,14 +307,16 @@ page.start(async () => {
     const words = filters.size ? `${selected.length} of ${n} samples are selected.` : `Nothing is selected: examples of every split, class and slope.`;
     at("selection-count").textContent = words + part;
     at("selected").hidden = !selected.length;
-    URL.revokeObjectURL(at("download").href);
-    const csv = selected.map((i) => `${quoted(idOf(i))},${splitName(i)}\n`);
-    at("download").href = URL.createObjectURL(new Blob(["sample_id,split\n", ...csv], { type: "text/csv" }));
     at("copy-ids").textContent = "Copy sample_ids";
     const splits = new Set(selected.map(splitName)), of = splits.size === 1 ? `[${JSON.stringify([...splits][0])}]` : "";
     const ids = selected.length > 3 ? '"sample_ids.csv"' : JSON.stringify(selected.map(idOf));
     at("python").textContent = `tcpipe.open_dataset(${JSON.stringify(directory)})${of}.select(${ids})`;
   }
+  at("download").onclick = () => {
+    const lines = selected.map((i) => `${quoted(idOf(i))},${splitName(i)}\n`);
+    const href = URL.createObjectURL(new Blob(["sample_id,split\n", ...lines], { type: "text/csv" }));
+    make("a", "", { href, download: "sample_ids.csv" }).click();
+  };
   at("copy-ids").onclick = () => {
     const area = make("textarea", selected.map((i) => `${idOf(i)}\n`).join(""));
     document.body.append(area);

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +88,7 @@ def render_dataset_report(
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
+    balance, repeatability = make_balance_sections(card.balance)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
     return render_page(
         title=f"Dataset {card.name}",
@@ -99,15 +100,23 @@ def render_dataset_report(
         sections=[
             _make_map_section(shown, card.samples, plots),
             *([_SELECTION] if samples.num_rows else []),
-            make_quality_section(quality, "samples"),
-            *_make_finding_sections(card),
-            *make_physics_sections(dict(card.physics)),
-            *make_budget_sections(card.energy_budget),
-            Section("Distance breakdown", "Used and excluded distances add up to the odometer.", plots=[waterfall]),
-            *_make_removal_sections(card),
-            *make_balance_sections(card.balance),
+            Section(
+                "Labels",
+                parts=[
+                    make_quality_section(quality, "samples"),
+                    *make_physics_sections(dict(card.physics)),
+                    *make_budget_sections(card.energy_budget),
+                ],
+            ),
+            Section(
+                "Distance breakdown",
+                "Used and excluded distances add up to the odometer.",
+                plots=[waterfall],
+                parts=_make_removal_sections(card),
+            ),
+            replace(balance, parts=[*_make_class_sections(card), repeatability]),
             _make_audit_section(card),
-            *_make_table_sections(card, hrefs),
+            _make_run_section(card, hrefs),
             _make_provenance_section(card),
         ],
         script="dataset.js" if samples.num_rows else "",
@@ -247,12 +256,13 @@ def _make_removal_sections(card: DatasetCard) -> list[Section]:
     return [section for section in sections if section.rows]
 
 
-def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section]:
-    sections = []
-    if card.terrain:
-        names = sorted({name for counts in card.terrain.values() for name in counts})
-        rows = [(name, *(card.terrain[split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
-        sections.append(Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows))
+def _make_class_sections(card: DatasetCard) -> list[Section]:
+    names = sorted({name for counts in card.terrain.values() for name in counts})
+    rows = [(name, *(card.terrain[split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
+    return [Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows)] if rows else []
+
+
+def _make_run_section(card: DatasetCard, hrefs: Mapping[str, str]) -> Section:
     runs = [
         (
             Link(run.run_id, hrefs[run.run_id]) if run.run_id in hrefs else run.run_id,
@@ -267,7 +277,7 @@ def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Se
     if hrefs:
         text = "Links lead to the pages of the runs, once 'tcpipe report STORE' has written them."
     header = ("run", "robot", "log", "samples", "noise floor of E")
-    return [*sections, Section("Runs", text, header=header, rows=runs, figures_from=3)]
+    return Section("Runs", text, header=header, rows=runs, figures_from=3, parts=_make_finding_sections(card))
 
 
 def _make_provenance_section(card: DatasetCard) -> Section:

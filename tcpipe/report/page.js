@@ -176,10 +176,11 @@ const page = (() => {
     at("after").onclick = () => step(1);
     at("row").onchange = () => { const i = at("row").valueAsNumber - 1; if (i >= 0 && i < count()) choose(i); };
   }
-  // Points of a source that are chosen by a click, a box or these buttons; `show(rows)` says what they are.
-  function chooseSamples(source, count, show) {
+  // Points of a source that are chosen by a click (on plots by name, with their axes), a box or these buttons; `show(rows)` says what they are.
+  function chooseSamples(source, axes, count, show) {
     const choose = (rows) => { source.selected.indices = rows; };
     source.selected.change.connect(() => show(source.selected.indices));
+    for (const [name, of] of Object.entries(axes)) clickNearest(name, source, of, () => true, (i) => choose([i]));
     stepThrough(count, (by) => source.selected.indices[0] ?? (by > 0 ? -1 : 0), (i) => choose([i]));
     at("clear").onclick = () => choose([]);
     return choose;

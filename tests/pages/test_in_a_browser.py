@@ -300,9 +300,8 @@ def test_an_evaluation_says_what_a_metre_was_and_was_predicted_to_be(judged):
     off = f"Array.from({SOURCE}.data.error, Math.abs)"
     assert judged.evaluate(f"{off}[0] === Math.max(...{off})")
     x, y = judged.evaluate(f"[{SOURCE}.data.measured[3], {SOURCE}.data.predicted[3]]")
-    judged.locator("figure", has=judged.locator(".plot")).first.scroll_into_view_if_needed()
-    judged.mouse.click(*judged.evaluate(PLACE, ["against", x, y]))
-    until(judged, f"{SOURCE}.selected.indices.some((i) => Math.abs({SOURCE}.data.measured[i] - {x}) < 1e-6)")
+    click(judged, "against", x, y)
+    until(judged, f"{SELECTED}.length === 1 && Math.abs({SOURCE}.data.measured[{SELECTED}[0]] - {x}) < 1e-6")
 
 
 def test_an_evaluation_answers_to_quantity_and_split_and_shows_the_worst(judged):
