@@ -70,9 +70,9 @@ class Metres:
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        values = (getattr(self, of.name) for of in fields(self))
-        columns: list[Any] = [None if of is None else of[rows] for of in values]
-        return Metres(*columns)
+        values: dict[str, Any] = {of.name: getattr(self, of.name) for of in fields(self)}
+        values = {name: None if of is None else of[rows] for name, of in values.items()}
+        return Metres(**values)
 
 
 @dataclass(frozen=True, slots=True)
