@@ -25,6 +25,8 @@ from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import Store, open_store
 
+DRAWS_DATASET_PAGES = True
+
 PITCH_M = 0.2
 
 

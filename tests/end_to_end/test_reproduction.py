@@ -75,7 +75,7 @@ def test_again_is_nothing_to_do(reproduced):
     here, first = reproduced
     before = (here / "here" / "reproduction.json").read_bytes()
     again = tcpipe(
-        "reproduce", "here", "--quick", "--seeds", "1", "--hidden-variance", "1", "--jobs", "2", cwd=here, env=ENV
+        "reproduce", "here", "--quick", "--seeds", "1", "--hidden-variance", "1", "--jobs", "1", cwd=here, env=ENV
     )
     assert again.returncode == 0
     assert "epoch" not in again.stderr

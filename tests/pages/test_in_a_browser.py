@@ -17,6 +17,8 @@ from tcpipe.pipeline.report import report
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, make_finding
 
+DRAWS_DATASET_PAGES = True
+
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: make test-pages")
 axe = pytest.importorskip("axe_core_python.sync_playwright", reason="axe-core-python is not installed: make test-pages")
 CHROMIUM = shutil.which("chromium")
