@@ -119,7 +119,7 @@ compare-peers: .venv-peers/installed
 UV_LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet
 lock:
 	$(UV_LOCK) pyproject.toml --extra build --output-file requirements.lock
-	$(UV_LOCK) pyproject.toml --extra build --extra dev --extra tables --extra cluster --extra gis --constraint requirements.lock --output-file requirements-dev.lock
+	$(UV_LOCK) pyproject.toml --extra build --extra dev --extra tables --extra cluster --constraint requirements.lock --output-file requirements-dev.lock
 	printf '%s\n' filelock fsspec jinja2 networkx setuptools sympy typing-extensions | \
 	  $(UV_LOCK) - --constraint requirements-dev.lock --output-file requirements-train.lock
 

@@ -19,11 +19,13 @@ import pyproj
 
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.finding_lines import format_finding
+from tcpipe.formats.logs.ros_types import MessageType, TypeLibrary
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.geometry.rotation import rpy_from_quat
-from tcpipe.logs.messages import list_needed_fields
+from tcpipe.logs.roles import ROLE_TYPES
 from tcpipe.logs.topics import Topic
+from tcpipe.logs.wire_types import Scalar, iterate_flat_fields
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, Truth, compute_true_cost, simulate_readings
@@ -249,10 +251,12 @@ def _lists(values: np.ndarray) -> pa.Array:
 
 
 def _fields(type_name: str) -> tuple[str, ...]:
-    try:
-        return list_needed_fields(type_name)
-    except KeyError:  # of power and of transforms
+    """Return the numbers of a message that is used as a role, but for power and transforms."""
+    if all(type_name not in types for role, types in ROLE_TYPES.items() if role != "power"):
         return ()
+    found = TypeLibrary().find_type(type_name, definition="", schema_encoding="", ros1=False)
+    assert isinstance(found, MessageType), found
+    return tuple(name for name, of in iterate_flat_fields(found.wire) if isinstance(of, Scalar))
 
 
 def log_of(drive: Drive, sensors: Sensors, fault: Fault) -> MemoryLog:

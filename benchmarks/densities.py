@@ -173,13 +173,7 @@ def describe(model: NoiseModel) -> Iterator[str]:
             f"{100 * np.sqrt(each.scale.variance):.2f} % over {each.scale.time_s:.0f} s (told {each.scale.told:.2f})"
         )
     for role, turn in model.turns.items():
-        yield f"  turns, {role}: {1e3 * np.sqrt(turn.white_rad2ps):.2f} mrad after 1 s, scale {100 * np.sqrt(turn.scale.variance):.2f} %"
-    for level in model.residuals:
-        if level.stationary and level.pair[0] == "gnss" and level.axis != "along":
-            yield (
-                f"  stationary, {level.axis}, {level.time_s:.1f} s: {1e3 * level.measured:.1f} mm measured, "
-                f"{1e3 * level.fitted:.1f} mm fitted, {level.count} windows"
-            )
+        yield f"  turns, {role}: {1e3 * np.sqrt(turn.white_rad2ps):.2f} mrad after 1 s"
 
 
 def read(path: Path) -> None:

@@ -32,7 +32,7 @@ from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.trajectory import cut_sections, make_track_stamps
+from tcpipe.fusion.measurements import cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import invert, multiply, rotate, rotation_vector_from_quat
 from tcpipe.recipe import FuseConfig, ReadConfig

@@ -63,7 +63,7 @@ import tcpipe.formats.logs.arrow_columns, tcpipe.formats.logs.bag_file, tcpipe.f
 peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024
 before, rows, largest = peak(), 0, 0
 with open_log(Path(sys.argv[1])) as log:
-    for tables in log.batches(sys.argv[2].split(","), threads=int(sys.argv[3])):
+    for tables in log.batches(sys.argv[2].split(",")):
         rows += sum(table.num_rows for table in tables.values())
         largest = max(largest, sum(table.nbytes for table in tables.values()))
     assert not log.damage, log.damage
@@ -71,9 +71,9 @@ print(rows, peak() - before, largest / 2**20)
 """
 
 
-def with_tcpipe(path: Path, topics: list[str], threads: int = 1) -> int:
+def with_tcpipe(path: Path, topics: list[str]) -> int:
     with open_log(path) as log:
-        return sum(table.num_rows for table in log.tables(topics, threads=threads).values())
+        return sum(table.num_rows for table in log.tables(topics).values())
 
 
 def to_parquet(path: Path, topics: list[str]) -> None:
@@ -122,10 +122,10 @@ def assert_equal_content(path: Path, topics: list[str]) -> None:
 
 
 def assert_equal_tables(path: Path, other: Path | None = None) -> None:
-    """Compare a log read with one thread and with two; and with another log, or with its export where none is given."""
+    """Compare a log that is read twice, or with another log; and with its export where no other is given."""
     with open_log(path) as log, open_log(other or path) as again, tempfile.TemporaryDirectory() as out:
         tables = log.tables(NAVIGATION)
-        assert tables == again.tables(NAVIGATION, threads=2)
+        assert tables == again.tables(NAVIGATION)
         if other is None:
             for topic in export(path, Path(out), topics=NAVIGATION).topics:
                 assert pq.read_table(topic.path).equals(tables[topic.topic]), topic.topic
@@ -295,24 +295,15 @@ def zstd_rows(directory: Path, minutes: float, rerun: Rerun) -> None:
         seconds = compare(what, path, rerun, None, of_rerun=0.75)
         row("  of the floor", target, seconds["tcpipe"] / seconds["floor"])
         if crcs:
-            parquet_and_threads(path, what)
+            parquet(path, what)
             salvage(path)
         path.unlink()
 
 
-def parquet_and_threads(path: Path, name: str) -> None:
+def parquet(path: Path, name: str) -> None:
     assert_equal_tables(path)
     seconds = best({"floor": lambda: floor(path, []), "parquet": lambda: to_parquet(path, NAVIGATION)})
     row(f"{name} to Parquet: of the floor", 1.6, seconds["parquet"] / seconds["floor"])
-    wall = best({str(n): lambda n=n: with_tcpipe(path, NAVIGATION, n) for n in (1, 2)}, time.perf_counter)
-    cpu = best({str(n): lambda n=n: with_tcpipe(path, NAVIGATION, n) for n in (1, 2)})
-    idle = wall["1"] < 1.1 * cpu["1"]
-    note = f"{wall['1']:.3f} s with one (CPU {cpu['1']:.3f}), CPU with two {cpu['2']:.3f}"
-    name = "  two threads: wall time of one"
-    if idle:
-        row(name, 0.65, wall["2"] / wall["1"], note=note)
-    else:
-        row(name, None, wall["2"] / wall["1"], note=f"the machine is busy, which makes this no figure: {note}")
 
 
 def salvage(path: Path) -> None:
@@ -368,12 +359,11 @@ def memory_rows(directory: Path, gigabytes: float) -> None:
     minute = by_time(navigation(1), camera(1))
     path = write_mcap(directory / "huge.mcap", repeated(minute, 60, times), compression="lz4")
     size = path.stat().st_size / 1e9
-    for threads in (1, 2):
-        arguments = [sys.executable, "-c", MEMORY, str(path), ",".join(NAVIGATION), str(threads)]
-        done = subprocess.run(arguments, check=True, capture_output=True, text=True)
-        rows, peak, largest = map(float, done.stdout.split())
-        name = f"{size:.1f} GB MCAP, {threads} thread(s): peak MB over imports and a row group"
-        row(name, 120, peak - largest, note=f"peak {peak:.0f}, largest row group {largest:.0f}, {rows:.0f} messages")
+    arguments = [sys.executable, "-c", MEMORY, str(path), ",".join(NAVIGATION)]
+    done = subprocess.run(arguments, check=True, capture_output=True, text=True)
+    rows, peak, largest = map(float, done.stdout.split())
+    name = f"{size:.1f} GB MCAP: peak MB over imports and a row group"
+    row(name, 120, peak - largest, note=f"peak {peak:.0f}, largest row group {largest:.0f}, {rows:.0f} messages")
     program = f"import sys; from tcpipe.cli import cli; sys.argv = ['tcpipe', 'inspect', {str(path)!r}]; cli()"
     inspect = [sys.executable, "-c", program]
     wall = best({"": lambda: subprocess.run(inspect, check=True, capture_output=True)}, time.perf_counter)

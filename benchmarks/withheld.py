@@ -2,7 +2,7 @@
 
     python benchmarks/withheld.py [LOGS] [--only NAME] [--log LOG ...]
 
-For each log `tcpipe audit` withholds fixes, wheels and camera in windows of 10, 30 and 60 s; see `tcpipe/stages/withheld.py`. One row a log
+For each log `tcpipe audit` withholds fixes, wheels and camera in windows of 10, 30 and 60 s; see `tcpipe/pipeline/audit.py`. One row a log
 shows the fixes: windows, median error, 95 % error and σ [m], and the share of errors inside 1σ and 2σ. Pooled figures follow, one value a
 second of every window, and the mean of the logs' shares: wanted are 92 % of withheld fixes inside 2σ. Logs without fixes show the length of
 the track over that of their own odometry: wanted is 1 to within 2 %. Husky logs are audited again without GNSS, and without GNSS and IMU.
@@ -40,8 +40,7 @@ import numpy as np
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.fusion.withheld import Comparison, score_comparisons
-from tcpipe.pipeline.audit import read_audited
-from tcpipe.stages.withheld import WithheldComparisons, compare_withheld
+from tcpipe.pipeline.audit import WithheldComparisons, compare_withheld, read_audited
 
 HUSKY = 'wheel_odometry = ["odometry/filtered"]\n'
 HUSKY_VARIANTS = {"": "", ", no GNSS": "gnss = []\n", ", no GNSS, no IMU": "gnss = []\nimu = []\n"}

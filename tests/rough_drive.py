@@ -6,8 +6,16 @@ from functools import cache
 
 import numpy as np
 
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
+from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
+    BodyVelocities,
+    InertialMeasurements,
+    InitialState,
+    Measurements,
+    Positions,
+    Rejections,
+    Trajectory,
+)
 from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rotation_vector_from_quat, rpy_from_matrix
 from tcpipe.tables.facts import StretchFacts
 

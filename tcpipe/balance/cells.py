@@ -117,7 +117,7 @@ def count_cells(
                 terrain,
                 slope,
                 speed[0] if speed else None,
-                {name: int(of[rows].sum()) for name, of in splits.items()},
+                {name: int(is_in_split[rows].sum()) for name, is_in_split in splits.items()},
                 compute_effective_size(xy_m[rows], *correlations) if correlations else None,
                 compute_effective_size(xy_m[train], *correlations) if correlations else None,
             )
@@ -194,9 +194,9 @@ def _find_largest_patches(free: NDArray[np.bool_]) -> list[tuple[Ints, Ints]]:
     """Return rows and columns of the largest connected patches of cells, the first in the map's order among equals."""
     numbers, count = label(free)
     cells = np.flatnonzero(free)
-    of = numbers.reshape(-1)[cells]
-    sizes = np.bincount(of, minlength=count + 1)[1:]
-    order, ends = cells[np.argsort(of, kind="stable")], np.append(0, np.cumsum(sizes))
+    patch_number = numbers.reshape(-1)[cells]
+    sizes = np.bincount(patch_number, minlength=count + 1)[1:]
+    order, ends = cells[np.argsort(patch_number, kind="stable")], np.append(0, np.cumsum(sizes))
     chosen = np.argsort(-sizes, kind="stable")[:_PATCHES_EACH]
     parts = (order[ends[number] : ends[number + 1]] for number in chosen.tolist())
     return [(part // free.shape[1], part % free.shape[1]) for part in parts]

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from tcpipe.cli.options import (
-    GEOPACKAGE,
     LOG,
-    OUTPUT_EXPORT,
+    OUTPUT_DIRECTORY,
     PUBLISHED,
     SEALED,
     add_options,
@@ -114,9 +113,9 @@ def report(path: str, *, no_runs: bool, patches: bool) -> None:
 
 
 @click.command()
-@click.argument("log", type=LOG, metavar="LOG|DATASET|STORE|RUN")
+@click.argument("log", type=LOG, metavar="LOG")
 @click.argument("names", nargs=-1, metavar="[TOPIC]...")
-@click.argument("out", type=OUTPUT_EXPORT, metavar="OUT")
+@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 @click.option("--topics", multiple=True, metavar="NAME[,NAME]", help="Only these topics; repeatable (default: all).")
 @msgdef_option
 @json_option
@@ -127,19 +126,9 @@ def export(
 
     The metadata of the files has the units of the columns and the definition of the message. tcpipe does not write topics again that
     OUT already contains from the same log.
-
-    For a dataset, a store or a run, OUT is a GeoPackage (a name that ends in .gpkg; needs the extra gis): samples, footprints,
-    regions and where to drive next, or segments, with styles for QGIS.
     """
     import resource
 
-    if out.endswith(GEOPACKAGE):
-        from tcpipe.pipeline.export import export_layers
-
-        if names or topics:
-            raise UsageError(f"{out}: a GeoPackage cannot contain topics; give a directory")
-        print_result(export_layers(log, Path(out)), as_json=as_json)
-        return 0
     from tcpipe.pipeline.export import export as run
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -188,7 +177,7 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
 @add_path_or_store(SEALED)
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
-    """Read the dataset, run, map, model or cost map at PATH, or the store, again: compare counts, checksums, schemas.
+    """Read the dataset, run, map, model or cost map at PATH, or the store, again: compare checksums and counts.
 
     Exit code 1: a file has changed, is missing or contradicts another.
     """

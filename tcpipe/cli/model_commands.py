@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, RenamedOption, add_options, jobs_option, json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, add_options, jobs_option, json_option, quiet_option
 from tcpipe.cli.output import print_json, print_lines, print_result, show_progress
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions, RouteGraphOptions
@@ -17,7 +16,7 @@ from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, Predic
 if TYPE_CHECKING:
     from tcpipe.experiment.reproduction import Size
     from tcpipe.formats.maps.map_files import MapFile
-    from tcpipe.planning.cost_model import CostModel
+    from tcpipe.learning.models import Model
 
 
 @click.command()
@@ -49,8 +48,8 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
     labels; all with the values of the paper. OUT keeps the networks that the command trains, for the next call; predictions.parquet has
     every prediction. OUT may be a URL in a bucket, where each evaluation is a generation.
 
-    With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals and figures, in
-    drives.json and drives.html of OUT; DATASET, which MODEL was trained on, shows whether a drive was held back.
+    With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in drives.json of OUT;
+    DATASET, which MODEL was trained on, shows whether a drive was held back.
 
     With --adapt: errors and coverage on the rest of each run after its first metres adapt MODEL, in adaptation.json of OUT; DATASET may
     be of another robot.
@@ -79,10 +78,6 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 )
 @jobs_option("Logs read")
 @click.option(
-    "--hidden-variance", cls=RenamedOption, earlier="--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
-    help="Factor on the variance of the rolling resistance that no input shows (1: the default site).",
-)  # fmt: skip
-@click.option(
     "--baselines/--no-baselines", default=True,
     help="Train networks of each class alone, with all layers and as Wei and Isler, which take most of the time.",
 )  # fmt: skip
@@ -95,7 +90,6 @@ def reproduce(
     quick: bool,
     seeds: int,
     jobs: int,
-    hidden_variance: float,
     baselines: bool,
     as_json: bool,
     quiet: bool,
@@ -109,14 +103,7 @@ def reproduce(
     from tcpipe.experiment.reproduction import reproduce as run
 
     with show_progress("reproduce", quiet=quiet):
-        result = run(
-            directory,
-            size="quick" if quick else size,
-            seeds=seeds,
-            jobs=jobs,
-            hidden_variance=hidden_variance,
-            baselines=baselines,
-        )
+        result = run(directory, size="quick" if quick else size, seeds=seeds, jobs=jobs, baselines=baselines)
     print_result(result, as_json=as_json)
 
 
@@ -148,17 +135,8 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with one band per course, the reasons where MODEL cannot predict, and
     maps for Nav2. An interrupted call resumes; OUT may be a URL in a bucket, where each map is a generation.
     """
-    from tcpipe.planning.cost_map import Cluster, make_cost_map
+    from tcpipe.planning.cost_map import make_cost_map
 
-    cluster = options.cluster
-    if cluster is not None:  # its workers have another working directory
-        from tcpipe.formats.object_storage import make_absolute
-
-        own = options.predictor
-        own = str(Path(own).absolute()) if own is not None and Path(own.split(":")[0]).is_file() else own
-        options = replace(
-            options, model=make_absolute(options.model), store=make_absolute(options.store), predictor=own
-        )
     with show_progress("cost-map", quiet=quiet) as shown:
         result = make_cost_map(
             *_load_inputs(options),
@@ -166,12 +144,11 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
             cell_size_m=options.cell_size_m,
             origin_deg=options.origin_deg,
             step=shown.count,
-            cluster=None if cluster is None else Cluster(cluster, partial(_load_inputs, options)),
         )
     print_result(result, as_json=as_json)
 
 
-def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[CostModel, MapFile]:
+def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, MapFile]:
     """Return the model and the map, wherever this is called."""
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map

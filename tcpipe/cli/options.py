@@ -142,12 +142,6 @@ complete_maps = _complete_names(lambda context: store.maps() if (store := _store
 
 OUTPUT_DIRECTORY = Place(atomic.check_output_directory, written=True)
 OUTPUT_FILE = Place(atomic.check_output_file, written=True)
-GEOPACKAGE = ".gpkg"
-OUTPUT_EXPORT = Place(
-    lambda path: (atomic.check_output_file if path.endswith(GEOPACKAGE) else atomic.check_output_directory)(path),
-    written=True,
-)
-"""A directory, or a GeoPackage by its name."""
 INPUT_FILE = Place(atomic.check_input_file)
 INPUT_DIRECTORY = Place(atomic.check_input_directory)
 SEALED = Place(atomic.check_input_directory, urls=True)

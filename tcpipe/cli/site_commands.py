@@ -131,7 +131,6 @@ _ANSWERS = {
     "evaluate-drives.answer": "planning.drives.Drives",
     "explain.answer": "pipeline.explain.Explained",
     "export.answer": "pipeline.export.Exported",
-    "export-layers.answer": "pipeline.export.ExportedLayers",
     "ingest-log.answer": "pipeline.plan.LogLine",
     "ingest-summary.answer": "pipeline.ingest.SummaryLine",
     "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from hashlib import sha256
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,20 +63,30 @@ class Metres:
     """Over each, uphill positive."""
     turn_rad: Floats
     """Over each, both ways counted."""
+    stated_std: Floats | None = None
+    """Of the prediction, by the model itself; None: as usual."""
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        return Metres(*(getattr(self, of.name)[rows] for of in fields(self)))
+        values: dict[str, Any] = {of.name: getattr(self, of.name) for of in fields(self)}
+        values = {name: None if of is None else of[rows] for name, of in values.items()}
+        return Metres(**values)
 
 
 @dataclass(frozen=True, slots=True)
 class Adapted:
-    """What an adapted model says of metres, shape (N,), with the ends of their intervals, and of their sum."""
+    """What a model, adapted or not, says of metres, shape (N,), with the ends of their intervals, and of their sum."""
 
     value: Floats
     low: Floats
     high: Floats
     total: SumDistribution
+
+
+def predict(errors: Errors, there: Metres) -> Adapted:
+    """Return what a model says of metres as it is."""
+    low, high = errors.compute_intervals(there.predicted, there.class_id, there.stated_std)
+    return Adapted(there.predicted, low, high, errors.compute_sum(there.predicted, there.class_id, there.stated_std))
 
 
 def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
@@ -95,7 +106,7 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
         _make_design(there, *usual),
         known.measured - known.predicted,
     )
-    spread, spread_there = (errors.compute_std(of.predicted, of.class_id) for of in (known, there))
+    spread, spread_there = (errors.compute_std(of.predicted, of.class_id, of.stated_std) for of in (known, there))
     neighbour, apart_m = _find_neighbour(errors), np.abs(known.distance_m[:, None] - known.distance_m)
     beside = np.eye(len(residual)) + neighbour * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
     freedom, evidences, values, variances, sums = _FREEDOM + len(residual), [], [], [], []
@@ -127,8 +138,9 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     total, total_variance = _mix(weights, np.array(values).sum(axis=1), np.array(sums))
     wider = float(stdtrit(freedom, _UPPER_END))
     low, high = (end * wider / NORMAL_HALF_WIDTH * np.sqrt(variance) for end in (errors.low, errors.high))
-    half = np.hypot(wider * np.sqrt(total_variance), wider * errors.common_share * np.abs(mean).sum())
-    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), float(half)))
+    half_sum = wider * float(np.sqrt(total_variance))
+    common_std = errors.common_share * float(np.abs(mean).sum())
+    return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half_sum, common_std))
 
 
 def _make_design(of: Metres, per_metre: float, per_second: float) -> Floats:
@@ -163,9 +175,9 @@ def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Fl
     return mean, np.tensordot(weights, variances + (values - mean) ** 2, 1)
 
 
-def _make_sum(middle: float, half: float) -> SumDistribution:
+def _make_sum(middle: float, half: float, common_std: float = 0.0) -> SumDistribution:
     """Return the distribution of a sum whose 90 % interval has this half-width."""
-    return SumDistribution(middle, half / NORMAL_HALF_WIDTH, half / NORMAL_HALF_WIDTH)
+    return SumDistribution(middle, half / NORMAL_HALF_WIDTH, half / NORMAL_HALF_WIDTH, common_std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,11 +249,7 @@ def _find_driven(of: Metres) -> Floats:
 def _predict_rest(errors: Errors, known: Metres, rest: Metres, predictor: str) -> Adapted:
     if predictor == MEAN:
         return _predict_mean(known, rest)
-    if len(known.predicted):
-        return adapt(errors, known, rest)
-    low, high = errors.compute_intervals(rest.predicted, rest.class_id)
-    total = errors.compute_sum(rest.predicted, rest.class_id)
-    return Adapted(rest.predicted, low, high, total)
+    return adapt(errors, known, rest) if len(known.predicted) else predict(errors, rest)
 
 
 def _predict_mean(known: Metres, rest: Metres) -> Adapted:

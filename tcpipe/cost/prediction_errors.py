@@ -6,24 +6,26 @@ Estimated are, in this order:
   b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
   (James and Stein's positive part; Efron and Morris, JASA 70, 1975), and as far as no single fold of the cross-validation makes it.
   Predictions are multiplied by it, so that they are centred.
-* the **spread** of one metre, a + c |prediction|, with a factor of the class that few samples hardly move from 1.
-* the **correlation** of two metres of one run by their distance, from the semivariogram g of the errors over their spread
-  (Cressie, *Statistics for Spatial Data*, 1993, section 2.4): 1 - g(distance) / g(other runs). A segment's end is the next one's
-  beginning, so that of neighbours may be negative; beyond, it never rises, and distances with few pairs are taken together. What is left
-  at the greatest distance is each run's own; few runs tell it as Student's t.
-
+* the **spread** of one metre, a + c |prediction| + e s, with a factor of the class that few samples hardly move from 1. Here s is the
+  standard deviation that the model itself states of the metre, 0 where it states none: it counts as far as held-out errors follow it.
+  Errors of a single fold vary from fold to fold (by 31 % of networks): spreads are then as much wider as Student's t of 5 degrees of
+  freedom, whose scale is as uncertain.
+* the **correlation** of two metres of one run by their distance, from the products of errors over their spread. A segment's end is the
+  next one's beginning, so that of neighbours may be negative; beyond, it never rises, and distances with few pairs are taken together.
+* the **variance of a run's own error**: how much more the means of runs differ than the correlated errors of their metres explain; few
+  runs tell it as Student's t.
 * the **common error** of the labels themselves (gain and zero of the power sensor, scale of a lone odometry): held-out samples have it
   too, so that no residual shows it. It is the share of it in the sum of the labels, by the columns of their standard deviations.
 
-With a_i the spreads, s_i the errors of the biases and c the share of the common error, a path of costs p_i errs by
-z sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)² + (c sum_i |p_i|)²): less, of itself, the longer it is, and never less than a run differs from
-another, or than the labels' sensors are known.
+With a_i the spreads and s_i the errors of the biases, what a robot's own sensors measure on a path of costs p_i errs by
+z sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)²): less, of itself, the longer it is, and never less than a run differs from another. Sensors
+that err as they did in training do not change that. Against the true cost, which a budget is of, their c sum_i |p_i| is added.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,37 +68,39 @@ class Bias:
 
 @dataclass(frozen=True, slots=True)
 class SumDistribution:
-    """Two halves of normal distributions that meet at the prediction: of the time or energy of a path."""
+    """Two halves of normal distributions that meet at the prediction: of the time or energy of a path, as the robot's sensors measure it.
+
+    ``common_std`` is the standard deviation of what these sensors measure against the truth.
+    """
 
     middle: float
     std_below: float
     std_above: float
+    common_std: float = 0.0
 
     @property
     def std(self) -> float:
-        """Return the mean of both standard deviations."""
-        return 0.5 * (self.std_below + self.std_above)
+        """Return the standard deviation of the true sum, the mean of both sides."""
+        return float(np.hypot(0.5 * (self.std_below + self.std_above), self.common_std))
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Return the ends of the interval of `COVERAGE`."""
-        return self.compute_quantile(_TAIL), self.compute_quantile(1.0 - _TAIL)
+        """Return the ends of the interval of `COVERAGE` of what the robot's sensors measure."""
+        return self.middle - NORMAL_HALF_WIDTH * self.std_below, self.middle + NORMAL_HALF_WIDTH * self.std_above
 
     def compute_quantile(self, probability: float) -> float:
-        """Return the value that is not exceeded with a probability."""
+        """Return the value that the true sum does not exceed with a probability."""
         z = float(ndtri(probability))
-        return self.middle + z * (self.std_above if z > 0.0 else self.std_below)
+        return self.middle + z * float(np.hypot(self.std_above if z > 0.0 else self.std_below, self.common_std))
 
     def compute_probability(self, limit: float) -> float:
-        """Return the probability that a limit is not exceeded."""
-        std = self.std_above if limit > self.middle else self.std_below
+        """Return the probability that the true sum does not exceed a limit."""
+        std = float(np.hypot(self.std_above if limit > self.middle else self.std_below, self.common_std))
         return float(ndtr((limit - self.middle) / std)) if std else float(limit >= self.middle)
 
     def __add__(self, other: SumDistribution) -> SumDistribution:
         """Return the distribution of both paths together: on the same ground a model errs alike, so that standard deviations add up."""
-        return SumDistribution(
-            self.middle + other.middle, self.std_below + other.std_below, self.std_above + other.std_above
-        )
+        return SumDistribution(*(getattr(self, of.name) + getattr(other, of.name) for of in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +114,7 @@ class Errors:
     low, high : 5 % and 95 % quantiles of the errors over their spread.
     bias_std : standard error of the class's bias, of the prediction, shape (256,).
     common_share : standard deviation of the labels' common error, of the prediction; 0 where the labels do not state it.
+    stated_share, usual_stated : what a spread has of the standard deviation that the model states, and its mean over held-out samples.
     lag_m, correlation : of two metres so far apart on one run, from each lag to the next.
     of_run : the last of them, each run's own, raised for the small number of runs.
     runs, samples : that were held out.
@@ -127,45 +132,52 @@ class Errors:
     runs: int
     samples: int
     common_share: float = 0.0
+    stated_share: float = 0.0
+    usual_stated: float = 0.0
 
-    def compute_std(self, predicted: Floats, class_id: NDArray[np.integer]) -> Floats:
-        """Return the standard deviation of each prediction, shape (N,)."""
-        return np.asarray((self.floor + self.share * np.abs(predicted)) * self.of_class[class_id])
+    def compute_std(
+        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+    ) -> Floats:
+        """Return the standard deviation of each prediction, shape (N,); ``stated`` by the model, None: as usual."""
+        own = self.stated_share * (self.usual_stated if stated is None else stated)
+        return np.asarray((self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id])
 
-    def compute_intervals(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
-        """Return the interval of each piece, shape (N,) each."""
-        spread = self.compute_std(predicted, class_id)
+    def compute_intervals(
+        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+    ) -> tuple[Floats, Floats]:
+        """Return the interval of each path segment, shape (N,) each."""
+        spread = self.compute_std(predicted, class_id, stated)
         return predicted + self.low * spread, predicted + self.high * spread
 
-    def compute_sum_interval(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[float, float]:
-        """Return the interval of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
-        return self.compute_sum(predicted, class_id).interval
-
-    def compute_sum(self, predicted: Floats, class_id: NDArray[np.integer]) -> SumDistribution:
-        """Return the distribution of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
+    def compute_sum(
+        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+    ) -> SumDistribution:
+        """Return the distribution of the sum over segments of about a metre, in order along the path; shape (N,), NaN counts as none."""
         known = np.isfinite(predicted)
         values = np.where(known, predicted, 0.0)
-        spread = np.where(known, self.compute_std(values, class_id), 0.0)
+        spread = np.where(known, self.compute_std(values, class_id, stated), 0.0)
         middle, alone = float(values.sum()), float((spread**2).sum())
         if not alone:
             return SumDistribution(middle, 0.0, 0.0)
-        variance = max(self._variance(spread), alone / spread.size)
+        variance = max(self.compute_variance(spread, self.of_run), alone / spread.size)
         size = np.abs(values)
-        common = np.hypot(float((size * self.bias_std[class_id]).sum()), self.common_share * float(size.sum()))
         # Errors of a single metre are no normal ones, sums nearly.
         like_one = min(variance / float(spread.sum()) ** 2, 1.0)
         below, above = (end / NORMAL_HALF_WIDTH * like_one + (1.0 - like_one) for end in (-self.low, self.high))
-        std = float(np.sqrt(variance + common**2))
-        return SumDistribution(middle, std * below, std * above)
+        std = float(np.hypot(np.sqrt(variance), (size * self.bias_std[class_id]).sum()))
+        return SumDistribution(middle, std * below, std * above, self.common_share * float(size.sum()))
 
-    def _variance(self, spread: Floats) -> float:
-        """Return sum_ij a_i a_j rho_ij."""
+    def compute_variance(self, spread: Floats, of_run: float) -> float:
+        """Return the variance sum_ij a_i a_j rho_ij of a sum over path segments of about a metre by their spreads, shape (N,).
+
+        ``of_run`` is the variance of a run's own error: all beyond the least correlation, that of a run, is of the metres.
+        """
         spectrum = np.fft.rfft(spread, 2 * spread.size)
         pairs = np.fft.irfft(np.abs(spectrum) ** 2, 2 * spread.size)[: spread.size]  # sums of a_i a_j by lag
-        at = np.searchsorted(self.lag_m, np.arange(spread.size, dtype=np.float64), side="right") - 1
-        rho = self.correlation[at]
-        rho = rho + (self.of_run - self.correlation[-1])  # what few runs leave open is in every pair
-        return float(pairs[0] * (1.0 + self.of_run - self.correlation[-1]) + 2.0 * (pairs[1:] @ rho[1:]))
+        at = np.searchsorted(self.lag_m, np.arange(1.0, spread.size), side="right") - 1
+        least = float(self.correlation[-1])
+        of_metres = (1.0 - least) * pairs[0] + 2.0 * (pairs[1:] @ (self.correlation[at] - least))
+        return float(of_metres) + of_run * float(spread.sum()) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +210,7 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
-    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule.
+    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, and what the model stated (`make_residuals`).
     """
     held = _Held.collect(residuals)
     if held is None:
@@ -210,11 +222,45 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     nothing = np.zeros(_CLASSES)
     return {
         name: replace(
-            _fit_class_errors(of, held.true[name], held, std.get(name, nothing)),
+            _fit_class_errors(of, held.true[name], held, std.get(name, nothing), held.stated[name]),
             common_share=_find_common_share(residuals, name),
         )
         for name, of in predicted.items()
     }
+
+
+def estimate_correlation(residuals: Residuals) -> float:
+    """Return the correlation of the errors of power and velocity of held-out samples; 0 of too few."""
+    held = _Held.collect(residuals)
+    if held is None:
+        return 0.0
+    power, velocity = (held.true[name] - held.predicted[name] for name in ("power", "velocity"))
+    both = float(np.sqrt(power.var() * velocity.var()))
+    return float(np.mean((power - power.mean()) * (velocity - velocity.mean()))) / both if both else 0.0
+
+
+_STATED = "power_predicted_std_watt", "velocity_predicted_std_mps", "power_velocity_predicted_covariance"
+
+
+def make_residuals(labels: Floats, mean: Floats, covariance: Floats) -> dict[str, Floats]:
+    """Return columns of labels and predictions of power and velocity, shape (N, 2); of covariances, (N, 2, 2), where they are not 0."""
+    columns = {
+        "power_watt": labels[:, 0], "velocity_mps": labels[:, 1],
+        "power_predicted_watt": mean[:, 0], "velocity_predicted_mps": mean[:, 1],
+    }  # fmt: skip
+    stated = np.sqrt(covariance[:, 0, 0]), np.sqrt(covariance[:, 1, 1]), covariance[:, 0, 1]
+    return columns | (dict(zip(_STATED, stated, strict=True)) if covariance.any() else {})
+
+
+def propagate_stated(mean: Floats, covariance: Floats) -> dict[str, Floats]:
+    """Return standard deviations of power, velocity, and of time and energy of a metre, to first order in the covariances stated."""
+    (power, velocity), (of_power, both), (_, of_velocity) = mean.T, *covariance.transpose(1, 2, 0)
+    energy = of_power - 2.0 * both * power / velocity + of_velocity * (power / velocity) ** 2
+    variances = {
+        "power": of_power, "velocity": of_velocity,
+        "duration": of_velocity / velocity**4, "energy": np.maximum(energy, 0.0) / velocity**2,
+    }  # fmt: skip
+    return {name: np.sqrt(of) for name, of in variances.items()}
 
 
 _COMMON = {"duration": "duration_common_std_s", "energy": "energy_common_std_joule"}
@@ -242,6 +288,9 @@ class _Held:
     """Along its run."""
     fold: Ints
     """That was held out with it."""
+    is_one_fold: bool
+    stated: Mapping[str, Floats]
+    """Standard deviations by the model; 0 where it states none."""
 
     @classmethod
     def collect(cls, residuals: Residuals) -> _Held | None:
@@ -266,7 +315,13 @@ class _Held:
         )
         class_id = np.nan_to_num(residuals["terrain_class"][rows].astype(np.float64)).astype(np.int64)
         fold = residuals["fold"][rows].astype(np.int64) if "fold" in residuals else np.zeros(rows.size, np.int64)
-        return cls(true, predicted, class_id, of_run, way_m, fold)
+        is_one_fold = "fold" in residuals and np.unique(fold).size == 1
+        covariance = np.zeros((rows.size, 2, 2))
+        if set(_STATED) <= residuals.keys():
+            of_power, of_velocity, both = (residuals[name][rows].astype(np.float64) for name in _STATED)
+            covariance = np.array([[of_power**2, both], [both, of_velocity**2]]).transpose(2, 0, 1)
+        mean = np.column_stack([predicted["power"], predicted["velocity"]])
+        return cls(true, predicted, class_id, of_run, way_m, fold, is_one_fold, propagate_stated(mean, covariance))
 
 
 def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
@@ -320,11 +375,15 @@ def _estimate_ratio(predicted: Floats, true: Floats, block: Ints) -> tuple[float
     return found, float(np.sqrt((of_block**2).sum() * several / (several - 1.0))) / whole
 
 
-def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors:
+_FEWEST_FREEDOM = 5.0
+"""Of the spread of errors of one fold."""
+
+
+def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats, stated: Floats) -> Errors:
     error = true - predicted
-    design = np.column_stack([np.ones_like(predicted), np.abs(predicted)])
-    (floor, share), _ = nnls(design, np.abs(error))
-    plain = np.maximum(design @ [floor, share], 1e-12)
+    design = np.column_stack([np.ones_like(predicted), np.abs(predicted), stated])
+    shares, _ = nnls(design, np.abs(error))
+    plain = np.maximum(design @ shares, 1e-12)
     scale = max(float(np.sqrt(np.mean((error / plain) ** 2))), 1e-9)
     standard, of_class = error / (scale * plain), np.ones(_CLASSES)
     for number in np.unique(held.class_id).tolist():
@@ -334,64 +393,58 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
     low, high = np.quantile(standard, (_TAIL, 1.0 - _TAIL)).tolist()
     lag_m, correlation = _estimate_correlation(standard, held)
     runs = int(np.unique(held.run).size)
-    of_run = max(
-        _estimate_run_variance(error, scale * plain * of_class[held.class_id], held.run), float(correlation[-1])
-    )
-    return Errors(
-        float(floor) * scale, float(share) * scale, of_class, min(low, 0.0), max(high, 0.0), bias_std,
-        lag_m, correlation, of_run, runs, standard.size,
+    wider = float(stdtrit(_FEWEST_FREEDOM, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH if held.is_one_fold else 1.0
+    floor, share, stated_share = (float(of) * scale * wider for of in shares)
+    found = Errors(
+        floor, share, of_class, min(low, 0.0), max(high, 0.0), bias_std, lag_m, correlation, 0.0, runs, standard.size,
+        stated_share=stated_share, usual_stated=float(stated.mean()),
     )  # fmt: skip
+    return replace(
+        found, of_run=_estimate_run_variance(found, error, scale * plain * of_class[held.class_id], held.run)
+    )
 
 
-def _estimate_run_variance(error: Floats, spread: Floats, run: Ints) -> float:
-    """Return the variance of a new run's mean error over its spread, raised as Student's t wants it: a normal interval holds it then."""
-    means = (np.bincount(run, weights=error) / np.maximum(np.bincount(run, weights=spread), 1e-300))[np.unique(run)]
-    if means.size < 2:
-        return 0.0
-    quantile = float(stdtrit(means.size - 1.0, 1.0 - _TAIL))
-    return float(means.var(ddof=1)) * (quantile / NORMAL_HALF_WIDTH) ** 2
+def _estimate_run_variance(errors: Errors, error: Floats, spread: Floats, run: Ints) -> float:
+    """Return the variance of a run's own error over its spread, beyond what errors of its metres leave in its mean.
+
+    It is raised so that a normal interval of the mean error of a new run is as wide as Student's t wants it. Runs count by their length
+    (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
+    """
+    runs = np.unique(run)
+    if runs.size < 2:  # nothing but the farthest metres tell it
+        return max(float(errors.correlation[-1]), 0.0)
+    weight = np.array([spread[run == of].sum() for of in runs])
+    means = np.array([error[run == of].sum() for of in runs]) / weight
+    of_metres = np.array([errors.compute_variance(spread[run == of], 0.0) for of in runs]) / weight**2
+    share = weight / weight.sum()
+    wider = float(stdtrit(runs.size - 1.0, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH
+    beyond = float(share @ (means - share @ means) ** 2) - float((share * (1.0 - share)) @ of_metres)
+    return wider**2 * max(beyond, 0.0) / (1.0 - float(share @ share))
 
 
 def _estimate_correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
-    """Return lags and the correlation from each on."""
-    sill = _estimate_variance_between_runs(standard, held.run)
-    half, far_m = _pair_errors(standard, held)
-    bins = np.searchsorted(_LAGS_M, far_m, side="right") - 1
-    count = np.bincount(bins, minlength=_LAGS_M.size)
-    total = np.bincount(bins, weights=half, minlength=_LAGS_M.size)
-    edges, sums, counts = [0.0], [0.0], [0.0]
-    for lag, pairs, value in zip(_LAGS_M, count, total, strict=True):
-        if counts[-1] >= _FEWEST_PAIRS:
-            edges, sums, counts = [*edges, float(lag)], [*sums, 0.0], [*counts, 0.0]
-        sums[-1], counts[-1] = sums[-1] + float(value), counts[-1] + float(pairs)
-    if counts[-1] < _FEWEST_PAIRS and len(counts) > 1:  # the rest is with the distance before
-        edges, sums, counts = edges[:-1], [*sums[:-2], sums[-2] + sums[-1]], [*counts[:-2], counts[-2] + counts[-1]]
-    pairs = np.array(counts)
-    rho = 1.0 - np.array(sums) / np.maximum(pairs, 1.0) / sill
-    rho[pairs == 0] = 0.0
+    """Return lags and the correlation from each on; the farther half of all pairs are together, since runs end somewhere."""
+    products, far_m = _pair_errors(standard, held)
+    order = np.argsort(far_m, kind="stable")
+    products, far_m, far_pairs = products[order], far_m[order], max(far_m.size // 2, _FEWEST_PAIRS)
+    edges, starts = [0.0], [0]
+    for edge, start in zip(_LAGS_M[1:].tolist(), np.searchsorted(far_m, _LAGS_M[1:]).tolist(), strict=True):
+        if start - starts[-1] >= _FEWEST_PAIRS and far_m.size - start >= far_pairs:
+            edges, starts = [*edges, edge], [*starts, start]
+    pairs = np.diff([*starts, far_m.size]).astype(np.float64)
+    if not far_m.size:
+        return np.zeros(1), np.zeros(1)
+    rho = np.add.reduceat(products, starts) / pairs / max(float(np.mean(standard**2)), 1e-12)
     if rho.size > 1:
-        rho[1:] = np.clip(
-            isotonic_regression(rho[1:], weights=np.maximum(pairs[1:], 1.0), increasing=False).x, 0.0, 1.0
-        )
+        rho[1:] = np.maximum(isotonic_regression(rho[1:], weights=pairs[1:], increasing=False).x, 0.0)
     return np.array(edges), np.clip(rho, -0.5, 1.0)
 
 
-def _estimate_variance_between_runs(standard: Floats, run: Ints) -> float:
-    """Return half the mean squared difference of errors of two runs; of one run alone, their variance."""
-    count = np.bincount(run).astype(np.float64)
-    total, squares = np.bincount(run, weights=standard), np.bincount(run, weights=standard**2)
-    pairs = count.sum() ** 2 - (count**2).sum()
-    if not pairs:
-        return max(float(standard.var()), 1e-12)
-    apart = (squares * (count.sum() - count)).sum() * 2.0 - 2.0 * (total.sum() ** 2 - (total**2).sum())
-    return max(float(apart / pairs / 2.0), 1e-12)
-
-
 def _pair_errors(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
-    """Return half the squared difference of rows of one run, and how far apart they were driven [m]."""
-    half, far_m = [np.empty(0)], [np.empty(0)]
+    """Return the products of rows of one run, and how far apart they were driven [m]."""
+    products, far_m = [np.empty(0)], [np.empty(0)]
     for step in _STEPS[standard.size > _STEPS]:
         same = held.run[step:] == held.run[:-step]
-        half.append(0.5 * np.square(standard[step:] - standard[:-step])[same])
+        products.append((standard[step:] * standard[:-step])[same])
         far_m.append((held.way_m[step:] - held.way_m[:-step])[same])
-    return np.concatenate(half), np.concatenate(far_m)
+    return np.concatenate(products), np.concatenate(far_m)

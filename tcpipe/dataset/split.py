@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
@@ -23,6 +24,7 @@ from tcpipe.formats.dataset_files import (
     is_shard,
     open_patches,
     read_current_card,
+    read_sample_ids,
     read_samples,
     sample_columns,
 )
@@ -39,6 +41,9 @@ Ints = NDArray[np.int64]
 
 _MIN_STD = 0.1
 """Standard deviations are taken as at least this share of their median, so that no sample outweighs a hundred."""
+
+_NAMED = 5
+"""So many unknown ids are named."""
 
 
 @dataclass(slots=True)
@@ -69,7 +74,7 @@ class Split:
 
     Attributes
     ----------
-    name : ``train``, ``test``, ``unseen`` or ``buffer``.
+    name : ``train``, ``test``, ``unseen`` or ``buffer``; ``selection`` of a selection from all of them.
     view : its samples among the stored pixels.
     energy : which of the two energies its labels are of.
     """
@@ -179,6 +184,31 @@ class Split:
         """Return some samples: their indices, or a mask of shape (N,)."""
         return replace(self, view=replace(self.view, at=self.view.at[np.asarray(chosen)]))
 
+    def select(self, ids: str | Path | Iterable[str]) -> Split:
+        """Return the samples with these ``sample_id``s, in the order given.
+
+        Parameters
+        ----------
+        ids : ids; or a file with them, as the dataset's page writes it: a CSV with a column ``sample_id``, or one id a line.
+
+        Raises
+        ------
+        DatasetError : ids that the split does not have, all in one error, or a file that cannot be read.
+        """
+        wanted = pa.array(read_sample_ids(Path(ids)) if isinstance(ids, str | Path) else list(ids), pa.string())
+        row = pc.index_in(wanted, value_set=pa.array(self.column("sample_id"), pa.string()))
+        if row.null_count:
+            raise DatasetError(self._describe_unknown(wanted.filter(row.is_null())))
+        return self.take(row.to_numpy())
+
+    def _describe_unknown(self, ids: pa.Array) -> str:
+        """Return which ids are not in the split, and how many of them are in others."""
+        table = read_samples(self._columns.directory, ["sample_id", "split"])
+        others = table.filter(pc.is_in(table.column("sample_id"), value_set=ids)).column("split").value_counts()
+        where = "".join(f"; {of['counts']} of them in {of['values']}" for of in others.to_pylist())
+        more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
+        return f"{self._columns.directory}: no sample {', '.join(ids[:_NAMED].to_pylist())}{more} in {self.name}{where}"
+
     def clean(
         self,
         without: Iterable[str] = (),
@@ -283,6 +313,7 @@ class Dataset(Mapping[str, Split]):
     path: Path
     card: DatasetCard
     _splits: Mapping[str, Split]
+    _every: Split
 
     def __getitem__(self, name: str) -> Split:
         """Return one split."""
@@ -298,6 +329,10 @@ class Dataset(Mapping[str, Split]):
     def __len__(self) -> int:
         """Return the number of splits."""
         return len(self._splits)
+
+    def select(self, ids: str | Path | Iterable[str]) -> Split:
+        """Return samples of any split, in the order given, as `Split.select` does."""
+        return self._every.select(ids)
 
     def __repr__(self) -> str:
         """Name the dataset and its splits."""
@@ -336,10 +371,11 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
     form = make_tensor_layout(asked, files.layers, files.patch_px)
-    parts, places = {}, find_places_in_files(card, split)
-    for name in SPLITS:
-        rows = np.flatnonzero(split == name)
-        columns = SampleColumns(directory, rows)
+    places = find_places_in_files(card, split)
+
+    def make_split(name: str, rows: Ints) -> Split:
         view = SampleView(StoredPixels(files, places[rows]), np.arange(len(rows)), form)
-        parts[name] = Split(name, card, columns, view, energy)
-    return Dataset(directory, card, parts)
+        return Split(name, card, SampleColumns(directory, rows), view, energy)
+
+    parts = {name: make_split(name, np.flatnonzero(split == name)) for name in SPLITS}
+    return Dataset(directory, card, parts, make_split("selection", np.arange(len(split))))

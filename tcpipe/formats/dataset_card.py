@@ -96,6 +96,23 @@ class Covariate:
 
 
 @dataclass(frozen=True, slots=True)
+class Exclusion:
+    """A list of samples that a user excluded, and why."""
+
+    name: str
+    checksum: Checksum
+    reason: str
+    listed: int
+    """Ids in the list."""
+    samples: int
+    """Samples that the dataset would have without it."""
+
+    def __str__(self) -> str:
+        """Return name, count and reason."""
+        return f"{self.name}: {self.samples} samples excluded: {self.reason or 'reason redacted'}"
+
+
+@dataclass(frozen=True, slots=True)
 class FlaggedSamples:
     """Samples that carry a quality flag which not all of them carry: how many, their share of all (0 to 1); and samples by flag."""
 
@@ -226,7 +243,8 @@ class Redacted:
         "to a centimetre"
     )
     cut: str = (
-        "names of logs, runs, maps and tables of covariates; topics, frames, files, hosts and times in findings, and their remedies; "
+        "names of logs, runs, maps, tables of covariates and lists of excluded samples, with their reasons; topics, frames, files, hosts "
+        "and times in findings, and their remedies; "
         "what else the power feeds; checksums of rasters; the recipe's sections read, robots, power_sources and tables"
     )
     not_hidden: str = (
@@ -294,6 +312,8 @@ class DatasetCard:
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
+    exclusions: tuple[Exclusion, ...] = field(default=(), metadata=LEFT_OUT)
+    """A sample of two lists counts for the first one."""
     redaction: Redacted | None = field(default=None, metadata=LEFT_OUT)
     """What is redacted; None for a dataset that is not redacted."""
     shards: tuple[Shard, ...]

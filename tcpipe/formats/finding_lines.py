@@ -90,8 +90,7 @@ def describe_title(finding: Finding) -> str:
 
 def describe_remedy(finding: Finding, remedy: Remedy) -> str:
     """Return what a remedy does and the keys or the command that do it, in one line; of arrays of tables only that they follow."""
-    entry = read_catalogue().get(finding.code)
-    purpose = (entry.remedies.get(remedy.name) if entry else None) or remedy.name.replace("_", " ")
+    purpose = _find_purpose(finding, remedy)
     what = [f"'{remedy.command}'"] if remedy.command else []
     what += (
         ["the recipe below"]
@@ -101,6 +100,29 @@ def describe_remedy(finding: Finding, remedy: Remedy) -> str:
         else []
     )
     return f"{purpose}: {' and '.join(what)}" if what else purpose
+
+
+def _find_purpose(finding: Finding, remedy: Remedy) -> str:
+    entry = read_catalogue().get(finding.code)
+    return (entry.remedies.get(remedy.name) if entry else None) or remedy.name.replace("_", " ")
+
+
+def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
+    """Return what helps against findings of one code: what it does, and the commands and lines of a recipe that do it; else the advice."""
+    remedies: list[Remedy] = []
+    for remedy in (of for finding in findings for of in finding.remedies):
+        if remedy not in remedies:
+            remedies.append(remedy)
+    if remedies and len(remedies) <= MOST_LINES:
+        return [
+            (
+                _find_purpose(findings[0], of),
+                [*([of.command] if of.command else []), *([_build_recipe_fragment(of).toml()] if of.recipe else [])],
+            )
+            for of in remedies
+        ]
+    entry = read_catalogue().get(findings[0].code)
+    return [(entry.advice, [])] if entry and entry.advice else []
 
 
 def format_finding(finding: Finding) -> str:
@@ -131,22 +153,15 @@ def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
     ordered = sort_findings(findings)
     found = [of for of in ordered if of.severity != "note"]
-    return _format_lines(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
+    return list_findings(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
 
 
 def list_findings(findings: Iterable[Finding]) -> list[str]:
-    """Return every finding as a line, the worst first, notes too."""
-    return _format_lines(sort_findings(findings))
-
-
-def _format_lines(findings: Iterable[Finding]) -> list[str]:
-    """Return each finding as a line, with the recipe that fits in no line below it."""
+    """Return every finding as a line, the worst first, notes too, with the recipe that fits in no line below it."""
     lines = []
-    for finding in findings:
-        lines += [
-            f"{finding.severity}: {format_finding(finding)}",
-            *(f"    {line}" for line in format_remedy_blocks([finding])),
-        ]
+    for finding in sort_findings(findings):
+        lines += [f"{finding.severity}: {format_finding(finding)}"]
+        lines += [f"    {line}" for line in format_remedy_blocks([finding])]
     return lines
 
 
@@ -220,11 +235,24 @@ def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") 
     if len(group.of) == 1 and len(findings) == 1:
         key, line = next(iter(group.of)), format_finding(findings[0])
         return line if key == findings[0].subject.name else f"{key}: {line}"
-    subjects = ", ".join(sorted({of.subject.name for of in findings})[:_MOST_SUBJECTS])
-    details = "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(group.code), findings))))
     shared = findings[0].remedies if all(of.remedies == findings[0].remedies for of in findings) else ()
     remedy = ". ".join(describe_remedy(findings[0], of) for of in shared)
-    return format_count(group.code, len(group.of), total, what, details, remedy=remedy)
+    return format_count(group.code, len(group.of), total, what, _describe_range(findings), remedy=remedy)
+
+
+def describe_group(group: FindingGroup[K], total: int | None, what: str) -> str:
+    """Return what was observed of a group without its title, remedy and code: how often, of what, in which range."""
+    findings, key = group.findings, next(iter(group.of))
+    if len(group.of) == 1 and len(findings) == 1:
+        line = describe_finding(findings[0])
+        return line if key == findings[0].subject.name else f"{key}: {line}"
+    head = "" if total is None else f"{len(group.of)} of {total} {what}: "
+    return f"{head}{_describe_range(findings)}"
+
+
+def _describe_range(findings: Sequence[Finding]) -> str:
+    subjects = ", ".join(sorted({of.subject.name for of in findings})[:_MOST_SUBJECTS])
+    return "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(findings[0].code), findings))))
 
 
 def format_count(
@@ -259,18 +287,15 @@ def format_mixed_groups(
     groups: Sequence[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
 ) -> list[str]:
     """Return the same of groups of different things, each with the arguments of `format_group`."""
-    found = sorted((of for of in groups if of[0].severity != "note"), key=lambda of: rank_severity(of[0].severity))
-    return _group_lines(found[:most]) + _count_rest(len(found) - most, len(groups) - len(found), more)
+    found = [of for of in groups if of[0].severity != "note"]
+    ordered = sorted(found, key=lambda of: rank_severity(of[0].severity))[:most]
+    return list_mixed_groups(ordered) + _count_rest(len(found) - most, len(groups) - len(found), more)
 
 
 def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
     """Return every group as a line, the worst first, notes too."""
-    return _group_lines(sorted(groups, key=lambda of: rank_severity(of[0].severity)))
-
-
-def _group_lines(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
     lines = []
-    for group, total, what in groups:
+    for group, total, what in sorted(groups, key=lambda of: rank_severity(of[0].severity)):
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines

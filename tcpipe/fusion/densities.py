@@ -1,16 +1,14 @@
 """Noise of each sensor, estimated from the run itself by pairwise residuals at several time differences (structure functions).
 
-`estimate_noise` returns a `NoiseModel`. A filter takes from it, each number in the unit that its name ends with:
+`fit_noise` returns a `NoiseModel`. A filter takes from it, each number in the unit that its name ends with:
 
 - ``horizontal`` and ``vertical``: of fixes, east and north alike, and up. ``white_m2`` is independent from fix to fix; ``correlated`` is a
   Gauss-Markov error of position, to be a state of each axis. Both are those of a fix that claims ``claimed_m2``, and in proportion to it.
 - ``odometries[role].velocity_m2ps``: the variance of the distance grows by so much a second of driving; a velocity at f Hz has the
   variance ``velocity_m2ps * f``. Zero while the robot is stationary.
 - ``odometries[role].scale``: Gauss-Markov error of the scale around its mean, [1]; ``shared_scale``: the same for all odometries at once.
-- ``turns[role].white_rad2ps``: the variance of the angle grows by so much a second; ``bias`` and ``scale``: Gauss-Markov errors of the turn
-  rate, around their means, in rad/s and [1].
-- ``stamp_s2``: variance of the time stamps of fixes; adds ``stamp_s2 * speed**2`` to the variance of a fix along the course, white.
-- ``slide_m2ps``: the variance of the sideways displacement grows by so much a second of driving.
+- ``turns[role].white_rad2ps``: the variance of the angle grows by so much a second; ``bias``: Gauss-Markov error of the turn rate around
+  its mean, in rad/s.
 
 ``told`` is the share told by the data: 0 is only the prior, 1 only the data. Densities are never evidence against a sensor.
 """
@@ -24,11 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.level_motion import KNOT_S
-from tcpipe.fusion.measurements import IMU, Measurements, Positions
-from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TURN, TURN_S, UP, Residuals, find_residuals
+from tcpipe.fusion.measurements import GNSS, IMU, Measurements, Positions
+from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, TURN, TURN_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
 from tcpipe.power.noise import solve_non_negative
 from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std
+from tcpipe.tables.facts import NoiseFacts
 
 Floats = NDArray[np.float64]
 
@@ -47,6 +46,11 @@ class GaussMarkov:
     def difference_variance(self, time_s: Floats) -> Floats:
         """Return the variance of the change over each time difference [s]: the structure function."""
         return np.asarray(2.0 * self.variance * -np.expm1(-time_s / self.time_s))
+
+    def integral_variance(self, time_s: Floats) -> Floats:
+        """Return the variance of the integral over each time [s]."""
+        times = time_s / self.time_s
+        return np.asarray(2.0 * self.variance * self.time_s**2 * (times + np.expm1(-times)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,30 +83,11 @@ class OdometryNoise:
 
 @dataclass(frozen=True, slots=True)
 class TurnNoise:
-    """Errors of a yaw rate: white noise, a bias [rad/s] and a scale [1], both around their means."""
+    """Errors of a yaw rate: white noise, and a bias [rad/s] that varies around its mean."""
 
     white_rad2ps: float
     bias: GaussMarkov
-    scale: GaussMarkov
     white_told: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class ResidualLevel:
-    """Residuals of one pair of sensors along one axis at one time difference: what a plot shows.
-
-    ``axis``: along, across, up or turn; ``measured`` and ``fitted``: RMS [m], of turns [rad]; ``z``: their log ratio in its standard
-    deviations, from ``count`` windows, which overlap.
-    """
-
-    pair: tuple[str, str]
-    axis: str
-    time_s: float
-    stationary: bool
-    count: int
-    measured: float
-    fitted: float
-    z: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +99,6 @@ class NoiseModel:
     odometries: Mapping[str, OdometryNoise]
     turns: Mapping[str, TurnNoise]
     shared_scale: GaussMarkov
-    slide_m2ps: float
-    slide_told: float = 0.0
-    stamp_s2: float = 0.0
-    stamp_told: float = 0.0
-    residuals: tuple[ResidualLevel, ...] = field(default=(), repr=False)
     densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
     """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 
@@ -193,11 +173,6 @@ _LEAST_LEVEL = 1e-3  # of the squares, relative to the fitted sum
 _LEAST = 1e-10  # m² or rad²: rounding
 
 
-def estimate_noise(measurements: Measurements) -> NoiseModel:
-    """Return the noise of each sensor of a section; what the data do not tell is the prior's."""
-    return fit_noise(measurements, find_residuals(measurements))
-
-
 def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
     """Return measurements whose fixes claim what the run shows, where the receiver claims nothing for most and the recipe too little.
 
@@ -239,18 +214,11 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
         vertical=by_heights.find_fix_noise("up", prior.vertical) if prior.vertical and claims else prior.vertical,
     )
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
-    slide_m2ps, slide_told = plane.find_density("slide velocity", prior.slide_m2ps)
-    stamp_s2, stamp_told = plane.find_density("stamp", prior.stamp_s2)
     return replace(
         prior,
         horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal and claims else prior.horizontal,
         odometries={role: plane.find_odometry_noise(role, noise) for role, noise in prior.odometries.items()},
         shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
-        slide_m2ps=slide_m2ps,
-        slide_told=slide_told,
-        stamp_s2=stamp_s2,
-        stamp_told=stamp_told,
-        residuals=tuple(level for fit in (by_turns, plane, by_heights) for level in fit.find_levels()),
         densities={
             axis: fit.get_densities()
             for axis, fit in ((TURN, by_turns), (ALONG, plane), (ACROSS, plane), (UP, by_heights))
@@ -404,21 +372,7 @@ class _Fit:
     def find_turn_noise(self, role: str, prior: TurnNoise) -> TurnNoise:
         """Return the noise of a yaw rate."""
         density, told = self.find_density(f"{role} turn", prior.white_rad2ps)
-        bias, scale = (
-            self.find_process(getattr(prior, name.split()[-1]), f"{role} {name}") for name in ("bias", "turn scale")
-        )
-        return TurnNoise(density, bias, scale, told)
-
-    def find_levels(self) -> Iterator[ResidualLevel]:
-        """Yield measured and fitted size of the residuals of each cell."""
-        for cell, count in zip(self._cells, self._count_windows(self._cells), strict=True):
-            _, level = cell.find_level(self._variances, truncated=True)
-            fitted = float(np.sqrt((multiply_by_vector(cell.features, self._variances) + _LEAST).mean()))
-            z = 0.5 * np.log(max(level, 1e-9)) * np.sqrt(2.0 * count)
-            each = cell.residuals
-            yield ResidualLevel(
-                each.pair, each.axis, each.time_s, cell.is_still, cell.square.size, fitted * np.sqrt(level), fitted, float(z)
-            )  # fmt: skip
+        return TurnNoise(density, self.find_process(prior.bias, f"{role} bias"), told)
 
 
 def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
@@ -510,16 +464,10 @@ def make_prior_model(measurements: Measurements) -> NoiseModel:
             for role, each in measurements.odometries().items()
         },
         turns={
-            role: TurnNoise(
-                _estimate_turn_density(measurements, role),
-                _make_process(f"{role} bias"),
-                _make_process(f"{role} turn scale"),
-            )
+            role: TurnNoise(_estimate_turn_density(measurements, role), _make_process(f"{role} bias"))
             for role in (*([IMU] if measurements.imu is not None else []), *turning)
         },
         shared_scale=_make_process("shared scale"),
-        slide_m2ps=PRIORS["slide velocity"].variance,
-        stamp_s2=0.0 if gnss is None else PRIORS["stamp"].variance,
     )
 
 
@@ -553,3 +501,53 @@ def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
     if second.size < _FEWEST:
         return 0.0
     return estimate_robust_std(second) ** 2 / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9
+
+
+_TIME_S = np.array(TIMES_S)
+_DRIVING_MPS = 0.1
+
+
+def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFacts]:
+    """Return by name how far fixes along an axis, distances of odometries and turns err over each time, by the fit and by the claims.
+
+    Turns are without the error of their scale, which a straight drive does not feel.
+    """
+    found = {}
+    for name, fixes in ((GNSS, noise.horizontal), (f"{GNSS} height", noise.vertical)):
+        if fixes is not None:
+            correlated = fixes.correlated.difference_variance(_TIME_S)
+            fitted = [(2.0 * fixes.white_m2 + 0.0 * _TIME_S, fixes.white_told), (correlated, fixes.correlated.told)]
+            found[name] = _make_facts("m", fitted, 2.0 * fixes.claimed_m2 + 0.0 * _TIME_S)
+    for role, odometry in m.odometries().items():
+        speed_mps, own = np.abs(odometry.velocity_mps[:, 0]), noise.odometries[role]
+        driving = speed_mps > _DRIVING_MPS
+        usual_mps = float(np.median(speed_mps[driving])) if driving.any() else 0.0
+        scales = [
+            (usual_mps**2 * each.integral_variance(_TIME_S), each.told) for each in (own.scale, noise.shared_scale)
+        ]
+        fitted = [(own.velocity_m2ps * _TIME_S, own.velocity_told), *scales]
+        found[role] = _make_facts("m", fitted, _sum_white(odometry.stamp_ns, odometry.variance_m2ps2[:, 0]))
+    for role, turns in noise.turns.items():
+        if role == IMU and m.imu is not None:
+            claimed = _sum_white(m.imu.stamp_ns, np.array([m.imu.gyro_std_radps**2]))
+        else:
+            claimed = _sum_white(m.odometries()[role].stamp_ns, m.odometries()[role].yaw_rate_var)
+        fitted = [
+            (turns.white_rad2ps * _TIME_S, turns.white_told),
+            (turns.bias.integral_variance(_TIME_S), turns.bias.told),
+        ]
+        found[f"{role} turn"] = _make_facts("rad", fitted, claimed)
+    return found
+
+
+def _sum_white(stamp_ns: NDArray[np.int64], variance: Floats) -> Floats:
+    """Return the variance of the integral of a rate whose samples err independently of each other by a variance."""
+    return np.asarray(np.nanmedian(variance) * compute_median_period_ns(stamp_ns) * 1e-9 * _TIME_S)
+
+
+def _make_facts(unit: str, fitted: Sequence[tuple[Floats, float]], claimed: Floats) -> NoiseFacts:
+    """Return the facts of variances over each time, each with the share of it that the data tell."""
+    whole = np.sum([variance for variance, _ in fitted], axis=0)
+    from_data = np.sum([share * variance for variance, share in fitted], axis=0) / whole
+    rows = (np.sqrt(whole), np.sqrt(claimed), from_data)
+    return NoiseFacts(unit, TIMES_S, *(tuple(float(f"{value:.4g}") for value in row) for row in rows))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
-from tcpipe.fusion.densities import NoiseModel, fit_noise, inflate_unclaimed_fixes
+from tcpipe.fusion.densities import NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
     ACCEPTED,
@@ -40,13 +40,15 @@ from tcpipe.fusion.hypotheses import (
 )
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
     IMU,
     STATED_ARM_STD_M,
     InitialState,
     Measurements,
+    Rejections,
+    Trajectory,
     select_rows,
 )
-from tcpipe.fusion.noise_curves import describe_noise
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
@@ -61,7 +63,6 @@ from tcpipe.fusion.process import (
 )
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed, make_adjoint, smooth_ticks
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding

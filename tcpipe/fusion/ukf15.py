@@ -33,6 +33,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
     GNSS,
     IMU,
     VISUAL,
@@ -41,10 +42,11 @@ from tcpipe.fusion.measurements import (
     InertialMeasurements,
     InitialState,
     Measurements,
+    Rejections,
+    Trajectory,
 )
 from tcpipe.fusion.signals import find_chi_square_threshold, is_covered
 from tcpipe.fusion.state import GRAVITY_MPS2
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import invert, quat_from_rpy, rotate, rpy_from_quat, wrap_to_pi
 from tcpipe.tables.facts import StretchFacts
 

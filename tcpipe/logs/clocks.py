@@ -136,13 +136,7 @@ class AlignedClocks:
 
 
 def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> AlignedClocks:
-    """Return each topic's timeline, and what the clocks did.
-
-    Parameters
-    ----------
-    topics : times of every topic that plays a role, by topic.
-    clock_published : whether the log holds a /clock topic with messages.
-    """
+    """Return the timeline of each topic that plays a role, and what the clocks did; ``clock_published``: /clock has messages."""
     stamped = {
         name: (of.log_time_ns, of.header_ns)
         for name, of in topics.items()
@@ -513,10 +507,8 @@ def _find_repeats(stamp_ns: Ints, epoch: Ints) -> Mask:
 def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: bool) -> SimulatedClock | None:
     """Return the clock of the simulation that a log is of, None where it is of none.
 
-    Parameters
-    ----------
-    stamps : by topic, log times and header stamps [ns], each of shape (N,), a header's 0 where it is unset.
-    published : whether the log holds a /clock topic; without, stamps must be no wall clock's.
+    ``stamps`` are by topic log times and header stamps [ns], shape (N,), 0 where unset; without a ``published`` /clock they must be no
+    wall clock's.
     """
     used = {name: (log[header > 0], header[header > 0]) for name, (log, header) in stamps.items() if _is_timed(header)}
     counting = [name for name, (_, header) in used.items() if _is_counting_clock(header, published=published)]

@@ -315,10 +315,7 @@ def utc_from_gps_ns(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
 def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, Array] | list[str]:
     """Return a custom message's columns as those of the message that a role usually has, or what is wrong with the mapping.
 
-    Parameters
-    ----------
-    columns : the custom message's fields by dotted name, and its log time.
-    fields : by short name the field it is taken from: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
+    ``fields`` are by short name what each is taken from: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
     """
     where = f"recipe read.fields.{role}"
     problems = list(find_mapping_problems(where, role, fields, {}))

@@ -59,23 +59,13 @@ class Readings:
     """Time that the measurement itself carries (NMEA), as `read_header_ns`."""
 
 
-def list_needed_fields(type_name: str) -> tuple[str, ...]:
-    """Return the fields that a type of message must have to be read here."""
-    return _FIELDS[type_name]
-
-
 def read_messages(
     columns: Columns, role: str, type_name: str, *, fix_std_m: Mapping[str, float] = MappingProxyType({})
 ) -> Readings:
-    """Return the readings of a topic that plays ``role``.
+    """Return the readings of a topic that is used as ``role`` (power is read by `tcpipe.power.readings`).
 
-    Parameters
-    ----------
-    columns : ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances as shape (N, k); frames and sentences as
-        arrays of str.
-    role : gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, command or pose (power is read by `tcpipe.power.readings`).
-    type_name : ``package/msg/Name``.
-    fix_std_m : recipe key ``read.fix_std_m``.
+    ``columns`` are ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances have shape (N, k), frames and
+    sentences are arrays of str. `KeyError`: its type lacks the field that this names. ``fix_std_m`` is the recipe's ``read.fix_std_m``.
     """
     found = _READERS[role, type_name]({name: _mask_impossible(name, values) for name, values in columns.items()})
     if role != "gnss":
@@ -520,45 +510,6 @@ _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
             (roles.TWIST_WITH_COVARIANCE_STAMPED, _read_twist_stamped),
         )
     },
-}
-
-
-def _expand_field_names(*prefixes: str) -> tuple[str, ...]:
-    """Return field names; a prefix that ends with a dot stands for its x, y, z."""
-    return tuple(
-        name
-        for prefix in prefixes
-        for name in ([prefix + axis for axis in "xyz"] if prefix.endswith(".") else [prefix])
-    )
-
-
-def _list_quat_fields(prefix: str) -> tuple[str, ...]:
-    return tuple(f"{prefix}.{c}" for c in "xyzw")
-
-
-_FIELDS: dict[str, tuple[str, ...]] = {
-    roles.NAV_SAT_FIX: (*_STAMP, "latitude", "longitude", "altitude", "status.status", "position_covariance_type"),
-    roles.NMEA_SENTENCE: ("sentence",),
-    **dict.fromkeys(roles.GPS_FIXES, (*_STAMP, "speed", "track")),
-    roles.IMU: (
-        *_STAMP,
-        *_expand_field_names("angular_velocity.", "linear_acceleration."),
-        *_list_quat_fields("orientation"),
-    ),
-    roles.ODOMETRY: (
-        *_STAMP,
-        *_expand_field_names("twist.twist.linear.", "twist.twist.angular.", "pose.pose.position."),
-        *_list_quat_fields("pose.pose.orientation"),
-    ),
-    roles.POSE_WITH_COVARIANCE_STAMPED: (
-        *_STAMP,
-        *_expand_field_names("pose.pose.position."),
-        *_list_quat_fields("pose.pose.orientation"),
-    ),
-    roles.POSE_STAMPED: (*_STAMP, *_expand_field_names("pose.position."), *_list_quat_fields("pose.orientation")),
-    roles.TWIST: _expand_field_names("linear.", "angular."),
-    roles.TWIST_STAMPED: (*_STAMP, *_expand_field_names("twist.linear.", "twist.angular.")),
-    roles.TWIST_WITH_COVARIANCE_STAMPED: (*_STAMP, *_expand_field_names("twist.twist.linear.", "twist.twist.angular.")),
 }
 
 

@@ -10,13 +10,14 @@ Source: NMEA 0183 v4.11, sentences GGA, RMC, VTG.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 NS_PER_DAY = 86_400_000_000_000
 
@@ -24,8 +25,9 @@ KNOT_MPS = 1852.0 / 3600.0
 _VAST = 1e6
 _STATUS_OF_MODE = {"": 0, "A": 0, "P": 0, "D": 1, "R": 2, "F": 2}
 """Mode to NavSatStatus; others (estimated, manual, simulated, none) are no measurement."""
-_RMC_OR_VTG = re.compile(r"\$([A-Z]{2}(RMC|VTG),[^*$\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
-_GGA = re.compile(r"\$([A-Z]{2}GGA,[^*$\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
+_SENTENCES = {
+    kind: re.compile(rf"\$([A-Z]{{2}}{kind},[^*$\r\n]*)(?:\*([0-9A-Fa-f]{{2}}))?") for kind in ("GGA", "RMC", "VTG")
+}
 _TIME = re.compile(r"(\d{2})(\d{2})(\d{2})(?:\.(\d{1,9}))?\Z")
 
 
@@ -36,92 +38,92 @@ class Gga:
     ``time_of_day_ns`` is UTC since midnight, ``alt_m`` above the geoid; ``broken`` marks a wrong checksum or an unreadable field.
     """
 
-    row: NDArray[np.int64]
-    time_of_day_ns: NDArray[np.int64]
+    row: Ints
+    broken: NDArray[np.bool_]
+    time_of_day_ns: Ints
     lat_deg: Floats
     lon_deg: Floats
-    quality: NDArray[np.int64]
+    quality: Ints
     hdop: Floats
     alt_m: Floats
     separation_m: Floats
-    broken: NDArray[np.bool_]
-
-
-def read_gga(sentences: Sequence[str]) -> Gga:
-    """Return the GGA sentences among ``sentences``."""
-    rows: list[int] = []
-    values: list[tuple[float, ...] | None] = []
-    times: list[int] = []
-    for row, sentence in enumerate(sentences):
-        found = _GGA.search(sentence)
-        if found is None:
-            continue
-        fields = _parse_fields(found[1], found[2])
-        rows.append(row)
-        times.append(-1 if fields is None else fields[0])
-        values.append(None if fields is None else fields[1])
-    table = np.array([(np.nan,) * 6 if value is None else value for value in values], np.float64).reshape(-1, 6)
-    return Gga(
-        np.array(rows, np.int64),
-        np.array(times, np.int64),
-        table[:, 0],
-        table[:, 1],
-        np.where(np.isfinite(table[:, 2]), table[:, 2], -1).astype(np.int64),
-        table[:, 3],
-        table[:, 4],
-        table[:, 5],
-        np.array([value is None for value in values], bool),
-    )
 
 
 @dataclass(frozen=True, slots=True)
 class OverGround:
-    """Sentences that tell speed and course, shape (N,): where they stood, and what they say; NaN where a field is empty.
+    """Sentences that tell speed and course, as `Gga`.
 
-    ``time_of_day_ns`` is UTC since midnight, -1 where there is none (VTG); ``course_rad`` clockwise from true north; ``status`` is -1
-    where the receiver does not stand for it; ``broken`` marks a wrong checksum or an unreadable field.
+    ``time_of_day_ns`` is -1 where there is none (VTG); ``course_rad`` clockwise from true north; ``status`` is -1 where the receiver does
+    not stand for it.
     """
 
-    row: NDArray[np.int64]
-    time_of_day_ns: NDArray[np.int64]
+    row: Ints
+    broken: NDArray[np.bool_]
+    time_of_day_ns: Ints
     speed_mps: Floats
     course_rad: Floats
-    status: NDArray[np.int64]
-    broken: NDArray[np.bool_]
+    status: Ints
+
+
+def read_gga(sentences: Sequence[str]) -> Gga:
+    """Return the GGA sentences among ``sentences``."""
+    row, broken, (time_ns, lat, lon, quality, *others) = _read(sentences, "GGA", _parse_gga, 7)
+    return Gga(row, broken, _whole(time_ns), lat, lon, _whole(quality), *others)
 
 
 def read_over_ground(sentences: Sequence[str]) -> OverGround:
     """Return the RMC sentences, which have a time, or where there are none the VTG sentences."""
-    found = [(row, match) for row, text in enumerate(sentences) if (match := _RMC_OR_VTG.search(text)) is not None]
-    kind = "RMC" if any(match[2] == "RMC" for _, match in found) else "VTG"
-    told = [(row, _parse_ground_velocity(match[1], kind, match[3])) for row, match in found if match[2] == kind]
-    none = (-1, np.nan, np.nan, -1)
-    times, speed, course, status = (
-        zip(*(none if fields is None else fields for _, fields in told), strict=True) if told else ((),) * 4
-    )
-    return OverGround(
-        np.array([row for row, _ in told], np.int64),
-        np.array(times, np.int64),
-        np.array(speed, np.float64),
-        np.radians(np.array(course, np.float64)),
-        np.array(status, np.int64),
-        np.array([fields is None for _, fields in told], bool),
-    )
+    has_rmc = any(_SENTENCES["RMC"].search(text) for text in sentences)
+    kind, parse = ("RMC", _parse_rmc) if has_rmc else ("VTG", _parse_vtg)
+    row, broken, (time_ns, speed, course, status) = _read(sentences, kind, parse, 4)
+    return OverGround(row, broken, _whole(time_ns), speed, np.radians(course), _whole(status))
 
 
-def _parse_ground_velocity(body: str, kind: str, checksum: str | None) -> tuple[int, float, float, int] | None:
-    """Return time of day [ns], speed [m/s], course [deg] and status; None where the sentence is broken."""
+def _read(
+    sentences: Sequence[str], kind: str, parse: Callable[[list[str]], tuple[float, ...]], width: int
+) -> tuple[Ints, NDArray[np.bool_], Floats]:
+    """Return where sentences of a kind stand, which are broken, and what ``parse`` makes of their fields, shape (width, N)."""
+    found = [(row, match) for row, text in enumerate(sentences) if (match := _SENTENCES[kind].search(text)) is not None]
+    values = np.full((len(found), width), np.nan)
+    broken = np.zeros(len(found), np.bool_)
+    for at, (_, match) in enumerate(found):
+        try:
+            values[at] = parse(_split_fields(*match.groups()))
+        except (ValueError, KeyError, IndexError):
+            broken[at] = True
+    return np.array([row for row, _ in found], np.int64), broken, values.T
+
+
+def _split_fields(body: str, checksum: str | None) -> list[str]:
     if checksum is not None and int(checksum, 16) != _compute_checksum(body):
-        return None
-    parts = [part.strip() for part in body.split(",")] + [""] * 3
-    try:
-        if kind == "RMC":
-            status = _STATUS_OF_MODE.get(parts[12], -1) if parts[2] == "A" else -1
-            return _time_of_day_ns(parts[1]), _number(parts[7]) * KNOT_MPS, _number(parts[8]), status
-        speed = _number(parts[5]) * KNOT_MPS if parts[5] else _number(parts[7]) / 3.6
-        return -1, speed, _number(parts[1]), _STATUS_OF_MODE.get(parts[9], -1)
-    except (ValueError, IndexError):
-        return None
+        raise ValueError(checksum)
+    return body.split(",")
+
+
+def _whole(values: Floats) -> Ints:
+    return np.where(np.isfinite(values), values, -1).astype(np.int64)
+
+
+def _parse_gga(parts: list[str]) -> tuple[float, ...]:
+    """Return time of day [ns] and lat, lon [deg], quality, hdop, altitude, separation [m]."""
+    latitude = _parse_degrees(parts[2], 2) * {"N": 1.0, "S": -1.0, "": np.nan}[parts[3]]
+    longitude = _parse_degrees(parts[4], 3) * {"E": 1.0, "W": -1.0, "": np.nan}[parts[5]]
+    numbers = [float(text) if text else np.nan for text in (parts[6], parts[8], parts[9], parts[11])]
+    return _time_of_day_ns(parts[1]), latitude, longitude, *numbers
+
+
+def _parse_rmc(parts: list[str]) -> tuple[float, ...]:
+    """Return time of day [ns], speed [m/s], course [deg] and status."""
+    parts = [*map(str.strip, parts), *[""] * 3]
+    status = _STATUS_OF_MODE.get(parts[12], -1) if parts[2] == "A" else -1
+    return _time_of_day_ns(parts[1]), _number(parts[7]) * KNOT_MPS, _number(parts[8]), status
+
+
+def _parse_vtg(parts: list[str]) -> tuple[float, ...]:
+    """Return what `_parse_rmc` does; there is no time."""
+    parts = [*map(str.strip, parts), *[""] * 3]
+    speed = _number(parts[5]) * KNOT_MPS if parts[5] else _number(parts[7]) / 3.6
+    return -1, speed, _number(parts[1]), _STATUS_OF_MODE.get(parts[9], -1)
 
 
 def _number(text: str) -> float:
@@ -130,22 +132,6 @@ def _number(text: str) -> float:
     if abs(value) > _VAST:
         raise ValueError(text)
     return value
-
-
-def _parse_fields(body: str, checksum: str | None) -> tuple[int, tuple[float, ...]] | None:
-    """Return time of day [ns] and lat, lon [deg], quality, hdop, altitude, separation [m]; None where the sentence is broken."""
-    if checksum is not None and int(checksum, 16) != _compute_checksum(body):
-        return None
-    parts = body.split(",")
-    if len(parts) < 12:
-        return None
-    try:
-        latitude = _parse_degrees(parts[2], 2) * {"N": 1.0, "S": -1.0, "": np.nan}[parts[3]]
-        longitude = _parse_degrees(parts[4], 3) * {"E": 1.0, "W": -1.0, "": np.nan}[parts[5]]
-        numbers = [float(text) if text else np.nan for text in (parts[6], parts[8], parts[9], parts[11])]
-    except (ValueError, KeyError):
-        return None
-    return _time_of_day_ns(parts[1]), (latitude, longitude, *numbers)
 
 
 def _compute_checksum(body: str) -> int:
@@ -173,17 +159,10 @@ def _time_of_day_ns(text: str) -> int:
 
 
 def add_date(time_of_day_ns: NDArray[np.int64], log_time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return UTC stamps: each time of day on the day that keeps it nearest to the log's clock, midnight included.
+    """Return UTC stamps [ns], 0 where the time of day is not known: on the day that keeps it nearest to the log's clock.
 
-    Parameters
-    ----------
-    time_of_day_ns : [ns], shape (N,), since midnight UTC; negative where unknown.
-    log_time_ns : [ns], shape (N,).
-
-    Returns
-    -------
-    [ns], shape (N,), 0 where unknown. A constant offset between both clocks, even one near half a day, keeps one sign throughout: the
-    first row decides, and later rows stay within half a day of its offset.
+    A constant offset between both clocks, even one near half a day, keeps one sign throughout: the first row decides, and later rows stay
+    within half a day of its offset.
     """
     known = time_of_day_ns >= 0
     stamps = np.zeros(len(time_of_day_ns), np.int64)

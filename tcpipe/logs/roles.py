@@ -141,23 +141,11 @@ def assign_roles(
     mapped: Collection[str] = (),
     pose_sources: Collection[str] = (),
 ) -> RoleAssignment:
-    """Return which topic plays which role, and why.
+    """Return which topic plays which role, and why; `RecipeError`: no profile is called ``robot``.
 
-    Parameters
-    ----------
-    topics : the log's topics.
-    chosen : recipe key ``read.topics``: topics by role. For power all are summed; elsewhere the first that the log holds is taken; an
-        empty list means that nothing plays the role.
-    ignored : recipe key ``read.ignore_topics``.
-    robot : profile name, where the user gave one.
-    known : robots, and message types that carry power.
-    namespace : recipe key ``read.namespace``; topics elsewhere play no role unless they are chosen by name.
-    mapped : roles whose fields the recipe maps (``read.fields``): a chosen topic may be of any type.
-    pose_sources : recipe key ``read.pose_sources``.
-
-    Raises
-    ------
-    RecipeError : no profile has the robot's name.
+    ``chosen`` is the recipe's ``read.topics``: of power all are summed, elsewhere the first that the log holds is taken, and an empty list
+    means that nothing plays the role. Outside ``namespace`` only topics that are chosen by name play roles. Those of the ``mapped`` roles
+    (``read.fields``) may be of any type.
     """
     every = {topic.name: topic for topic in sorted(topics, key=lambda topic: topic.name)}
     named = {name for names in chosen.values() for name in names}

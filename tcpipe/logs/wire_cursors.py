@@ -149,10 +149,7 @@ def walk(
 ) -> WalkResult:
     """Find every field of every message; `RaggedError` where they are so unlike that they are cheaper to read one by one.
 
-    Parameters
-    ----------
-    data : bytes that hold all messages.
-    starts, ends : where each message begins and ends, shape (N,), rising.
+    Each begins and ends in ``data`` at ``starts`` and ``ends``, shape (N,), rising.
     """
     fits = np.ones(len(starts), np.bool_)
     while fits.any():

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory
-from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
+from tcpipe.formats.dataset_card import DatasetCard, Exclusion, MapSource, RunSource
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import to_plain
@@ -66,12 +66,7 @@ _CHANGES = ("only in a", "only in b", "other labels", "other columns", "other pa
 
 
 def diff(a: str | Path, b: str | Path) -> Difference:
-    """Compare two datasets; `DatasetError` if either is none.
-
-    Parameters
-    ----------
-    a, b : their directories or URLs, the older one first.
-    """
+    """Compare two datasets; `DatasetError` if either is none."""
     first, second = fetch_directory(a), fetch_directory(b)
     cards = read_card(first), read_card(second)
     there = [sample_columns(directory) for directory in (first, second)]
@@ -238,6 +233,7 @@ def _iterate_causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
         yield f"region: {'added' if a.split.region is None else 'removed' if b.split.region is None else 'another one'}"
     if a.split.kept != b.split.kept:
         yield f"kept split: {_format_value(to_plain(a.split.kept))} → {_format_value(to_plain(b.split.kept))}"
+    yield from _exclusion_causes({of.name: of for of in a.exclusions}, {of.name: of for of in b.exclusions})
     if a.format != b.format:
         yield f"format: {a.format} → {b.format}"
 
@@ -251,6 +247,16 @@ def _run_causes(a: Mapping[str, RunSource], b: Mapping[str, RunSource]) -> Itera
             was, now = a[run_id].recipe_id, b[run_id].recipe_id
             why = f"ingested with recipe {was} → {now}" if was != now else "the same log and recipe, ingested again"
             yield f"log: run {run_id} has other segments: {why}"
+
+
+def _exclusion_causes(a: Mapping[str, Exclusion], b: Mapping[str, Exclusion]) -> Iterator[str]:
+    for name in sorted({*a, *b}):
+        was, now = a.get(name), b.get(name)
+        if was is None or now is None:
+            which, of = ("removed", was) if now is None else ("added", now)
+            yield f"exclusion: {which} {name} ({of.samples if of else 0} samples): {of.reason if of else ''}"
+        elif was != now:
+            yield f"exclusion: {name} is another list: {was.samples} → {now.samples} samples, {was.reason} → {now.reason}"
 
 
 def _map_causes(a: Mapping[str, MapSource], b: Mapping[str, MapSource]) -> Iterator[str]:

@@ -67,14 +67,9 @@ class Overlay:
 def write_overlay(path: Path | str, out: Path) -> Overlay:
     """Write what became of a run as an MCAP of ROS 2 messages, whole or not at all; the same run gives the same bytes.
 
-    Raises `UsageError`: the path is no run, or one under several recipes, or ``out`` is there and no overlay: a recording is never
-    replaced; `StoreError`: a file of the run is not as it was written, or its streams, which know the recorder's clock, were made otherwise
-    or are gone.
-
-    Parameters
-    ----------
-    path : a run of a store, here or in a bucket; where it was ingested under several recipes, one of them.
-    out : the file.
+    `UsageError`: the path is no run, or one under several recipes, or ``out`` is there and no overlay: a recording is never replaced;
+    `StoreError`: a file of the run is not as it was written, or its streams, which know the recorder's clock, were made otherwise or are
+    gone.
     """
     found = run_at(path)
     if found is None:

@@ -87,11 +87,8 @@ def propose_for_log(
 ) -> ProposedRecipe:
     """Return the recipe for a log as ``init --from`` writes it: what a recipe does not settle yet.
 
-    Parameters
-    ----------
-    proposals : what `find_proposals` finds in it.
-    is_complete : read all messages of the used topics. If not, values are those of the first messages, and what only moving transforms
-        could tell of a sensor's place is left out.
+    ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first messages, and what only
+    moving transforms could tell of a sensor's place is left out.
     """
     config, known = find_read_config(recipe, log.topics), load_profiles(recipe)
     used = {name: role for role, names in assigned.choices.items() for name in names}

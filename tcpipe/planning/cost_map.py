@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
@@ -26,12 +26,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, fit_errors
-from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.execution import Executor, run_all, unwrap_result
+from tcpipe.cost.prediction_errors import Errors
+from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
-from tcpipe.formats.geopackage import make_raster_style
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
@@ -39,6 +37,8 @@ from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, find_wrong_files
+from tcpipe.formats.qgis_styles import make_raster_style
+from tcpipe.learning.models import Model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
@@ -53,7 +53,7 @@ from tcpipe.planning.cost_grid import (
     make_grid,
     read_classes,
 )
-from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, predict_segments
+from tcpipe.planning.cost_model import Reason, check_model, iterate_predictions
 from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
@@ -69,7 +69,7 @@ KIND = "tcpipe cost map"
 VERSION = "1.2"
 
 _BLOCKS_KEPT = 8
-"""Blocks after which what is done is on disk, and those of a task."""
+"""Blocks after which what is done is on disk."""
 
 _QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
 _BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)
@@ -97,7 +97,7 @@ class CellCounts:
     trusted: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CostMapCard:
     """All of cost-map.json but its seal."""
 
@@ -108,17 +108,21 @@ class CostMapCard:
     """The model's checksum."""
     robot: str
     grid: MapGrid
-    courses_deg: tuple[float, ...]
-    bands: Mapping[str, tuple[str, ...]]
-    units: Mapping[str, str]
-    reasons: Mapping[str, str]
+    courses_deg: tuple[float, ...] = tuple(ANGLES_DEG.tolist())
+    bands: Mapping[str, tuple[str, ...]] = field(
+        default_factory=lambda: dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course", "std"))
+    )
+    units: Mapping[str, str] = field(default_factory=lambda: _QUANTITIES)
+    reasons: Mapping[str, str] = field(
+        default_factory=lambda: {str(int(reason)): flag_name(reason) for reason in Reason}
+    )
     """Name of each bit of reasons.tif."""
     nav2_scale: Mapping[str, Nav2Scale]
     cells: CellCounts
     reason_share: Mapping[str, float]
     """Of cells and courses."""
-    barred_by: tuple[str, ...]
-    aggregation: str
+    barred_by: tuple[str, ...] = tuple(flag_name(reason) for reason in Reason if reason & BARRED)
+    aggregation: str = AGGREGATION
     """Of the courses of a cell, in its bands and in the Nav2 maps."""
     checksums: Mapping[str, Checksum]
     origin_deg: tuple[float, float] | None = None
@@ -154,20 +158,19 @@ class CostMapResult:
         )
 
 
-def make_cost_map_key(model: CostModel, source: MapFile, cell_size_m: float) -> str:
+def make_cost_map_key(model: Model, source: MapFile, cell_size_m: float) -> str:
     """Return what a cost map is made from, as a digest."""
     return digest({"model": model.checksum, "map": source.summary(), "cell_size_m": cell_size_m, "version": VERSION})
 
 
 def make_cost_map(
-    model: CostModel,
+    model: Model,
     source: MapFile,
     out: Path | str,
     *,
     cell_size_m: float,
     origin_deg: tuple[float, float] | None = None,
     step: Step = lambda _, __: None,
-    cluster: Cluster | None = None,
 ) -> CostMapResult:
     """Write the cost map of a whole map to ``out``, whole or not at all; an interrupted call goes on where it was.
 
@@ -180,12 +183,6 @@ def make_cost_map(
     origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
         without.
     step : is told how many blocks of how many are done.
-    cluster : whose workers ask the model instead of this process; the bytes are the same.
-
-    Raises
-    ------
-    ModelError, MapError : the map cannot give what the model wants, is smaller than a cell, or cannot be read.
-    UsageError, StoreError : ``out`` is something else, or cannot be written; the origin is far from the map.
     """
     check_model(model, source)
     key = make_cost_map_key(model, source, cell_size_m)
@@ -195,9 +192,7 @@ def make_cost_map(
         if known is not None and (known.key, known.origin_deg) == (key, origin_deg):
             return CostMapResult(url, "unchanged", known)
         with write_generation(url, CARD) as place:
-            made = make_cost_map(
-                model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step, cluster=cluster
-            )
+            made = make_cost_map(model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step)
         return replace(made, path=url)
     out = Path(out)
     clear_beside(out)
@@ -212,11 +207,15 @@ def make_cost_map(
                 return CostMapResult(str(out), "unchanged", found)
             costs = open_cost_map(out, found)
         else:
-            spool = _open_spool(place, key, grid)
-            _predict_missing(model, source, spool, key, step, cluster)
-            costs = spool.costs
+            costs = _predict_cells(model, source, place, key, grid, step)
         with write_atomic_directory(out) as directory:
-            card = replace(_write_files(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
+            strips = _Strips(costs, model.errors, read_classes(source, grid))
+            scales = _write_files(directory, strips, origin_m)
+            cells, shares = _compute_shares(costs)
+            card = CostMapCard(
+                key=key, map=source.name, model=model.checksum, robot=model.card.robot, label_energy=model.card.label_energy, grid=grid,
+                nav2_scale=scales, cells=cells, reason_share=shares, checksums=compute_checksums(directory), origin_deg=origin_deg,
+            )  # fmt: skip
             write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(str(out), "done", card)
@@ -244,21 +243,6 @@ def open_cost_map(path: Path, card: CostMapCard) -> CostGrid:
 _ARRAYS = ("power_watt", "velocity_mps", "reasons", "height_m")
 
 
-@dataclass(frozen=True, slots=True)
-class _Spool:
-    """Costs in files that outlive an interruption, and which cells are done, (rows · cols,)."""
-
-    costs: CostGrid
-    done: NDArray[np.uint8]
-    files: tuple[np.memmap[Any, Any], ...]
-
-    def keep(self, cells: Cells) -> None:
-        """Put on disk what is known, then that these cells are done."""
-        for file in self.files:
-            file.flush()
-        self.done[cells] = 1
-
-
 @contextmanager
 def _claim_spool(out: Path) -> Iterator[Path]:
     """Yield the directory beside ``out`` where its costs wait, for one process at a time; it stays when that is interrupted."""
@@ -275,24 +259,47 @@ def _claim_spool(out: Path) -> Iterator[Path]:
         place.rmdir()
 
 
-def _open_spool(place: Path, key: str, grid: MapGrid) -> _Spool:
-    """Return the costs so far, or new files without any."""
+def _predict_cells(  # noqa: PLR0917
+    model: Model, source: MapFile, place: Path, key: str, grid: MapGrid, step: Step
+) -> CostGrid:
+    """Return the costs of all cells, in files of ``place`` that outlive an interruption; what is done of ``key`` is not done again."""
     if _read_job(place) != key:
-        for file in place.iterdir():
-            file.unlink()
-        nothing = make_empty_grid(replace(grid, rows=1, cols=1))
-        for name in _ARRAYS:
-            one = getattr(nothing, name)
-            shape = (*one.shape[:-2], grid.rows, grid.cols)
-            array = np.lib.format.open_memmap(place / f"{name}.npy", "w+", one.dtype, shape)
-            _allocate(place / f"{name}.npy", array.offset + array.nbytes)
-            array[...] = one
-        np.save(place / "done.npy", np.zeros(grid.rows * grid.cols, np.uint8))
-        write_json(place / "job.json", {"key": key})
+        _make_spool(place, key, grid)
     held = {name: np.load(place / f"{name}.npy", mmap_mode="r+") for name in (*_ARRAYS, "done")}
-    files = tuple(held.values())
-    done = held.pop("done")
-    return _Spool(CostGrid(grid, **held), done, files)
+    files, done = tuple(held.values()), held.pop("done")
+    costs, frames = CostGrid(grid, **held), CellFrames(grid, where=f"map {source.name}")
+    missing = (done == 0).reshape(grid.rows, grid.cols)
+    todo = list(iterate_blocks(source, model, grid, missing))
+    if not missing.all():
+        logger.info("resuming: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
+    ready: list[Cells] = []
+    answers = iterate_predictions(model, source, (frames.of(cells) for cells in todo))
+    for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
+        costs.put(cells, found)
+        ready.append(cells)
+        if len(ready) == _BLOCKS_KEPT or number == len(todo):
+            for file in files:  # what is known, then that it is done
+                file.flush()
+            done[np.concatenate(ready)] = 1
+            ready = []
+        step(number, len(todo))
+    return costs
+
+
+def _make_spool(place: Path, key: str, grid: MapGrid) -> None:
+    """Write files of costs of which none is known."""
+    for file in place.iterdir():
+        file.unlink()
+    nothing = make_empty_grid(replace(grid, rows=1, cols=1))
+    for name in _ARRAYS:
+        one = getattr(nothing, name)
+        array = np.lib.format.open_memmap(
+            place / f"{name}.npy", "w+", one.dtype, (*one.shape[:-2], grid.rows, grid.cols)
+        )
+        _allocate(place / f"{name}.npy", array.offset + array.nbytes)
+        array[...] = one
+    np.save(place / "done.npy", np.zeros(grid.rows * grid.cols, np.uint8))
+    write_json(place / "job.json", {"key": key})
 
 
 def _allocate(path: Path, size_bytes: int) -> None:
@@ -311,103 +318,7 @@ def _read_job(place: Path) -> str | None:
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class Cluster:
-    """A Dask scheduler's address or an executor, and what gives its workers the model and the map, by files that they see."""
-
-    address: str | Executor
-    inputs: Callable[[], tuple[CostModel, MapFile]]
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """Blocks of cells for one worker, and what the cost map is made from."""
-
-    inputs: Callable[[], tuple[CostModel, MapFile]]
-    key: str
-    grid: MapGrid
-    blocks: tuple[Cells, ...]
-
-
-def _ask_cluster(
-    cluster: Cluster, key: str, grid: MapGrid, todo: Sequence[Cells]
-) -> Iterator[tuple[Cells, SegmentPredictions]]:
-    """Yield what a cluster's workers say of each block, as their tasks end."""
-    parts = [tuple(todo[first : first + _BLOCKS_KEPT]) for first in range(0, len(todo), _BLOCKS_KEPT)]
-    tasks = [_Task(cluster.inputs, key, grid, part) for part in parts]
-    with closing(run_all(_answer, tasks, jobs=1, cluster=cluster.address)) as outcomes:
-        for outcome in outcomes:
-            found: list[SegmentPredictions] = unwrap_result(outcome)
-            yield from zip(tasks[outcome.index].blocks, found, strict=True)
-
-
-def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
-    """Ask the model about the blocks of a task, on a worker."""
-    try:
-        model, source = task.inputs()
-        if make_cost_map_key(model, source, task.grid.pixel_size_m) != task.key:
-            raise UsageError(
-                f"a worker finds another map {source.name} or model {model.name} than the caller; expected the same files under "
-                "the same names"
-            )
-        frames = CellFrames(task.grid, where=f"map {source.name}")
-        return list(predict_segments(model, source, (frames.of(cells) for cells in task.blocks)))
-    except TcpipeError as error:  # it may lack what is here: an extra, a file
-        return type(error)(*(f"{os.uname().nodename}: {problem}" for problem in error.problems))
-
-
-def _predict_missing(  # noqa: PLR0917
-    model: CostModel, source: MapFile, spool: _Spool, key: str, step: Step, cluster: Cluster | None
-) -> None:
-    """Ask the model, here or on a cluster, about every cell that is not done."""
-    costs = spool.costs
-    frames = CellFrames(costs.grid, where=f"map {source.name}")
-    missing = (spool.done == 0).reshape(costs.grid.rows, costs.grid.cols)
-    todo = list(iterate_blocks(source, model, costs.grid, missing))
-    if not missing.all():
-        logger.info("resuming: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
-    ready: list[Cells] = []
-    answers: Iterator[tuple[Cells, SegmentPredictions]]
-    if cluster is None:
-        answers = zip(todo, predict_segments(model, source, (frames.of(cells) for cells in todo)), strict=True)
-    else:
-        answers = _ask_cluster(cluster, key, costs.grid, todo)
-    for number, (cells, found) in enumerate(answers, 1):
-        costs.put(cells, found)
-        ready.append(cells)
-        if len(ready) == _BLOCKS_KEPT or number == len(todo):
-            spool.keep(np.concatenate(ready))
-            ready = []
-        step(number, len(todo))
-
-
-def _write_files(
-    model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
-) -> CostMapCard:
-    """Write all files but the card; return it."""
-    scales = _write(directory, _Strips(costs, fit_errors(model.residuals), read_classes(source, costs.grid)), origin_m)
-    cells, shares = _compute_shares(costs)
-    return CostMapCard(
-        key=key,
-        map=source.name,
-        model=model.checksum,
-        robot=model.robot,
-        label_energy=model.label_energy,
-        grid=costs.grid,
-        courses_deg=tuple(ANGLES_DEG.tolist()),
-        bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course", "std")),
-        units=_QUANTITIES,
-        reasons={str(int(reason)): flag_name(reason) for reason in Reason},
-        nav2_scale=scales,
-        cells=cells,
-        reason_share=shares,
-        aggregation=AGGREGATION,
-        barred_by=tuple(flag_name(reason) for reason in Reason if reason & BARRED),
-        checksums=compute_checksums(directory),
-    )
-
-
-def _write(directory: Path, strips: _Strips, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
+def _write_files(directory: Path, strips: _Strips, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
     """Write all files but the card; return the scales of the Nav2 maps."""
     costs, grid = strips.costs, strips.costs.grid
     layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}

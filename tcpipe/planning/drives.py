@@ -1,4 +1,4 @@
-"""Time and energy of whole ingested drives, measured and predicted, as files and a page."""
+"""Time and energy of whole ingested drives, measured and predicted, as a file."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.cost.adaptation import Metres, Run
+from tcpipe.cost.adaptation import Metres, Run, predict
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
-from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError, clean_lines
-from tcpipe.formats.atomic import clear, write_text
+from tcpipe.formats.atomic import clear
 from tcpipe.formats.bucket_directories import require_card
 from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, format_verdict
@@ -25,22 +24,12 @@ from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.learning.models import Model
 from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.pipeline.generations import write_generation
-from tcpipe.planning.cost_model import (
-    CostModel,
-    Reason,
-    SegmentPredictions,
-    check_model,
-    iterate_batches,
-    join_predictions,
-    predict_segments,
-)
-from tcpipe.planning.search import find_turning
+from tcpipe.planning.cost_model import Reason, check_model, predict_segments
+from tcpipe.planning.path_cost import find_added_turning
 from tcpipe.recipe import SampleConfig
-from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
-from tcpipe.report.page import Number, Section, render_page, show_verdict
-from tcpipe.report.plots import Plot, make_plot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store
@@ -54,9 +43,6 @@ Floats = NDArray[np.float64]
 
 UNCERTAIN, UNLABELLED = "position_uncertain", "no_label"
 """Why a segment is not compared, besides `Reason`."""
-
-_POINTS = 60
-"""Of a curve along a drive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,15 +63,6 @@ class IntervalComparison:
     def held(self) -> bool | None:
         """Return whether the interval holds what was measured."""
         return None if self.low is None or self.high is None else self.low <= self.measured <= self.high
-
-
-@dataclass(frozen=True, slots=True)
-class CumulativeSums:
-    """Sums along a drive, over the metres that are compared, at up to 60 places."""
-
-    distance_m: tuple[float, ...]
-    duration_s: tuple[IntervalComparison, ...]
-    energy_joule: tuple[IntervalComparison, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +87,6 @@ class DriveCost:
     duration_s: IntervalComparison
     energy_joule: IntervalComparison
     label_energy: str
-    along: CumulativeSums
 
     @property
     def held_back(self) -> bool:
@@ -138,152 +114,124 @@ def find_drive(store: Store, log: str) -> RunDirectory:
     return found[0]
 
 
-def compute_drive_cost(
-    model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
-) -> DriveCost:
-    """Return what a drive took beside what a model says of it.
+@dataclass(frozen=True, slots=True)
+class DrivenMetres:
+    """All segments of a run in order, predicted and measured, with why each is not to be compared; nothing where it is."""
 
-    Parameters
-    ----------
-    model, source : who predicts, and the map.
-    run : the drive, ingested.
-    data : the dataset that the model was trained on: what of the drive it has seen.
-    log : what the user calls it.
-    shifts : of runs on the map.
+    run: Run
+    reasons: Sequence[Sequence[str]]
 
-    Raises
-    ------
-    ModelError, MapError : the model is of another robot or dataset, or the map cannot give what it wants.
-    UsageError : the drive has no segments.
+    @property
+    def is_good(self) -> NDArray[np.bool_]:
+        """Return which segments are to be compared, shape (N,)."""
+        return np.array([not why for why in self.reasons], np.bool_)
+
+    @property
+    def names(self) -> list[str]:
+        """Return all reasons."""
+        return sorted({name for why in self.reasons for name in why})
+
+
+def predict_run(
+    model: Model,
+    source: MapReader,
+    run: RunDirectory,
+    *,
+    gnss_crs: str | None = None,
+    sample: SampleConfig | None = None,
+    shift: Sequence[float] = (0.0, 0.0, 0.0),
+) -> DrivenMetres:
+    """Return what a model says of a run's segments, on their ground by the map, and what was measured.
+
+    ``gnss_crs`` is of the fixes (None: as the run was ingested); ``sample`` says how well a place must be known; ``shift`` moves the run
+    on the map (x, y) and adds to its standard deviation [m].
     """
     check_model(model, source)
-    segments = run.segments()
-    if run.manifest.robot != model.robot:
-        raise ModelError(f"{log}: is of robot {run.manifest.robot}, model {model.name} of {model.robot}")
-    if not segments.num_rows:
-        raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
-    segments = segments.sort_by("start_ns")
-    shift_m, recipe = np.array((shifts or {}).get(run.run_id, (0.0, 0.0, 0.0))), data.card.recipe
-    said = _predict_drive(model, source, segments, recipe.read.gnss_crs, shift_m[:2])
-    std_m = np.hypot(to_floats(segments, "position_std_m"), shift_m[2])
-    reasons = _list_reasons(model, segments, said, std_m > recipe.sample.max_position_std_m)
-    energy = ENERGIES[model.label_energy].energy
-    length_m, good = to_floats(segments, "arc_length_m"), np.array([not why for why in reasons])
-    named = sorted({name for why in reasons for name in why})
-    trained = data["train"]
-    near = are_near(
-        compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
-        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.chord_m,
-    )  # fmt: skip
-    duration = to_floats(segments, "chord_m") / said.velocity_mps
-    along = _sum_along(
-        fit_errors(model.residuals), said.terrain_class[good], np.cumsum(length_m)[good],
-        (to_floats(segments, "duration_s")[good], duration[good]),
-        (to_floats(segments, energy)[good], (said.power_watt * duration)[good]),
-    )  # fmt: skip
-    return DriveCost(
-        run_id=run.run_id, log=log, map=source.name, driven_m=float(sum(run.manifest.distance_by_reason_m.values())),
-        segments_m=float(length_m.sum()), compared_m=float(length_m[good].sum()),
-        rest_m={name: float(length_m[[name in why for why in reasons]].sum()) for name in named},
-        samples_in_training=int((trained.column("run_id").astype(np.str_) == run.run_id).sum()),
-        near_training_percent=100.0 * float(near.mean()),
-        duration_s=along.duration_s[-1] if along.duration_s else IntervalComparison(0.0, 0.0, None, None),
-        energy_joule=along.energy_joule[-1] if along.energy_joule else IntervalComparison(0.0, 0.0, None, None),
-        label_energy=model.label_energy, along=along,
-    )  # fmt: skip
+    segments = run.segments().sort_by("start_ns")
+    values = {
+        name: to_floats(segments, name)
+        for name in ("chord_m", "arc_length_m", "duration_s", "mean_abs_yaw_rate_radps", "position_std_m")
+    }
+    measured, length_m = to_floats(segments, ENERGIES[model.card.label_energy].energy), values["arc_length_m"]
+    turn_rad = values["mean_abs_yaw_rate_radps"] * values["duration_s"]
+    projection = find_map_projection(source, gnss_crs or run.manifest.recipe.read.gnss_crs)
+    start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift[:2] for name in ("start", "end"))
+    frames = make_patch_frames(start, end, values["chord_m"])
+    said = predict_segments(model, source, frames, turn_radpm=turn_rad / length_m)
+    duration, class_id = values["chord_m"] / said.velocity_mps, said.terrain_class
+    turning = find_added_turning(model)
+    turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, class_id, is_driven=True)
+    distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start, axis=0), axis=1)), 0, 0.0)[: len(start)]
+    energy = said.power_watt * duration + np.nan_to_num(turn_joule)
+    both = {
+        "duration": (duration, values["duration_s"], said.duration_std_s),
+        "energy": (energy, measured, said.energy_std_joule),
+    }
+    rise_m = length_m * np.tan(said.slope_rad)
+    metres = {
+        name: Metres(predicted, label, class_id, distance_m, length_m, duration, rise_m, turn_rad, std)
+        for name, (predicted, label, std) in both.items()
+    }
+    uncertain = np.hypot(values["position_std_m"], shift[2]) > (sample or SampleConfig()).max_position_std_m
+    reasons = [
+        [*flag_names(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * (not known)]
+        for bits, unsure, known in zip(
+            said.reasons, uncertain, np.isfinite(measured + values["duration_s"]), strict=True
+        )
+    ]
+    return DrivenMetres(Run(run.run_id, metres), reasons)
 
 
-def _predict_drive(
-    model: CostModel, source: MapReader, segments: pa.Table, gnss_crs: str, shift_m: Floats
-) -> SegmentPredictions:
-    """Return what the model says of each segment, on its ground by the map: where it was driven, moved by a shift (x, y)."""
-    projection = find_map_projection(source, gnss_crs)
-    start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m for name in ("start", "end"))
-    turn_radpm = _find_turns(segments) / to_floats(segments, "arc_length_m")
-    frames = make_patch_frames(start, end, to_floats(segments, "chord_m"))
-    return join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
-
-
-def _find_turns(segments: pa.Table) -> Floats:
-    """Return how far each segment turns, both ways counted [rad]."""
-    return to_floats(segments, "mean_abs_yaw_rate_radps") * to_floats(segments, "duration_s")
-
-
-def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
+def collect_run(model: Model, source: MapReader, run: RunDirectory) -> Run:
     """Return the labelled segments of a run on ground that the model knows, predicted and measured; `UsageError` if there are none.
 
     The run may be of another robot, payload or season: a model is adapted by it.
     """
-    check_model(model, source)
-    segments, gnss_crs = run.segments().sort_by("start_ns"), run.manifest.recipe.read.gnss_crs
-    said = _predict_drive(model, source, segments, gnss_crs, np.zeros(2)) if segments.num_rows else None
-    uncertain = to_floats(segments, "position_std_m") > SampleConfig().max_position_std_m
-    reasons = [] if said is None else _list_reasons(model, segments, said, uncertain)
-    good = np.array([not why for why in reasons], np.bool_)
-    if said is None or not good.any():
-        named = ", ".join(sorted({name.replace("_", " ") for why in reasons for name in why})) or "it has no segments"
+    found = predict_run(model, source, run)
+    if not found.is_good.any():
+        named = ", ".join(found.names).replace("_", " ") or "it has no segments"
         raise UsageError(
             f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
         )
-    duration, energy = to_floats(segments, "chord_m") / said.velocity_mps, ENERGIES[model.label_energy].energy
-    length_m, turn_rad = to_floats(segments, "arc_length_m"), _find_turns(segments)
-    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
-    turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, said.terrain_class)
-    start_xy_m = find_map_projection(source, gnss_crs).forward(read_lonlat_deg(segments, "start"))
-    distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start_xy_m, axis=0), axis=1)), 0, 0.0)
-    both = {
-        "duration": (duration, to_floats(segments, "duration_s")),
-        "energy": (said.power_watt * duration + turn_joule, to_floats(segments, energy)),
-    }
-    return Run(
-        run.run_id,
-        {
-            name: Metres(
-                *of, said.terrain_class, distance_m, length_m, duration, length_m * np.tan(said.slope_rad), turn_rad
-            ).take(good)
-            for name, of in both.items()
-        },
-    )
+    return Run(run.run_id, {name: of.take(found.is_good) for name, of in found.run.metres.items()})
 
 
-def _list_reasons(
-    model: CostModel, segments: pa.Table, said: SegmentPredictions, uncertain: NDArray[np.bool_]
-) -> list[list[str]]:
-    """Return why each segment is not compared; nothing where it is. ``uncertain``: whose place is not known well enough, shape (N,)."""
-    unlabelled = ~np.isfinite(
-        to_floats(segments, ENERGIES[model.label_energy].energy) + to_floats(segments, "duration_s")
-    )
-    return [
-        [*flag_names(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * bool(without)]
-        for bits, unsure, without in zip(said.reasons, uncertain, unlabelled, strict=True)
-    ]
+def compute_drive_cost(
+    model: Model, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
+) -> DriveCost:
+    """Return what a drive took beside what a model says of it.
 
-
-def _sum_along(
-    errors: Mapping[str, Errors] | None,
-    class_id: NDArray[np.uint8],
-    distance_m: Floats,
-    duration: tuple[Floats, Floats],
-    energy: tuple[Floats, Floats],
-) -> CumulativeSums:
-    """Return sums of measured and predicted from the drive's beginning to places spread over it, the last at its end."""
-    count = len(distance_m)
-    ends = sorted({round(end) for end in np.linspace(1, count, min(_POINTS, count)).tolist()}) if count else []
-
-    def sums(quantity: str, measured: Floats, predicted: Floats) -> tuple[IntervalComparison, ...]:
-        found = []
-        for end in ends:
-            low, high = (
-                (None, None)
-                if errors is None
-                else errors[quantity].compute_sum_interval(predicted[:end], class_id[:end])
-            )
-            found.append(IntervalComparison(float(measured[:end].sum()), float(predicted[:end].sum()), low, high))
-        return tuple(found)
-
-    return CumulativeSums(
-        tuple(float(distance_m[end - 1]) for end in ends), sums("duration", *duration), sums("energy", *energy)
-    )
+    ``data`` is the dataset that the model was trained on: what of the drive it has seen; ``log`` what the user calls the drive;
+    ``shifts`` are of runs on the map. `ModelError`, `UsageError`: it is of another robot, or has no segments.
+    """
+    if run.manifest.robot != model.card.robot:
+        raise ModelError(f"{log}: is of robot {run.manifest.robot}, model {model.name} of {model.card.robot}")
+    segments = run.segments()
+    if not segments.num_rows:
+        raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
+    recipe, shift = data.card.recipe, (shifts or {}).get(run.run_id, (0.0, 0.0, 0.0))
+    found = predict_run(model, source, run, gnss_crs=recipe.read.gnss_crs, sample=recipe.sample, shift=shift)
+    errors, trained, length_m = model.errors, data["train"], found.run.metres["energy"].length_m
+    near = are_near(
+        compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
+        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.card.chord_m,
+    )  # fmt: skip
+    good = {name: of.take(found.is_good) for name, of in found.run.metres.items()}
+    sums = {
+        name: IntervalComparison(
+            float(of.measured.sum()), float(of.predicted.sum()),
+            *((None, None) if errors is None else predict(errors[name], of).total.interval),
+        )
+        for name, of in good.items()
+    }  # fmt: skip
+    return DriveCost(
+        run_id=run.run_id, log=log, map=source.name, driven_m=float(sum(run.manifest.distance_by_reason_m.values())),
+        segments_m=float(length_m.sum()), compared_m=float(length_m[found.is_good].sum()),
+        rest_m={name: float(length_m[[name in why for why in found.reasons]].sum()) for name in found.names},
+        samples_in_training=int((trained.column("run_id").astype(np.str_) == run.run_id).sum()),
+        near_training_percent=100.0 * float(near.mean()),
+        duration_s=sums["duration"], energy_joule=sums["energy"], label_energy=model.card.label_energy,
+    )  # fmt: skip
 
 
 def format_drive(drive: DriveCost) -> list[str]:
@@ -308,7 +256,7 @@ def format_drive(drive: DriveCost) -> list[str]:
     return lines
 
 
-JSON, PAGE = "drives.json", "drives.html"
+JSON = "drives.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -345,20 +293,16 @@ class DrivesResult:
                 f"all {len(held)} drives held back: {sums}; intervals cover {hits[0]} of the times and {hits[1]} of the energies"
             )
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
-        return clean_lines((*lines, f"open {self.path}/{PAGE}"))
+        return clean_lines((*lines, f"{self.path}/{JSON}"))
 
 
 def evaluate_drives(
-    model: CostModel, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
+    model: Model, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
 ) -> DrivesResult:
-    """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``, or to a URL.
+    """Compare drives with what a model says of them and write ``drives.json`` into the directory ``out``, or to a URL.
 
     Where the dataset's runs were moved onto their map (``sample.align``), drives are moved together with
     those of them that are in the store, or a finding says why not.
-
-    Raises
-    ------
-    ModelError, MapError, UsageError : as `drives.drive_cost`; ``out`` is a file.
     """
     if is_url(out):
         with write_generation(str(out), JSON) as made:
@@ -368,7 +312,7 @@ def evaluate_drives(
     runs = [find_drive(opened, log) for log in logs]
     clear(place)
     if place.exists() and not place.is_dir():
-        raise UsageError(f"{place}: is a file, expected a directory to write {JSON} and {PAGE} into")
+        raise UsageError(f"{place}: is a file, expected a directory to write {JSON} into")
     recipe, shifts, moved = data.card.recipe, dict[str, tuple[float, float, float]](), list[Finding]()
     if recipe.sample.align:
         names = {run.run_id for run in runs}
@@ -390,34 +334,12 @@ def evaluate_drives(
     )  # fmt: skip
     place.mkdir(parents=True, exist_ok=True)
     write_json(place / JSON, values)
-    write_text(place / PAGE, _render_page(values))
     return DrivesResult(place, values)
 
 
 def _sum(parts: Sequence[IntervalComparison]) -> IntervalComparison:
     """Return sums over drives; how errors of drives go together is not known, so there is no interval."""
     return IntervalComparison(sum(of.measured for of in parts), sum(of.predicted for of in parts), None, None)
-
-
-def _render_page(values: Drives) -> str:
-    return render_page(
-        title="Drives, measured and predicted",
-        lead=f"Model {Path(values.model).name}: sums along each drive over the comparable segments, with 90 % intervals.",
-        numbers=[
-            Number(f"{of.off_percent:+.1f} %", f"{called} of all drives held back, predicted less measured")
-            for called, of in (("time", values.duration_s), ("energy", values.energy_joule))
-            if of.measured
-        ],
-        verdict=show_verdict(values.verdict, values.findings, labels=PREDICTED),
-        sections=[
-            Section(
-                drive.run_id,
-                " ".join(f"{line}." for line in format_drive(drive)),
-                plots=list(_draw_sums(number, drive)),
-            )
-            for number, drive in enumerate(values.drives)
-        ],
-    )
 
 
 def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Finding]:
@@ -440,36 +362,3 @@ def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Findin
             yield from find_miscalibration(measure_coverage(np.array(held), np.arange(len(held))), name, model)
     if 0 < len(compared) < read_threshold("few-drives", "min_drive_count"):
         yield make_finding("few-drives", model, drive_count=len(compared))
-
-
-def _draw_sums(number: int, drive: DriveCost) -> Iterator[Plot]:
-    """Yield what a drive took so far over the distance driven, measured and predicted, with its interval."""
-    distance_m, first = np.array(drive.along.distance_m), None
-    for label, sums in (("time T [s]", drive.along.duration_s), ("energy E [J]", drive.along.energy_joule)):
-        if not len(distance_m):
-            return
-        plot = make_plot(
-            f"{label} {number}",
-            alt=f"{label} of {drive.run_id} so far over the distance driven, measured and predicted, with its 90 % interval.",
-            axes=("distance driven in segments [m]", label),
-            legend={"measured": DROPPED, "predicted, with its interval": SPLIT_COLOURS["train"]},
-            **({} if first is None else {"x_range": first.figure.x_range}),
-            tooltips=[
-                ("at", "@metres{0.0} m"),
-                ("measured", "@measured{0.0}"),
-                ("predicted", "@predicted{0.0}"),
-                ("90 %", "@low{0.0} to @high{0.0}"),
-            ],
-        )
-        names = ("measured", "predicted", "low", "high")
-        columns = {name: np.array([getattr(of, name) for of in sums], np.float64) for name in names}
-        source = {"metres": distance_m, **columns}
-        plot.figure.varea("metres", "low", "high", source=source, color=SPLIT_COLOURS["train"], alpha=0.2)
-        plot.figure.hover.renderers = [
-            plot.figure.line("metres", name, source=source, color=colour, line_width=2)
-            for name, colour in (("measured", DROPPED), ("predicted", SPLIT_COLOURS["train"]))
-        ]
-        plot.figure.hover.mode = "vline"
-        plot.figure.yaxis.formatter.use_scientific = False
-        first = plot
-        yield plot

@@ -1,9 +1,9 @@
-"""The cost of a path: cut into pieces of a metre, one prediction each, and summed (paper, section III)."""
+"""The cost of a path: cut into segments of a metre, one prediction each, and summed (paper, section III)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,27 +12,26 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
-from tcpipe.cost.adaptation import ELSEWHERE_M, Metres, Run, adapt
-from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
+from tcpipe.cost.adaptation import ELSEWHERE_M, Adapted, Metres, Run, adapt, predict
+from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.rotation import wrap_to_pi
+from tcpipe.learning.models import Model
 from tcpipe.path import find_cuts
 from tcpipe.planning.cost_model import (
-    CostModel,
     Reason,
     SegmentPredictions,
     check_model,
     count_reasons,
-    iterate_batches,
-    join_predictions,
     predict_segments,
 )
-from tcpipe.planning.search import compute_turns, find_turning
+from tcpipe.planning.search import Turning, compute_turns, find_turning
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.tables.findings import LEFT_OUT
 from tcpipe.terrain.projection import Projection, compute_area, make_metres_from_plane
 from tcpipe.terrain.sampling import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
@@ -42,11 +41,18 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathTotals:
-    """What a path costs in all, over the pieces that have a cost; ``complete`` says whether all have."""
+    """What a path costs in all, over the path segments that have a cost, by which model, on which map, for which robot."""
 
+    model: str
+    map: str
+    robot: str
+    label_energy: str = "total"
+    """``total`` or ``net``: which energy it is."""
+    adapted_by: str | None = field(default=None, metadata=LEFT_OUT)
+    """Run whose metres adapted the model."""
     length_m: float
-    pieces: int
-    pieces_without_cost: int
+    path_segments: int
+    path_segments_without_cost: int
     duration_s: float
     energy_joule: float
     turn_rad: float = 0.0
@@ -55,23 +61,26 @@ class PathTotals:
     """Of the energy, what turns cost beyond those of the segments that the model knows; None where its robot's physics is not known, and
     where the model was told the turns: its energies hold them."""
     duration_interval_s: tuple[float, float] | None
-    """None, as that of energy, without held-out samples."""
+    """Of what the robot's own sensors will measure; None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
+    energy_common_std_joule: float | None = None
+    """Standard deviation of what these sensors measure against the truth (gain and zero of the power sensor); in no interval."""
     coverage: float = COVERAGE
     """Share of drives that an interval is to cover."""
     held_out_samples: int = 0
     held_out_runs: int = 0
     """Samples that determine the intervals."""
     reasons: Mapping[str, int]
-    """Pieces by reason; a piece may have several."""
+    """By reason; a path segment may have several."""
     complete: bool
+    """Whether all path segments have a cost."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathCost:
-    """What a path costs; ``pieces`` is a checked table (`path_table.PIECES`), one row a piece in order."""
+    """What a path costs; ``path_segments`` is a checked table (`PATH_SEGMENTS`), one row a path segment in order."""
 
-    pieces: pa.Table
+    path_segments: pa.Table
     totals: PathTotals
     errors: Mapping[str, SumDistribution] | None
     """Of ``duration`` [s] and ``energy`` [J] in all; None without held-out samples."""
@@ -102,7 +111,7 @@ def find_origin_m(source: MapReader, origin_deg: tuple[float, float] | None) -> 
 
 
 def compute_path_cost(
-    model: CostModel,
+    model: Model,
     source: MapReader,
     lonlat_deg: Floats,
     *,
@@ -118,30 +127,26 @@ def compute_path_cost(
     lonlat_deg : the path's points, WGS 84, shape (P, 2).
     where : what the path is called in errors.
     known : metres of a run of the robot that is to drive the path.
-    shortest_m : the least length of a path, without it that of a piece.
-
-    Raises
-    ------
-    ModelError, MapError : the map cannot give what the model wants, or cannot be read.
-    PathError : the path is shorter, or nowhere on the map.
+    shortest_m : the least length of a path, without it that of a path segment.
     """
     check_model(model, source)
-    pieces = cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where, shortest_m=shortest_m)
-    frames = pieces.frames(model.chord_m)
-    if not count_corners_on(source.grid, compute_footprints(frames, model.patch_m)).any():
+    segments = _cut_into_segments(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
+    frames = segments.frames(model.card.chord_m)
+    if not count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
-    turn_radpm = compute_turns(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m
-    usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
+    turn_rad = compute_turns(segments.start_xy_m, segments.end_xy_m)
+    turn_radpm = turn_rad / segments.arc_m
+    usual_radpm = 0.0 if model.card.physics is None else model.card.physics.mean_turn_radpm
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
-    said = join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
-    said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
-    return _sum_costs(model, source, pieces, said, known)
+    said = predict_segments(model, source, frames, turn_radpm)
+    said.reasons[segments.arc_m > model.card.max_arc_to_chord * segments.chord_m] |= np.uint16(Reason.CURVED)
+    return _sum_costs(model, source, segments, said, turn_rad, known)
 
 
-def cut_into_pieces(
-    source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None = None
-) -> Pieces:
-    """Return the pieces of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
+def _cut_into_segments(
+    source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None
+) -> PathSegments:
+    """Return the path segments of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
     projection = find_projection(source)
     xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
@@ -150,100 +155,108 @@ def cut_into_pieces(
     scale = float(np.mean(np.sqrt(np.abs(np.linalg.det(make_metres_from_plane(projection.target, xy_m))))))
     if not length_m:
         raise PathError(f"{where}: is one point; expected a path of at least {chord_m:g} m")
-    pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)
-    if not pieces.chord_m.size or pieces.chord_m[0] < (shortest_m or chord_m) * (1.0 - 1e-6):
+    segments = cut_path(xy_m, chord_m=chord_m, scale=scale)
+    if not segments.chord_m.size or segments.chord_m[0] < (shortest_m or chord_m) * (1.0 - 1e-6):
         raise PathError(
             f"{where}: is {length_m * scale:.2f} m long and never {chord_m:g} m from where it starts; "
             f"expected a path of at least {chord_m:g} m"
         )
-    return pieces
+    return segments
 
 
-def _sum_costs(
-    model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions, known: Run | None
+def find_added_turning(model: Model) -> Turning | None:
+    """Return what turns cost beside what a model predicts; None where it was told them, or the robot's physics is not known."""
+    return None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
+
+
+def _sum_costs(  # noqa: PLR0917
+    model: Model,
+    source: MapReader,
+    segments: PathSegments,
+    said: SegmentPredictions,
+    turn_rad: Floats,
+    known: Run | None,
 ) -> PathCost:
-    bits, class_id, errors = said.reasons, said.terrain_class, fit_errors(model.residuals)
-    duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
-    turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
-    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
-    turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
+    class_id, errors, turning = said.terrain_class, model.errors, find_added_turning(model)
+    nothing = np.full(len(class_id), np.nan)
+    duration = segments.arc_m / said.velocity_mps
+    turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, segments.arc_m, class_id)
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
-    (fast, slow), (least, most), sums = (nothing, nothing), (nothing, nothing), None
-    if known is not None:
-        if errors is None:
-            raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
-        begin_m, rise_m = ELSEWHERE_M + np.cumsum(pieces.arc_m), pieces.arc_m * np.tan(said.slope_rad)
-        adapted = {
-            name: adapt(
-                errors[name],
-                known.metres[name],
-                Metres(of, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad),
+    found = {
+        name: Adapted(of, nothing, nothing, SumDistribution(0.0, 0.0, 0.0))
+        for name, of in (("duration", duration), ("energy", energy))
+    }
+    if known is not None and errors is None:
+        raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
+    if errors is not None:
+        begin_m, rise_m = ELSEWHERE_M + np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
+        for name, of in found.items():
+            std = segments.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
+            there = Metres(of.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std)
+            found[name] = (
+                predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
             )
-            for name, of in (("duration", duration), ("energy", energy))
-        }
-        duration, energy = adapted["duration"].value, adapted["energy"].value
-        (fast, slow), (least, most) = ((of.low, of.high) for of in (adapted["duration"], adapted["energy"]))
-        sums = {name: of.total for name, of in adapted.items()}
-    elif errors is not None:
-        fast, slow = errors["duration"].compute_intervals(duration, class_id)
-        least, most = errors["energy"].compute_intervals(energy, class_id)
-        sums = {
-            "duration": errors["duration"].compute_sum(duration, class_id),
-            "energy": errors["energy"].compute_sum(energy, class_id),
-        }
-    table = PIECES.table(
-        piece=np.arange(len(bits)),
-        **_locate_pieces(source, pieces),
+    time, joule = found["duration"], found["energy"]
+    table = PATH_SEGMENTS.table(
+        path_segment=np.arange(len(class_id)),
+        **_locate_segments(source, segments),
         terrain_class=class_id,
         terrain_name=source.classes.names()[class_id].tolist(),
         slope_rad=said.slope_rad,
         cross_slope_rad=said.cross_slope_rad,
         power_watt=said.power_watt,
         velocity_mps=said.velocity_mps,
-        duration_s=duration,
-        duration_low_s=fast,
-        duration_high_s=slow,
+        duration_s=time.value,
+        duration_low_s=time.low,
+        duration_high_s=time.high,
         turn_rad=turn_rad,
         turn_energy_joule=turn_joule,
-        energy_joule=energy,
-        energy_low_joule=least,
-        energy_high_joule=most,
-        reasons=bits,
-        reason_names=[" ".join(flag_names(int(value), Reason)) for value in bits],
+        energy_joule=joule.value,
+        energy_low_joule=joule.low,
+        energy_high_joule=joule.high,
+        reasons=said.reasons,
+        reason_names=[" ".join(flag_names(int(value), Reason)) for value in said.reasons],
     )
     without_cost = int(table.column("duration_s").null_count)
+    sums = None if errors is None else {name: of.total for name, of in found.items()}
     totals = PathTotals(
-        length_m=float(pieces.arc_m.sum()),
-        pieces=table.num_rows,
-        pieces_without_cost=without_cost,
-        duration_s=float(np.nansum(duration)),
-        energy_joule=float(np.nansum(energy)),
+        model=model.name,
+        map=source.name,
+        robot=model.card.robot,
+        label_energy=model.card.label_energy,
+        adapted_by=None if known is None else known.name,
+        length_m=float(segments.arc_m.sum()),
+        path_segments=table.num_rows,
+        path_segments_without_cost=without_cost,
+        duration_s=float(np.nansum(time.value)),
+        energy_joule=float(np.nansum(joule.value)),
         turn_rad=float(turn_rad.sum()),
         turn_energy_joule=None if turning is None else float(np.nansum(turn_joule)),
         duration_interval_s=sums["duration"].interval if sums else None,
         energy_interval_joule=sums["energy"].interval if sums else None,
+        energy_common_std_joule=sums["energy"].common_std if sums else None,
         held_out_samples=errors["energy"].samples if errors else 0,
         held_out_runs=errors["energy"].runs if errors else 0,
-        reasons=count_reasons(bits),
+        reasons=count_reasons(said.reasons),
         complete=not without_cost,
     )
     return PathCost(table, totals, sums)
 
 
-def _locate_pieces(source: MapReader, pieces: Pieces) -> dict[str, Floats]:
-    """Return where the pieces lie, as columns."""
+def _locate_segments(source: MapReader, segments: PathSegments) -> dict[str, Floats]:
+    """Return where the path segments lie, as columns."""
     projection = find_projection(source)
-    start, end = (projection.inverse(xy_m) for xy_m in (pieces.start_xy_m, pieces.end_xy_m))
+    start, end = (projection.inverse(xy_m) for xy_m in (segments.start_xy_m, segments.end_xy_m))
     azimuth_deg, _, _ = Geod(ellps="WGS84").inv(start[:, 0], start[:, 1], end[:, 0], end[:, 1])
     return {
         "start_lon_deg": start[:, 0],
         "start_lat_deg": start[:, 1],
         "end_lon_deg": end[:, 0],
         "end_lat_deg": end[:, 1],
-        "distance_m": np.cumsum(pieces.arc_m) - pieces.arc_m,
-        "chord_m": pieces.chord_m,
-        "arc_length_m": pieces.arc_m,
+        "distance_m": np.cumsum(segments.arc_m) - segments.arc_m,
+        "chord_m": segments.chord_m,
+        "arc_length_m": segments.arc_m,
         "course_rad": wrap_to_pi(np.radians(90.0 - np.asarray(azimuth_deg))),
     }
 
@@ -264,12 +277,12 @@ def describe_off_map(source: MapReader, where: str, lonlat_deg: Floats) -> str:
 
 _F, _WGS84 = pa.float64(), "WGS84"
 
-PIECES = TableSchema(
-    "pieces",
+PATH_SEGMENTS = TableSchema(
+    "path segments",
     "path",
     "Segments of a path in order, with their costs (tcpipe predict-path).",
     (
-        Column("piece", pa.int64(), "", "Number of the path segment, from 0."),
+        Column("path_segment", pa.int64(), "", "Number of the path segment, from 0."),
         Column("start_lon_deg", _F, "deg", "Longitude of its start.", _WGS84),
         Column("start_lat_deg", _F, "deg", "Latitude of its start.", _WGS84),
         Column("end_lon_deg", _F, "deg", "Longitude of its end.", _WGS84),
@@ -308,21 +321,21 @@ def check_ending(path: Path) -> None:
         raise UsageError(f"{path}: is a directory, expected a file")
 
 
-def write_pieces(path: Path, table: pa.Table) -> None:
+def write_path_segments(path: Path, table: pa.Table) -> None:
     """Write the table in the format of the file's ending, whole or not at all."""
     match path.suffix.lower():
         case ".parquet":
             write_table(table, path)
         case ".json":
-            write_json(path, {"pieces": table.to_pylist()})
+            write_json(path, {"path_segments": table.to_pylist()})
         case _:
             with write_atomic_file(path) as temporary:
                 csv.write_csv(table, temporary)
 
 
 @dataclass(frozen=True, slots=True)
-class Pieces:
-    """N pieces of a path, in order.
+class PathSegments:
+    """N path segments of a path, in order.
 
     Attributes
     ----------
@@ -338,14 +351,14 @@ class Pieces:
     scale: float
 
     def frames(self, chord_m: float) -> PatchFrames:
-        """Return the patch of each piece; that of a shorter last one ends with it and reaches back over the piece before."""
+        """Return the patch of each path segment; that of a shorter last one ends with it and reaches back over the one before."""
         along = (self.end_xy_m - self.start_xy_m) / np.linalg.norm(self.end_xy_m - self.start_xy_m, axis=1)[:, None]
         start = self.end_xy_m - along * (chord_m / self.scale)
         return make_patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))
 
 
-def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
-    """Return the pieces of a polyline.
+def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> PathSegments:
+    """Return the path segments of a polyline.
 
     Parameters
     ----------
@@ -358,4 +371,4 @@ def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
     ends = np.array([(x, y) for x, y, _ in cuts]).reshape(-1, 2)
     arc = np.diff(np.array([length for _, _, length in cuts])) * scale
     chord = np.linalg.norm(np.diff(ends, axis=0), axis=1) * scale
-    return Pieces(ends[:-1], ends[1:], chord, arc, scale)
+    return PathSegments(ends[:-1], ends[1:], chord, arc, scale)

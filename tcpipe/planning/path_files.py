@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,32 +15,33 @@ from tcpipe.cost.adaptation import Run
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
+from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
-from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_sealed_as, write_sealed
+from tcpipe.formats.integrity import compute_checksum, describe_broken, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.geometry.rotation import wrap_to_pi
+from tcpipe.learning.models import Model
 from tcpipe.planning.cost_grid import make_survey, read_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
-from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, write_pieces
+from tcpipe.planning.cost_model import check_model
+from tcpipe.planning.path_cost import (
+    PathTotals,
+    check_ending,
+    compute_path_cost,
+    find_added_turning,
+    write_path_segments,
+)
+from tcpipe.planning.path_options import PlanPathOptions
 from tcpipe.planning.plan import OBJECTIVES, Objective, Plan, PlanTotals, plan_paths
-from tcpipe.planning.search import find_turning
 from tcpipe.store import open_store
-from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
 
 
 def choose_map(store: str | Path, name: str | None) -> MapFile:
-    """Return the named map of a store, or its only one.
-
-    Raises
-    ------
-    StoreError, MapError : there is no store, no such map, or it cannot be read.
-    UsageError : there are several, and none is named.
-    """
+    """Return the named map of a store, or its only one; `UsageError` if there are several and none is named."""
     opened = open_store(store)
     maps = opened.maps()
     if not maps:
@@ -56,21 +57,8 @@ _PATH_VERSION = "1.2"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NamedTotals(PathTotals):
-    """What a path costs in all, by which model, on which map, for which robot."""
-
-    model: str
-    map: str
-    robot: str
-    label_energy: str = "total"
-    """``total`` or ``net``: which energy it is."""
-    adapted_by: str | None = field(default=None, metadata=LEFT_OUT)
-    """Run whose metres adapted the model."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TableTotals(NamedTotals):
-    """All of ``<table>.summary.json`` but its seal: what a table of pieces is made from, and what the path costs in all."""
+class TableTotals(PathTotals):
+    """All of ``<table>.summary.json`` but its seal: what a table of path segments is made from, and what the path costs in all."""
 
     key: str
     """Hash of the path, the model and the map."""
@@ -79,7 +67,7 @@ class TableTotals(NamedTotals):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PathResult(NamedTotals):
+class PathResult(PathTotals):
     """What a path costs; ``str`` of it is what the command prints."""
 
     path: Path
@@ -99,7 +87,7 @@ class PathResult(NamedTotals):
         lines = [f"{self.path}: {format_cost(self)}{above}", *findings]
         if self.out is not None:
             same = "; nothing to do: it is made from the same path, model and map"
-            lines.append(f"{self.out}: {self.pieces} path segments{same if self.status == 'unchanged' else ''}")
+            lines.append(f"{self.out}: {self.path_segments} path segments{same if self.status == 'unchanged' else ''}")
         return clean_lines(lines)
 
 
@@ -107,7 +95,7 @@ def format_cost(of: PathTotals) -> str:
     """Return length, time and energy with their intervals, as one line."""
     duration = _format_quantity(of.duration_s, of.duration_interval_s, "s")
     energy = _format_quantity(of.energy_joule, of.energy_interval_joule, "J")
-    part = "" if of.complete else f", without {of.pieces_without_cost} of {of.pieces} path segments"
+    part = "" if of.complete else f", without {of.path_segments_without_cost} of {of.path_segments} path segments"
     turns = (
         ""
         if of.turn_energy_joule is None
@@ -127,7 +115,7 @@ def _format_quantity(value: float, interval: tuple[float, float] | None, unit: s
 def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
     """Yield where the model has no support on a path, and how little its intervals rest on."""
     for reason, count in of.reasons.items():
-        names, total = {"reason": reason.replace("_", " ")}, of.pieces
+        names, total = {"reason": reason.replace("_", " ")}, of.path_segments
         yield make_finding("path-not-supported", path, names=names, segment_count=count, total_count=total)
     if of.duration_interval_s is None:
         yield make_finding("no-intervals", path)
@@ -140,16 +128,11 @@ def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
 
 
 def predict_path(
-    model: CostModel, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
+    model: Model, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
 ) -> PathResult:
-    """Return what the line in a GeoJSON file costs; write its pieces to ``out`` and the totals beside it.
+    """Return what the line in a GeoJSON file costs; write its path segments to ``out`` and the totals beside it.
 
     ``adapted_by`` is a run by whose metres the model is adapted.
-
-    Raises
-    ------
-    PathError, ModelError, MapError : the path, the model or the map cannot be used.
-    UsageError, StoreError : ``out`` ends in no known format, or cannot be written.
     """
     if out is not None:
         check_ending(out)
@@ -163,20 +146,15 @@ def predict_path(
     if out is not None and (known := _compute_totals(out, key)) is not None:
         return convert_record(known, PathResult, path=path, out=out, status="unchanged")
     cost = compute_path_cost(model, source, lonlat_deg, where=str(path), known=adapted_by)
-    totals = convert_record(
-        cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot, label_energy=model.label_energy,
-        adapted_by=None if adapted_by is None else adapted_by.name,
-    )  # fmt: skip
     if out is not None:
-        write_pieces(out, cost.pieces)
-        write_sealed(
-            make_summary_path(out), convert_record(totals, TableTotals, key=key, sha256=compute_checksum(out).sha256)
-        )
-    return convert_record(totals, PathResult, path=path, out=out, status="done")
+        write_path_segments(out, cost.path_segments)
+        made = convert_record(cost.totals, TableTotals, key=key, sha256=compute_checksum(out).sha256)
+        write_sealed(make_summary_path(out), made)
+    return convert_record(cost.totals, PathResult, path=path, out=out, status="done")
 
 
 def make_summary_path(out: Path) -> Path:
-    """Return where the totals of a table of pieces stand."""
+    """Return where the totals of a table of path segments stand."""
     return out.with_name(f"{out.name}.summary.json")
 
 
@@ -195,36 +173,6 @@ _PLAN_VERSION = "1.2"
 
 RISK = 0.95
 """Probability with which a budget shall suffice, where none is asked for."""
-
-
-@dataclass(frozen=True, slots=True)
-class PlanRequest:
-    """What is asked: ends as lon, lat [deg], what is to be least, side of a cell [m], and whether unseen ground may be crossed.
-
-    ``risk`` is as in `plan_paths`; with ``round_trip`` a way back is planned; ``budget_joule`` is to suffice for both.
-    """
-
-    start_deg: tuple[float, float]
-    goal_deg: tuple[float, float]
-    objective: Objective = "energy"
-    cell_size_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
-    allow_extrapolation: bool = False
-    risk: Annotated[float, Bounds(ge=0.5, le=0.999)] | None = None
-    budget_joule: Annotated[float, Bounds(gt=0)] | None = None
-    round_trip: bool = False
-    cost_map: Path | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedPath(PlanTotals):
-    """Properties of the path in a plan's file."""
-
-    model: str
-    map: str
-    robot: str
-    allow_extrapolation: bool
-    label_energy: str = "total"
-    """``total`` or ``net``: which energy it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,7 +205,7 @@ class PlanOrigin:
 class PlanFile:
     """The file of a plan: GeoJSON of one line and, with a way back, another; as a foreign member what it is made from (RFC 7946, 6.1)."""
 
-    features: tuple[LineFeature[PlannedPath], ...]
+    features: tuple[LineFeature[PlanTotals], ...]
     tcpipe: PlanOrigin
     type: Literal["FeatureCollection"] = "FeatureCollection"
 
@@ -283,8 +231,13 @@ class PlanResult:
     @property
     def exit_code(self) -> int:
         """Return 3 if some path segment has no cost, or the budget suffices with less than the probability asked for; else 0."""
-        ways = (self.plans[self.objective], *([self.together.back] if self.together and self.together.back else []))
-        return 3 if self._is_budget_too_small or not all(way.complete for way in ways) else 0
+        return 3 if self._is_budget_too_small or not all(way.complete for way in self._ways) else 0
+
+    @property
+    def _ways(self) -> list[PlanTotals]:
+        """Return what was asked for: the path, and the way back if there is one."""
+        back = None if self.together is None else self.together.back
+        return [self.plans[self.objective], *([] if back is None else [back])]
 
     @property
     def _is_budget_too_small(self) -> bool:
@@ -310,8 +263,8 @@ class PlanResult:
 
     def _find_doubts(self) -> Iterator[Finding]:
         """Yield what the path segments of the plan show that its cells did not."""
-        path, together = Subject("file", self.out.name), self.together
-        for asked in (self.plans[self.objective], *([together.back] if together and together.back else [])):
+        path = Subject("file", self.out.name)
+        for asked in self._ways:
             yield from find_doubts(asked, path)
             if not asked.complete:
                 yield make_finding("cells-too-large", path)
@@ -329,78 +282,63 @@ def _format_risk(plan: PlanTotals) -> str:
     )
 
 
-def plan(
-    model: CostModel,
-    source: MapFile,
-    request: PlanRequest,
-    *,
-    out: Path,
-    picture: Path | None,
-    step: Callable[[int, int], None] = lambda _, __: None,
-) -> PlanResult:
-    """Find the path that is asked for and write it to ``out``; with ``picture`` all three, side by side.
+_RULES = ("start", "goal", "objective", "cell_size_m", "allow_extrapolation", "risk", "budget_joule", "round_trip")
+"""Options that determine a plan."""
 
-    Raises
-    ------
-    PathError, ModelError, MapError : an end, the model, the map or the cost map cannot be used, or there is no way.
-    UsageError, StoreError : an output has a wrong name, or cannot be written.
-    """
+
+def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
+    """Find the path that is asked for and write it to ``out``; with ``picture`` all three, side by side."""
+    out, picture = Path(options.out), None if options.picture is None else Path(options.picture)
     _check_names(out, picture)
     clear_beside(out)
-    start, goal = (np.array(end, np.float64) for end in (request.start_deg, request.goal_deg))
+    start, goal = (np.array(end, np.float64) for end in (options.start, options.goal))
     for label, end in (("--from", start), ("--to", goal)):
         check_lonlat(label, end[None])
     check_model(model, source)
-    drawn = picture is not None
-    card = None if request.cost_map is None else _read_card(request.cost_map, model, source)
-    rules = replace(request, cost_map=None, cell_size_m=card.grid.pixel_size_m if card else request.cell_size_m)
-    made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": drawn}
+    costs = None if options.cost_map is None else fetch_directory(options.cost_map)
+    card = None if costs is None else _read_card(costs, model, source)
+    rules = {name: getattr(options, name) for name in _RULES}
+    if card is not None:
+        rules["cell_size_m"] = card.grid.pixel_size_m
+    made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": picture is not None}
     key = digest({**made_from, "cost_map": card is not None, "version": _PLAN_VERSION})
+    objective = options.objective
     if (found := _read_plans(out, picture, key)) is not None:
-        return PlanResult(request.objective, out, picture, "unchanged", *found)
-    if request.cost_map is None or card is None:
-        survey = make_survey(model, source, request.cell_size_m)
+        return PlanResult(objective, out, picture, "unchanged", *found)
+    if costs is None or card is None:
+        survey = make_survey(model, source, options.cell_size_m)
     else:
-        survey = read_survey(model, source, open_cost_map(request.cost_map, card))
-    wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
-    risk = RISK if request.risk is None and request.budget_joule is not None else request.risk
-    search = partial(plan_paths, survey, allow_extrapolation=request.allow_extrapolation, risk=risk, step=step)
+        survey = read_survey(model, source, open_cost_map(costs, card))
+    wanted = (objective, *(name for name in OBJECTIVES if picture is not None and name != objective))
+    risk = RISK if options.risk is None and options.budget_joule is not None else options.risk
+    step = options.on_step or (lambda _, __: None)
+    search = partial(plan_paths, survey, allow_extrapolation=options.allow_extrapolation, risk=risk, step=step)
     plans = search(start, goal, wanted)
-    asked = plans[request.objective]
-    back = search(goal, start, (request.objective,))[request.objective] if request.round_trip else None
-    together = (
-        None if back is None and request.budget_joule is None else _add_up(model, asked, back, request.budget_joule)
-    )
-    origin = PlanOrigin(key, {name: found.totals for name, found in plans.items()}, wanted, together=together)
+    asked = plans[objective]
+    back = search(goal, start, (objective,))[objective] if options.round_trip else None
+    together = None
+    if back is not None or options.budget_joule is not None:
+        together = _add_up(model, asked, back, options.budget_joule)
+    origin = PlanOrigin(key, {name: of.totals for name, of in plans.items()}, wanted, together=together)
     if picture is not None:
         from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw
 
         draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
         origin = replace(origin, picture_sha256=compute_checksum(picture).sha256)
-    who = {
-        "model": model.name,
-        "map": source.name,
-        "robot": model.robot,
-        "allow_extrapolation": request.allow_extrapolation,
-    }
-    who["label_energy"] = model.label_energy
-    paths = tuple(
-        make_line_feature(way.lonlat_deg, convert_record(way.totals, PlannedPath, **who))
-        for way in (asked, *([back] if back else []))
-    )
+    paths = tuple(make_line_feature(way.lonlat_deg, way.totals) for way in (asked, *([] if back is None else [back])))
     write_json(out, PlanFile(paths, origin))
-    return PlanResult(request.objective, out, picture, "done", origin.plans, together)
+    return PlanResult(objective, out, picture, "done", origin.plans, together)
 
 
-def _add_up(model: CostModel, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
+def _add_up(model: Model, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
     """Return what a path and the way back take, with the turn between them, and the probability that a budget suffices."""
     energy, complete = there.totals.energy_joule, there.totals.complete
     errors = None if there.cost.errors is None else there.cost.errors["energy"]
     if back is not None:
-        turning = None if model.takes_turns else find_turning(model.physics, model.classes)
+        turning = find_added_turning(model)
         last, first = (np.diff(way.xy_m, axis=0) for way in (there, back))
         turn_rad = wrap_to_pi(np.arctan2(*first[0, ::-1]) - np.arctan2(*last[-1, ::-1]))
-        class_id = to_integers(there.cost.pieces, "terrain_class")[-1:].astype(np.uint8)
+        class_id = to_integers(there.cost.path_segments, "terrain_class")[-1:].astype(np.uint8)
         turn = 0.0 if turning is None else float(turning.energy_joule(np.array([turn_rad]), np.zeros(1), class_id)[0])
         energy, complete = energy + turn + back.totals.energy_joule, complete and back.totals.complete
         if errors is not None and back.cost.errors is not None:
@@ -422,13 +360,13 @@ def _check_names(out: Path, picture: Path | None) -> None:
         raise UsageError(f"{picture}: expected the name of a file that ends in .png")
 
 
-def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
+def _read_card(path: Path, model: Model, source: MapFile) -> CostMapCard:
     """Return the card of a cost map of this model and map; `ModelError` if it is none."""
     card = read_cost_map_card(path)
     if card is None:
         if not (path / CARD).is_file():
             raise UsageError(f"{path}: not a cost map; make one with tcpipe cost-map")
-        raise ModelError(f"{find_broken_seal(path / CARD)}; make one with tcpipe cost-map")
+        raise ModelError(f"{describe_broken(path / CARD)}; make one with tcpipe cost-map")
     if card.key != make_cost_map_key(model, source, card.grid.pixel_size_m):
         raise ModelError(
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.options import CLUSTER, MAP, MODEL, PHYSICS, PREDICTOR, SPEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import MAP, MODEL, PHYSICS, PREDICTOR, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.planning.plan import Objective
@@ -117,9 +117,6 @@ class CostMapOptions:
     speed_mps: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     store: str = option("tcpipe-store", STORE)
-    cluster: str | None = option(
-        None, replace(CLUSTER, about="Dask scheduler whose workers compute it, tcp://host:port (or TCPIPE_CLUSTER).")
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, fit_errors
+from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
 from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
@@ -67,6 +67,7 @@ class PlanTotals(PathTotals):
 
     objective: Objective
     """What it is the least of."""
+    allow_extrapolation: bool
     finalists: int
     """Paths that were judged; this one is the best of them."""
     predicted_cells: int
@@ -116,13 +117,8 @@ def plan_paths(
     allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
     risk : the probability with which a path shall take no more than what is least; None: its prediction is least.
     step : is told how many blocks of how many are looked at, or predicted, in each round.
-
-    Raises
-    ------
-    PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
-    ModelError : the model states no errors for ``risk``.
     """
-    errors = fit_errors(survey.model.residuals)
+    errors = survey.model.errors
     if risk is not None and errors is None:
         raise ModelError(
             f"{survey.model.name}: has too few held-out samples for errors, which --risk and --budget need"
@@ -137,11 +133,12 @@ def plan_paths(
     plans = {}
     for objective in objectives:
         of_all = [_judge(cost, objective, risk) for cost in costs]
-        best = min(range(len(lines)), key=lambda at, of_all=of_all: (costs[at].totals.pieces_without_cost, of_all[at]))  # type: ignore[misc]
+        best = min((cost.totals.path_segments_without_cost, of_all[at], at) for at, cost in enumerate(costs))[-1]
         totals = convert_record(
             costs[best].totals,
             PlanTotals,
             objective=objective,
+            allow_extrapolation=allow_extrapolation,
             finalists=len(lines),
             predicted_cells=predicted_cells,
             negative_steps=negative.get(objective, 0),
@@ -201,9 +198,9 @@ class _Search:
                 elif not may[class_id]:
                     problems.append(f"{label}: is on {names[class_id]}, which is not traversable")
         apart_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]))
-        if apart_m < self.survey.model.chord_m:
+        if apart_m < self.survey.model.card.chord_m:
             problems.append(
-                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; expected at least {self.survey.model.chord_m:g} m"
+                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; expected at least {self.survey.model.card.chord_m:g} m"
             )
         elif len(set(self._cells.tolist())) == 1:
             pixel_size_m = self.survey.costs.grid.pixel_size_m
@@ -266,7 +263,7 @@ class _Search:
             return steps, ()
         if objective != "energy" or class_id is None:
             return steps, find_least_cost_paths(steps, 0.0, start, goal)
-        turning = find_turning(self.survey.model.physics, self.survey.model.classes)
+        turning = find_turning(self.survey.model.card.physics, self.survey.model.card.class_table)
         return steps, find_least_cost_paths(steps, find_best_potential(steps), start, goal, turning, class_id)
 
     def find_finalists(

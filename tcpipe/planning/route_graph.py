@@ -18,7 +18,8 @@ from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import Json, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.route_graph import RouteEdge, RouteGraph, make_route_graph, read_route_graph
-from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.learning.models import Model
+from tcpipe.planning.cost_model import check_model
 from tcpipe.planning.path_cost import PathCost, compute_path_cost, find_origin_m, find_projection
 from tcpipe.store import Store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
@@ -80,7 +81,7 @@ class RouteGraphResult:
 
 
 def write_route_graph(
-    model: CostModel,
+    model: Model,
     source: MapFile,
     out: Path,
     *,
@@ -97,11 +98,6 @@ def write_route_graph(
     graph, store : the graph's file, or without one the store whose runs propose one.
     origin_deg : longitude and latitude where the graph's frame has x = y = 0, its axes those of the map's CRS; the CRS's own without.
     two_way : whether an edge is added for each that has none back.
-
-    Raises
-    ------
-    PathError, ModelError, MapError : the graph, the model or the map cannot be used.
-    UsageError, StoreError : ``out`` is the graph itself, has a wrong name or cannot be written; the store has no runs on the map.
     """
     if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
         raise UsageError(f"{out}: expected the name of a file that ends in .geojson or .json")

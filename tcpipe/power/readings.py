@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.power.joints import Columns, JointPower
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
     REJECTED,
+    Columns,
     Floats,
     HuskyPower,
+    JointPower,
     RailReadings,
     apply_sign,
     find_rejection,

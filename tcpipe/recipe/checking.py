@@ -70,7 +70,7 @@ def from_values(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
 def read_annotations(cls: type) -> Mapping[str, Any]:
     """Return the annotation of every field of a dataclass."""
     hints = get_type_hints(cls, include_extras=True)
-    return {of.name: hints[of.name] for of in fields(cls)}
+    return {entry.name: hints[entry.name] for entry in fields(cls)}
 
 
 def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
@@ -113,8 +113,8 @@ def _read_key_docstrings(cls: type) -> Mapping[str, str]:
     """Return the docstring that stands below each field of a dataclass."""
     body = cast("ast.ClassDef", ast.parse(dedent(inspect.getsource(cls))).body[0]).body
     found = {}
-    for of, text in pairwise(body):
-        match of, text:
+    for statement, text in pairwise(body):
+        match statement, text:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as docstring)):
                 found[name] = docstring
     return found
@@ -150,7 +150,7 @@ def as_toml(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_make_key(str(name))} = {as_toml(item)}" for name, item in value.items()) + "}"
     if is_dataclass(value) and not isinstance(value, type):
-        return as_toml({name: of for name, of in asdict(value).items() if of is not None})
+        return as_toml({name: item for name, item in asdict(value).items() if item is not None})
     if isinstance(value, int) and value.bit_length() > _DECIMAL_BITS:
         return hex(value)
     return repr(value)
@@ -169,15 +169,15 @@ def parse_utc_ns(text: str) -> int:
 
 def _check_value(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
     """Return the plain value of an annotation; what is wrong becomes a problem."""
-    origin, of = get_origin(kind), get_args(kind)
+    origin, arguments = get_origin(kind), get_args(kind)
     if is_dataclass(kind):
         return _find_dataclass(kind, value, key, problems)
     if origin is dict and isinstance(value, Mapping):
-        known = None if of[0] is str else get_args(of[0])
+        known = None if arguments[0] is str else get_args(arguments[0])
         items = ((name, item) for name, item in value.items() if _is_known(name, known, key, problems))
-        return {name: _check_value(of[1], item, _join_key(key, name), problems) for name, item in items}
+        return {name: _check_value(arguments[1], item, _join_key(key, name), problems) for name, item in items}
     if origin is list and isinstance(value, list | tuple):
-        return [_check_value(of[0], item, f"{key}.{place}", problems) for place, item in enumerate(value)]
+        return [_check_value(arguments[0], item, f"{key}.{place}", problems) for place, item in enumerate(value)]
     try:
         return msgspec.convert(_to_plain(value), kind)
     except (msgspec.ValidationError, ValueError):  # a number of thousands of digits is the latter
@@ -206,13 +206,13 @@ def _find_dataclass(cls: Any, values: Any, key: str, problems: list[str]) -> Any
     if isinstance(values, cls):
         if hasattr(cls, "__post_init__"):  # it has checked itself
             return values
-        values = {of.name: getattr(values, of.name) for of in fields(cls)}
+        values = {entry.name: getattr(values, entry.name) for entry in fields(cls)}
     if not isinstance(values, Mapping):
         return _reject(key, values, "a table of keys", problems)
     kinds, before = read_annotations(cls), len(problems)
     items = ((name, value) for name, value in values.items() if _is_known(name, kinds, key, problems))
     made = {name: _check_value(kinds[name], value, _join_key(key, name), problems) for name, value in items}
-    needed = (of.name for of in fields(cls) if of.default is MISSING and of.default_factory is MISSING)
+    needed = (entry.name for entry in fields(cls) if entry.default is MISSING and entry.default_factory is MISSING)
     problems += [f"{_join_key(key, name)} is missing" for name in needed if name not in values]
     if len(problems) > before:
         return None

@@ -415,7 +415,9 @@ class TableMapping:
             return None
         return PowerSource(
             TABLE_POWER,
-            **{of: of for of in ("voltage", "current", "power", "energy") if of in self.columns},  # type: ignore[arg-type]
+            **{
+                quantity: quantity for quantity in ("voltage", "current", "power", "energy") if quantity in self.columns
+            },  # type: ignore[arg-type]
             topic=f"/{name}",
             sign="drawn_positive" if "energy" in self.columns else "auto",
             nominal_voltage_volt=self.nominal_voltage_volt,

@@ -37,7 +37,14 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import clean_line
-from tcpipe.formats.finding_lines import MOST_LINES, FindingGroup, format_finding, format_group, format_remedy_blocks
+from tcpipe.formats.finding_lines import (
+    MOST_LINES,
+    FindingGroup,
+    describe_finding,
+    describe_group,
+    describe_title,
+    list_remedies,
+)
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
@@ -85,11 +92,13 @@ class Shaded:
 
 @dataclass(frozen=True, slots=True)
 class ShownFinding:
-    """A finding, or those of one code, as a line, with the recipe that fits in no line below it."""
+    """The findings of one code: what it means, what was observed and when, and what helps, with the lines to copy."""
 
     severity: Severity
-    text: str
-    recipe: str
+    code: str
+    title: str
+    observed: Sequence[tuple[str, tuple[float, float] | None]]
+    remedies: Sequence[tuple[str, Sequence[str]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +118,17 @@ def show_verdict(
     *,
     labels: Sequence[Affected] = AFFECTED,
 ) -> VerdictBox:
-    """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` of one code as `format_group` takes them."""
-    lines = [(part.severity, format_finding(part), [part]) for part in sort_findings(findings)]
-    lines += [(group.severity, format_group(group, total, noun), group.findings) for group, total, noun in groups]
-    shown = [ShownFinding(severity, text, "\n".join(format_remedy_blocks(part))) for severity, text, part in lines]
+    """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` as `describe_group` takes them."""
+    by_code: dict[tuple[Severity, str], list[Finding]] = {}
+    for finding in sort_findings(findings):
+        by_code.setdefault((finding.severity, finding.code), []).append(finding)
+    shown = []
+    for (severity, code), of_code in by_code.items():
+        observed = [(describe_finding(of), of.span_s) for of in of_code]
+        shown.append(ShownFinding(severity, code, describe_title(of_code[0]), observed, list_remedies(of_code)))
+    for group, total, noun in groups:
+        title, text = describe_title(group.findings[0]), describe_group(group, total, noun)
+        shown.append(ShownFinding(group.severity, group.code, title, [(text, None)], list_remedies(group.findings)))
     problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
     return VerdictBox(
         grades=tuple((name, getattr(verdict, name)) for name in labels),
@@ -128,6 +144,7 @@ class Section:
 
     title: str
     text: str = ""
+    """What follows a line break is folded."""
     header: Sequence[str] = field(default_factory=tuple)
     rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
     figures_from: int | None = None
@@ -139,6 +156,8 @@ class Section:
     """Whether the table waits behind a line to click."""
     stacked: bool = False
     """Whether the figures are one below the other on wide pages too, as those with one axis are."""
+    parts: Sequence[Section] = ()
+    """Sections below it, which have no parts; those without figures wait behind their titles."""
 
 
 def render_page(
@@ -159,15 +178,15 @@ def render_page(
     Parameters
     ----------
     title, lead, verdict, numbers, warnings : the top of the page, in this order.
-    sections : in the order of the page; their titles form the table of contents.
+    sections : in the order of the page; the first stands beside the verdict, the titles form the table of contents.
     links : pages that belong to it.
     script, data : file beside this one that runs when all figures are drawn, and its data.
     reads_pictures : whether the page may load pictures beside it; it never loads anything else.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = _format_cell
-    figures, ids = plots.render_plots([plot for section in sections for plot in section.plots])
-    names = iter(ids)
+    drawn = [plot for section in sections for part in (section, *section.parts) for plot in part.plots]
+    figures, ids = plots.render_plots(drawn)
     page = environment.from_string(_read_file("page.html.j2")).render(
         title=title,
         lead=lead,
@@ -176,14 +195,9 @@ def render_page(
         verdict=verdict,
         links=links,
         pictures="'self' file: " if reads_pictures else "",
-        sections=[
-            (
-                section,
-                [(plot, next(names)) for plot in section.plots],
-                _read_file(section.controls) if section.controls else "",
-            )
-            for section in sections
-        ],
+        sections=sections,
+        ids={plot.figure.name: id_ for plot, id_ in zip(drawn, ids, strict=True)},
+        read_file=_read_file,
         version=__version__,
         style=_read_file("page.css"),
         scripts=_SCRIPTS,

@@ -5,13 +5,14 @@ const unpacked = Promise.all(packed.map(page.unpack));
 page.start(async () => {
   const { at, make, fillSelect, pairs, model, ramp } = page;
   const told = page.data;
-  const [spans, s, ...found] = await unpacked;
-  const series = Object.fromEntries(Object.entries(told.series).map(([name, { gap_s }], i) => [name, { ...found[i], gap_s }]));
+  const [spans, s, ...columns] = await unpacked;
+  const series = Object.fromEntries(Object.entries(told.series).map(([name, { gap_s }], i) => [name, { ...columns[i], gap_s }]));
   const [track, n] = [series.track, s.start.length];
   const panels = [];
   const range = model("gates").x_range;
   const names = { w: ["power w", "power", "W", 1], v: ["velocity v", "velocity", "m/s", 3], T: ["time T", "duration", "s", 3], E: ["energy E", "energy", "J", 1],
-    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 1], residual: ["w beyond physics", "residual", "W", 1] };
+    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 1], residual: ["w beyond physics", "residual", "W", 1], sigma: ["σ of position", "position_std", "m", 3] };
+  const ofTrack = { w: "power", v: "speed", sigma: "position_std" };  // columns that colour the whole track, segments or not
   const there = Object.keys(names).filter((key) => s[names[key][1]]?.some(Number.isFinite));
   const finite = Number.isFinite;
 
@@ -116,21 +117,59 @@ page.start(async () => {
 
   // Segments on the map and in their own plot.
   const flagged = Array.from(s.quality, (bits) => (bits & told.flags ? told.doubted : told.kept));
-  const number = (value, [, , unit, digits]) => (finite(value) ? `${value.toFixed(digits)} ${unit}` : "none");
-  function coloured(key) {
-    if (key === "quality") {
-      const entries = [["segment", told.kept], ["with a flag", told.doubted], ["kept, not in a segment", told.unused], ...told.reasons
-        .filter(([bit]) => spans.bits.some((bits) => bits & bit)).map(([, name, , colour]) => [name, colour])];
-      at("scale").replaceChildren(...page.legend(entries));
-      return flagged;
-    }
-    const values = s[names[key][1]];
+  const number = (value, [, , unit, digits]) => (finite(value) ? `${page.fixed(value, digits)} ${unit}` : "none");
+  function ramped(values, kind) {
     const [low, high] = page.ends(values);
-    at("scale").replaceChildren(...page.scale(number(low, names[key]), number(high, names[key])));
+    at("scale").replaceChildren(...page.scale(number(low, kind), number(high, kind)));
     return Array.from(values, (value) => finite(value)
       ? ramp[Math.max(0, Math.min(ramp.length - 1, Math.floor((ramp.length * (value - low)) / ((high - low) || 1))))] : told.unused);
   }
-  const paint = () => { model("segments").data_source.data = { x0: s.x0, y0: s.y0, x1: s.x1, y1: s.y1, colour: coloured(at("colour").value) }; };
+  // The track from one time to another as lines, which gaps end.
+  function pathOf(from, to) {
+    const paths = [];
+    let x = [], y = [];
+    for (let k = from; k < to; k++) {
+      const gap = k > from && track.t[k] - track.t[k - 1] > track.gap_s;
+      if (gap || k === from) { x = []; y = []; paths.push([x, y]); }
+      else if (k < to - 1 && Math.hypot(track.x[k] - x[x.length - 1], track.y[k] - y[y.length - 1]) < told.step_m) continue;
+      x.push(track.x[k]); y.push(track.y[k]);
+    }
+    return paths;
+  }
+  const lines = (paths, colour) => ({ xs: paths.map(([x]) => x), ys: paths.map(([, y]) => y), colour });
+  const bySpan = [[], []];
+  spans.start.forEach((start, i) => {
+    for (const path of pathOf(after(track.t, start), Math.min(after(track.t, spans.end[i]) + 1, track.t.length))) {
+      bySpan[0].push(path);
+      bySpan[1].push(told.reasons.find(([bit]) => spans.bits[i] & bit)?.[3] ?? told.unused);
+    }
+  });
+  function byColumn(key) {
+    const step = Math.max(1, Math.ceil(track.t.length / 1500)), values = [], paths = [];
+    for (let k = 0; k + 1 < track.t.length; k += step) {
+      const known = Array.from(track[ofTrack[key]].slice(k, k + step)).filter(finite);
+      for (const path of pathOf(k, Math.min(k + step + 1, track.t.length))) {
+        paths.push(path);
+        values.push(known.length ? page.mean(known) : NaN);
+      }
+    }
+    return lines(paths, ramped(values, names[key]));
+  }
+  function paint() {
+    const key = at("colour").value, whole = track[ofTrack[key]]?.some(finite);
+    model("track").data_source.data = whole ? byColumn(key) : lines(...bySpan);
+    let colour = flagged;
+    if (key === "severity") {
+      const seen = told.severities.filter((_, k) => s.severity.includes(k));
+      at("scale").replaceChildren(...page.legend([...seen, ["no finding of its own", told.kept], ["not in a segment", told.unused]]));
+      colour = Array.from(s.severity, (k) => told.severities[k]?.[1] ?? told.kept);
+    } else if (key === "quality") {
+      const entries = [["segment", told.kept], ["with a flag", told.doubted], ["kept, not in a segment", told.unused], ...told.reasons
+        .filter(([bit]) => spans.bits.some((bits) => bits & bit)).map(([, name, , colour]) => [name, colour])];
+      at("scale").replaceChildren(...page.legend(entries));
+    } else if (!whole) colour = ramped(s[names[key][1]], names[key]);
+    model("segments").data_source.data = whole ? { x0: [], y0: [], x1: [], y1: [], colour: [] } : { x0: s.x0, y0: s.y0, x1: s.x1, y1: s.y1, colour };
+  }
   function label() {
     if (!model("labels")) return;
     const [, name, unit] = names[at("label").value];
@@ -139,22 +178,12 @@ page.start(async () => {
     model("labels").data_source.data = { t: s.start.map((t, i) => (t + s.end[i]) / 2), y, low: off(-1), high: off(1), colour: flagged };
     model("label plot").left[0].axis_label = `${at("label").value} [${unit}]${std ? ", ± σ" : ""}`;
   }
-  const xs = [], ys = [], colour = [];
-  for (let i = 0; i < spans.start.length; i++) {
-    const [from, to] = [after(track.t, spans.start[i]), Math.min(after(track.t, spans.end[i]) + 1, track.t.length)];
-    const [x, y] = [[], []];
-    for (let k = from; k < to; k++) {
-      if (k > from && k < to - 1 && Math.hypot(track.x[k] - x[x.length - 1], track.y[k] - y[y.length - 1]) < told.step_m) continue;
-      if (k > from && track.t[k] - track.t[k - 1] > track.gap_s) break;
-      x.push(track.x[k]); y.push(track.y[k]);
-    }
-    xs.push(x); ys.push(y);
-    colour.push(told.reasons.find(([bit]) => spans.bits[i] & bit)?.[3] ?? told.unused);
-  }
-  model("track").data_source.data = { xs, ys, colour };
+  const found = told.findings.flatMap(([start, end, colour]) => pathOf(after(track.t, start - 1), after(track.t, end + 1)).map((path) => [path, colour]));
+  model("findings").data_source.data = lines(found.map(([path]) => path), found.map(([, colour]) => colour));
   page.chooseGround(told.ground);
   at("ground").closest("label").hidden = !told.ground.length;
-  fillSelect(at("colour"), ["quality", ...there], (key) => (key === "quality" ? "use and quality" : names[key][0]));
+  const colours = [...there, ...Object.keys(ofTrack).filter((key) => !there.includes(key) && track[ofTrack[key]]?.some(finite))];
+  fillSelect(at("colour"), ["quality", "severity", ...colours], (key) => ({ quality: "use and quality", severity: "severity" })[key] ?? names[key][0]);
   fillSelect(at("label"), there, (key) => names[key][0]);
   at("label").closest("label").hidden = !there.length;
   at("colour").onchange = paint;
@@ -194,7 +223,7 @@ page.start(async () => {
       left.append(make("b", `Segment ${i + 1} of ${n}`), pairs([
         ...Object.values(names).filter(([, name]) => s[name] !== undefined).map((kind) => {
           const std = s[`${kind[1]}_std`]?.[i];
-          return [kind[0], finite(std) && finite(s[kind[1]][i]) ? `${s[kind[1]][i].toFixed(kind[3])} ± ${std.toPrecision(2)} ${kind[2]}` : number(s[kind[1]][i], kind)];
+          return [kind[0], finite(std) && finite(s[kind[1]][i]) ? `${page.fixed(s[kind[1]][i], kind[3])} ± ${std.toPrecision(2)} ${kind[2]}` : number(s[kind[1]][i], kind)];
         }),
         ["quality", flags.length ? flags.join("; ") : "clean"],
         ["in a dataset", page.explain(`${told.run}-${told.starts[i]}`)]]));
@@ -203,12 +232,19 @@ page.start(async () => {
         pairs(why.length ? why.map(([, name, words]) => [name, words]) : [["why", bitsAt(t) === null
           ? "no measurements that can be fused" : "steady, but too curved, or shorter than a segment"]]));
     }
-    right.append(make("b", `${t.toFixed(2)} s`), pairs([["time", clock(t)], ...values(t)]));
+    right.append(make("b", `${t.toFixed(2)} s`), pairs([["time", clock(t)], ...(i >= 0 ? [] : values(t))]));
     at("chosen").replaceChildren(left, right);
   }
   const pick = (k) => choose((s.start[k] + s.end[k]) / 2);
   const current = (by) => { const t = chosen ?? first, i = segmentAt(t); return i >= 0 ? i : after(s.start, t) - (by > 0 ? 1 : 0); };
   page.stepThrough(() => n, current, pick);
+  document.querySelectorAll(".show").forEach((button) => {
+    const { from, to } = button.dataset, found = told.findings.find(([, , , ...span]) => span[0] === Number(from) && span[1] === Number(to));
+    if (!found) return;
+    const [start, end] = found, room = Math.max(2, 0.2 * (end - start));
+    button.hidden = false;
+    button.onclick = () => { zoom(start - room, end + room); choose(start); };
+  });
   at("row").max = n;
   [at("time").min, at("time").max] = [first, last];
   at("time").oninput = () => choose(at("time").valueAsNumber);

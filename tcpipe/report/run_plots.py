@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.power.rails import is_power_only
-from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS
+from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS, SEVERITY_COLOURS
 from tcpipe.report.page import Column, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
 from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import StageFacts
+from tcpipe.tables.findings import Finding
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -230,6 +232,28 @@ def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Span
     return Spans(t_s[begin] - period_s / 2, t_s[last] + period_s / 2, bits[begin])
 
 
+@dataclass(frozen=True, slots=True)
+class FindingSpan:
+    """When an error or a warning holds, on the page's axis."""
+
+    finding: Finding
+    start_s: float
+    end_s: float
+
+
+def find_finding_spans(findings: Iterable[Finding], track: pa.Table, timeline: Timeline) -> list[FindingSpan]:
+    """Return the spans of errors and warnings that have one; where its ends lie in no clock epoch, they are seconds of the axis."""
+    spans, start_ns = [], int(to_integers(track, "stamp_ns")[0])
+    for finding in findings:
+        if finding.severity == "note" or finding.span_s is None:
+            continue
+        ends_s = np.array(finding.span_s)
+        on_axis_s = timeline.seconds(start_ns + np.round(ends_s * 1e9).astype(np.int64))
+        start_s, end_s = np.clip(np.where(np.isnan(on_axis_s), ends_s, on_axis_s), 0.0, timeline.end_s).tolist()
+        spans.append(FindingSpan(finding, start_s, end_s))
+    return spans
+
+
 REASON_WORDS = {
     DropReason.GAP: "no usable motion or power: gap of a sensor, jump, or uncertain position",
     DropReason.STATIONARY: "it stands",
@@ -296,9 +320,10 @@ def time_plots(
     facts: StageFacts,
     rejections: pa.Table,
     has_labels: bool,
+    findings: Sequence[FindingSpan] = (),
 ) -> tuple[list[Plot], list[Json]]:
     """Return the plots, one below the other, and the lines as the page's script reads them."""
-    first = _draw_masks(timeline, spans, facts)
+    first = _draw_masks(timeline, spans, facts, findings)
     plots = [first]
     lines_json: list[Json] = []
     for name in dict.fromkeys(line.plot for line in lines):
@@ -318,12 +343,14 @@ def time_plots(
         plots.append(_draw_labels(first))
     for plot in plots[1:-1]:
         plot.figure.xaxis.visible = False
-    plots[-1].figure.xaxis.axis_label = "time since the track began [s]"
-    plots[-1].figure.height += 40
+    for plot in {id(plot): plot for plot in (first, plots[-1])}.values():
+        plot.figure.xaxis.axis_label = "time since the track began [s]"
+        plot.figure.height += 40
+    border_px = max(112, 16 + 7 * max(map(len, first.figure.y_range.factors)))
     for plot in plots:
         figure = plot.figure
         figure.toolbar_location = None
-        figure.min_border_left = 112
+        figure.min_border_left = border_px
         figure.min_border_right = 12
         shade = {"x0": [0.0], "x1": [0.0], "colour": [KEPT]}
         name = f"shade {figure.name}"
@@ -351,16 +378,28 @@ def _draw_panel(name: str, label: str, first: Plot, *, legend: Mapping[str, str]
     return plot
 
 
-def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
-    """Return the plot of kept rows, reasons for dropping the others, and events; all plots share its time axis."""
-    events = list(_iterate_events(timeline, facts))
-    reasons = [bit for bit in DropReason if (spans.bits & int(bit)).any()]
-    rows = ["kept", *(flag_name(bit).replace("_", " ") for bit in reasons), *dict.fromkeys(row for row, *_ in events)]
+def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts, findings: Sequence[FindingSpan]) -> Plot:
+    """Return the plot of findings, kept rows, reasons for dropping the others, and events; all plots share its time axis."""
+    least_s = 0.004 * timeline.end_s  # so that a moment can be seen
+    events = [
+        (
+            of.finding.code,
+            of.start_s,
+            max(of.end_s, of.start_s + least_s),
+            SEVERITY_COLOURS[of.finding.severity],
+            describe_finding(of.finding),
+        )
+        for of in findings
+    ]
+    problems = dict.fromkeys(row for row, *_ in events)
+    events += _iterate_events(timeline, facts)
+    reasons = [flag_name(bit).replace("_", " ") for bit in DropReason if (spans.bits & int(bit)).any()]
+    rows = [*problems, "kept", *reasons, *dict.fromkeys(row for row, *_ in events if row not in problems)]
     plot = make_plot(
         "gates",
-        alt="Kept sections of the drive, masks of the rest, and when sensors were rejected or disagreed.",
+        alt="When findings hold, kept sections of the drive, masks of the rest, and when sensors were rejected or disagreed.",
         axes=("", ""),
-        height_px=40 + 22 * len(rows),
+        height_px=40 + 20 * len(rows),
         tools="xbox_zoom",
         y_range=rows[::-1],
         x_range=(0.0, max(timeline.end_s, 1.0)),
@@ -369,14 +408,15 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     bars = {"left": [0.0], "right": [1.0], "row": ["kept"], "colour": [KEPT]}
     figure.hbar(y="row", left="left", right="right", height=0.75, color="colour", source=bars, name="gates bars")
     if events:
-        source = dict(zip(("row", "left", "right", "text"), zip(*events, strict=True), strict=True))
-        show_text(plot, figure.hbar(y="row", left="left", right="right", height=0.75, color=DROPPED, source=source))
+        names = ("row", "left", "right", "colour", "text")
+        source = dict(zip(names, zip(*events, strict=True), strict=True))
+        show_text(plot, figure.hbar(y="row", left="left", right="right", height=0.75, color="colour", source=source))
     figure.ygrid.visible = False
     return plot
 
 
-def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str]]:
-    """Yield events: row, start and end [s], and text."""
+def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str, str]]:
+    """Yield when sensors disagreed or were rejected: row, start and end [s], colour and text."""
     events = []
     for part in facts.audit.disagreements if facts.audit else ():
         role = part.sensor.replace("_", " ")
@@ -390,11 +430,7 @@ def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str
     for row, start_ns, end_ns, epoch, text in events:
         start_s, end_s = timeline.seconds(np.array([start_ns, end_ns]), np.full(2, epoch)).tolist()
         if np.isfinite(start_s):
-            yield row, start_s, end_s, text
-    for number, later in enumerate(timeline.epochs[1:]):
-        steps = facts.clock_steps[number : number + 1]
-        text = f"the clock steps by {steps[0].step_s:+.3f} s" if steps else "the clock steps"
-        yield "clock step", later.start_s - 1.0, later.start_s, text
+            yield row, start_s, end_s, DROPPED, text
 
 
 def _draw_rejections(timeline: Timeline, first: Plot, rejections: pa.Table) -> Iterator[Plot]:

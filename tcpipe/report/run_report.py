@@ -17,7 +17,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.report.colours import DOUBTED, KEPT, LINE_COLOURS, UNUSED
+from tcpipe.report.colours import DOUBTED, KEPT, LINE_COLOURS, SEVERITY_COLOURS, UNUSED
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -32,9 +32,11 @@ from tcpipe.report.page import Column, Link, Number, Section, make_shown_column,
 from tcpipe.report.plots import Plot, label_histograms, make_plot, show_text
 from tcpipe.report.run_plots import (
     SPEED_ROLES,
+    FindingSpan,
     Line,
     Series,
     Timeline,
+    find_finding_spans,
     find_mask_spans,
     make_lines,
     make_rail_series,
@@ -45,15 +47,16 @@ from tcpipe.report.run_plots import (
     time_plots,
 )
 from tcpipe.store import Store
+from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import NoiseFacts, PhysicsFacts, StageFacts
-from tcpipe.tables.findings import Finding, select_findings
+from tcpipe.tables.findings import SEVERITIES, Finding, rank_severity, read_catalogue, select_findings
 
 _PAGE = "report.html"
-_DAMAGE = "Places where messages are or may be lost."
 _NOISE = (
-    "How much the error of each sensor changes over a time difference (1σ): fitted to the longest section of the run (line), and by the "
-    "covariances of its messages, were their errors independent (dashed). A filled circle: the run determines more than half of the "
+    "Noise of the sensors: how much the error of each changes over a time difference (1σ).\n"
+    "Line: fitted to the longest section of the run; dashed: by the "
+    "covariances of its messages, were their errors independent. A filled circle: the run determines more than half of the "
     "variance; an empty one: it is mostly what tcpipe assumes of such sensors."
 )
 _NOISE_PLOTS = {
@@ -86,7 +89,6 @@ def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[
     source = "source unknown"
     if run_json is not None:
         source = f"from {', '.join(run_json.source.paths)} ({run_json.source.size_bytes / 1e6:.1f} MB)"
-    damage = [(describe_finding(finding),) for finding in manifest.damage]
     return render_page(
         title=f"Run {run.run_id}",
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {source}",
@@ -102,11 +104,8 @@ def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[
         sections=[
             *drive,
             *make_losses_sections([ledger], "Kept and excluded distances add up to the odometer.", names_runs=False),
-            *_make_label_sections(segments, label.physics if label else None, manifest.robot),
-            *([make_quality_section(to_integers(segments, "quality"), "segments")] if segments.num_rows else []),
-            *make_budget_sections(run.facts.energy_budget),
-            *make_sensor_sections(run_json, manifest, rejections),
-            *([Section("Damage of the log", _DAMAGE, header=("what",), rows=damage, folded=True)] if damage else []),
+            *_make_label_sections(run, segments, label.physics if label else None),
+            _make_sensor_section(run_json, manifest, rejections),
             _make_provenance_section(run, manifest, run_json),
         ],
         script="run.js" if data is not None else "",
@@ -138,6 +137,7 @@ def _draw_run(
     sensor_series, lost = _read_series(store, run, timeline)
     series = [make_track_series(track, timeline, run_map.track_xy_m), *sensor_series]
     lines, spans = make_lines(series), find_mask_spans(track, timeline, info.rate_hz)
+    findings = find_finding_spans(info.report.findings, track, timeline)
     over_time, lines_json = time_plots(
         timeline,
         lines=lines,
@@ -145,6 +145,7 @@ def _draw_run(
         facts=info.report.facts,
         rejections=rejections,
         has_labels=bool(segments.num_rows),
+        findings=findings,
     )
     data: dict[str, Json] = {
         "run": run.run_id,
@@ -154,7 +155,11 @@ def _draw_run(
         "series": {part.name: part.to_json() for part in series},
         "lines": lines_json,
         "spans": spans.to_json(),
-        "segments": _make_segments_data(segments, timeline, run_map),
+        "segments": _make_segments_data(segments, timeline, run_map, findings=info.report.findings, spans=findings),
+        "findings": [
+            [of.start_s, of.end_s, SEVERITY_COLOURS[of.finding.severity], *(of.finding.span_s or ())] for of in findings
+        ],
+        "severities": [[name, SEVERITY_COLOURS[name]] for name in SEVERITIES],
         "starts": [str(stamp) for stamp in to_integers(segments, "start_ns").tolist()],
         "reasons": make_reasons_data(),
         "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
@@ -166,13 +171,13 @@ def _draw_run(
         "unused": UNUSED,
         "tall_by_wide": float(np.divide(*np.maximum(np.ptp(run_map.track_xy_m, axis=0), 1.0)[::-1])),
     }
-    text = "The colour shows the use of the distance, or why it is excluded; click on the track or a plot for details."
+    text = "Click on the track or a plot for details."
     over = " ".join([_describe_series(series, lines), *lost])
-    sections = [
-        Section("The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot]),
-        Section("Over time", over, controls="run_time.html", plots=over_time, stacked=True),
-    ]
-    return sections, data
+    first, *others = over_time
+    drive = Section(
+        "The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot, first], stacked=True
+    )
+    return [drive, Section("Over time", over, controls="run_time.html", plots=others, stacked=True)], data
 
 
 def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[list[Series], list[str]]:
@@ -201,7 +206,7 @@ def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
 def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
     """Return the text above the plots over time, with the series that are thinned."""
     text = (
-        "Shaded: excluded, in the colour of the reason. Draw a box to zoom, double-click for the whole run; all plots follow. "
+        "Shaded: excluded, in the colour of the reason. Draw a box to zoom, double-click for the whole run; all plots follow.\n"
         "Where many values share a pixel, the line shows their minimum and maximum."
     )
     if not any(line.plot == "power" for line in lines):
@@ -215,7 +220,14 @@ def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
     return text
 
 
-def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap) -> Json:
+def _make_segments_data(
+    segments: pa.Table,
+    timeline: Timeline,
+    run_map: RunMap,
+    *,
+    findings: Sequence[Finding],
+    spans: Sequence[FindingSpan],
+) -> Json:
     """Return the columns of segments on the page."""
     epoch = to_integers(segments, "clock_epoch")
     columns: dict[str, Column] = {
@@ -234,25 +246,51 @@ def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap)
         ("f32", np.degrees(to_floats(segments, f"yaw_change_{part}rad"))) for part in ("", "std_")
     )
     columns["residual"] = "f32", to_floats(segments, "power_watt") - to_floats(segments, "physics_power_watt")
-    return pack_columns(columns | {"quality": ("u16", to_integers(segments, "quality"))})
+    columns["position_std"] = "half", to_floats(segments, "position_std_m")
+    columns["quality"] = "u16", to_integers(segments, "quality")
+    columns["severity"] = "u8", _find_severities(columns, findings, spans)
+    return pack_columns(columns)
 
 
-def _make_label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> Iterator[Section]:
+def _find_severities(
+    columns: Mapping[str, Column], findings: Sequence[Finding], spans: Sequence[FindingSpan]
+) -> NDArray[np.int64]:
+    """Return the worst severity that concerns each segment by a span or a flag: its place in `SEVERITIES`, beyond them where none does."""
+    start_s, end_s = (np.asarray(columns[name][1], np.float64) for name in ("start", "end"))
+    quality = np.asarray(columns["quality"][1], np.int64)
+    concerned = [(of.finding.severity, (start_s <= of.end_s) & (end_s >= of.start_s)) for of in spans]
+    flags = {code: int(Quality[entry.flag.upper()]) for code, entry in read_catalogue().items() if entry.flag}
+    concerned += [(of.severity, (quality & flags[of.code]) != 0) for of in findings if of.code in flags]
+    worst = np.full(len(quality), len(SEVERITIES))
+    for severity, rows in concerned:
+        worst[rows] = np.minimum(worst[rows], rank_severity(severity))
+    return worst
+
+
+def _make_label_sections(run: RunDirectory, segments: pa.Table, physics: PhysicsFacts | None) -> list[Section]:
+    """Return the section on labels, with physics, flags and uncertainty below it; none of a run without segments."""
     if not segments.num_rows:
-        return
-    yield Section("Labels", "One value per segment.", plots=label_histograms(segments, "segments", prefix="of "))
-    yield from make_physics_sections({robot: physics.fit} if physics is not None and physics.fit is not None else {})
+        return []
+    fits = {run.manifest.robot: physics.fit} if physics is not None and physics.fit is not None else {}
+    parts = [
+        *make_physics_sections(fits),
+        make_quality_section(to_integers(segments, "quality"), "segments"),
+        *make_budget_sections(run.facts.energy_budget),
+    ]
+    plots = label_histograms(segments, "segments", prefix="of ")
+    return [Section("Labels", "One value per segment.", plots=plots, parts=parts)]
 
 
-def make_sensor_sections(run_json: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
-    """Return the sections on topics, rejections, noise and clocks; ``run_json`` is None where it is lost."""
+def _make_sensor_section(run_json: RunJson | None, manifest: Manifest, rejections: pa.Table) -> Section:
+    """Return the section on topics, rejections, noise and clocks; ``run_json`` is None where it is lost."""
     facts = manifest.info.report.facts
-    return [
+    plots = list(_draw_noises(facts))
+    parts = [
         *([] if run_json is None else [_make_topics_section(run_json, manifest.counts)]),
         *_make_trust_sections(facts, rejections),
-        *_make_noise_sections(facts),
         *_make_clock_sections(facts, manifest.info.report.findings),
     ]
+    return Section("Sensors", _NOISE if plots else "", plots=plots, parts=parts)
 
 
 def _name(role: str) -> str:
@@ -268,7 +306,7 @@ def _make_topics_section(run_json: RunJson, counts: Counts) -> Section:
         for role, sensor in sorted(run_json.sensors.items())
     ]
     header = ("role", "topic", "type", "messages", "stamp", "placed by", "why this topic")
-    return Section("Sensors", "Roles and the topics used for them.", header=header, rows=rows)
+    return Section("Topics and roles", header=header, rows=rows)
 
 
 def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Section]:
@@ -289,7 +327,7 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
     if not rows:
         return []
     text = (
-        "Rejected: by the χ² gate, or unusable (rejections.parquet lists each). NIS is the mean squared innovation over its "
+        "Rejected: by the χ² gate, or unusable (rejections.parquet lists each).\nNIS is the mean squared innovation over its "
         "variance and dimension, of fused measurements: at 1 the stated σ is correct; far above 1 it is too small; "
         "far below, too large."
     )
@@ -297,19 +335,17 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
     return [Section("Rejected measurements by sensor", text, header=header, rows=rows)]
 
 
-def _make_noise_sections(facts: StageFacts) -> list[Section]:
-    """Return the section on the noise of the sensors; none of a run whose estimator does not fit it."""
+def _draw_noises(facts: StageFacts) -> Iterator[Plot]:
+    """Yield the plots of the noise of the sensors; none of a run whose estimator does not fit it."""
     stretches = [each for each in (facts.fuse.stretches if facts.fuse else ()) if each.noise]
     if not stretches:
-        return []
+        return
     noise = max(stretches, key=lambda each: each.end_ns - each.start_ns).noise
     sensors = list(dict.fromkeys(name.removesuffix(_TURN) for name in noise))
-    plots = []
     for unit in _NOISE_PLOTS:
         drawn = {name: each for name, each in noise.items() if each.unit == unit}
         if drawn:
-            plots.append(_draw_noise(unit, drawn, [sensors.index(name.removesuffix(_TURN)) for name in drawn]))
-    return [Section("Noise of the sensors", _NOISE, plots=plots)]
+            yield _draw_noise(unit, drawn, [sensors.index(name.removesuffix(_TURN)) for name in drawn])
 
 
 def _draw_noise(unit: str, noise: Mapping[str, NoiseFacts], numbers: Sequence[int]) -> Plot:
@@ -359,7 +395,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
     rows = [
         (
             _name(role),
-            f"{1e3 * offset.offset_s:+.0f} ms",
+            f"{round(1e3 * offset.offset_s) + 0:+d} ms",
             f"{2e3 * offset.std_s:.0f} ms",
             _format_correction(role, findings),
         )
@@ -384,13 +420,14 @@ def _format_correction(role: str, findings: Sequence[Finding]) -> str:
 
 
 def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:
-    """Return the inputs from which the run can be made again."""
+    """Return the inputs from which the run can be made again, and what is damaged of them."""
     rows = [
         ("made by", f"tcpipe {manifest.tcpipe_version}, data model {manifest.data_model_version}"),
         ("recipe", run.recipe_id),
         ("estimator", manifest.info.estimator),
         ("tags", ", ".join(f"{key}={value}" for key, value in manifest.tags.items()) or "none"),
         *((("log", f"sha256 {run_json.source.sha256}"),) if run_json is not None else ()),
+        *(("damage of the log", describe_finding(finding)) for finding in manifest.damage),
     ]
     text = "The same log and recipe give the same run."
     return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)

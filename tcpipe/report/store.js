@@ -28,7 +28,7 @@ page.start(() => {
       && (!code || run.codes.includes(Number(code))) && words.every((word) => `${run.run} ${run.tags}`.toLowerCase().includes(word))
       && (!dataset || (dataset === "none" ? !run.datasets.length : run.datasets.includes(Number(dataset)))));
   };
-  const table = document.querySelector("#s1 table");
+  const table = at("find").closest("section").querySelector("table");
   const heads = [...table.rows[0].cells];
   const more = make("button", "More", { type: "button" });
   table.parentElement.after(more);

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tcpipe.cost.physics import PHYSICS_UNITS
-from tcpipe.formats.finding_lines import FindingGroup, describe_finding, format_group
+from tcpipe.formats.finding_lines import FindingGroup, describe_finding
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.stored_runs import Ingestions
@@ -203,6 +203,11 @@ def store_report(store: StoreFacts) -> str:
     runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
     groups = [(group, len(current), "runs") for group in store.groups]
+    ledgers = [run.facts.distance_by_reason_m for run in current if run.facts]
+    losses = make_losses_sections(
+        ledgers, "The largest losses of distance and their remedies; 'tcpipe status' lists the same.", names_runs=True
+    )
+    drift, table = _make_drift_sections(runs), _make_table_section(store, runs)
     problem = "The store has no usable runs. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."
     return render_page(
         title=f"Store {store.where}",
@@ -211,14 +216,9 @@ def store_report(store: StoreFacts) -> str:
         numbers=_make_numbers(store, current),
         warnings=[] if current else [problem],
         sections=[
-            *_make_table_section(store, runs),
-            *_make_drift_sections(runs),
-            *make_losses_sections(
-                [run.facts.distance_by_reason_m for run in current if run.facts],
-                "The largest losses of distance and their remedies; 'tcpipe status' lists the same.",
-                names_runs=True,
-            ),
-            *_make_findings_sections(store, current),
+            *(drift or losses),
+            *table,
+            *(losses if drift else []),
             *_make_datasets_sections(store, runs),
             *_make_problem_sections(store, runs),
         ],
@@ -260,7 +260,7 @@ def _make_table_section(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Se
         )
         for run in runs[:MOST_ROWS]
     ]
-    text = "Click a column head to sort; a selection in the plots below filters the table."
+    text = "Click a column head to sort; a selection in the plots filters the table."
     if len(runs) > MOST_ROWS:
         text += f" Without scripts the table shows the first {MOST_ROWS} of {len(runs)}."
     return [Section("All runs", text, header=_COLUMNS, rows=rows, controls="store.html")]
@@ -286,7 +286,7 @@ def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
             f"drift {name}",
             alt=f"{label} of every run over the time at which it began; the table lists the same values.",
             axes=("", label),
-            legend=dict(_list_robots(runs)),
+            legend={} if plots else dict(_list_robots(runs)),
             height_px=260,
             tools="box_select,tap,pan,wheel_zoom,reset,save",
             drag="box_select",
@@ -314,16 +314,6 @@ def _list_robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
     """Return the robots with their colours, those of most runs first."""
     counts = Counter(run.facts.robot for run in runs if run.facts)
     return [(robot, CLASS_COLOURS[n % len(CLASS_COLOURS)]) for n, (robot, _) in enumerate(counts.most_common())]
-
-
-def _make_findings_sections(store: StoreFacts, current: Sequence[StoredRun]) -> list[Section]:
-    rows = [
-        (group.severity, format_group(group, len(current)), len(group.of), ", ".join([*group.of][:3]))
-        for group in store.groups
-    ]
-    header = ("severity", "finding", "runs", "such as")
-    text = "Findings of the current runs by code, worst first; the page of each run lists all of its findings."
-    return [Section("Findings by code", text, header=header, rows=rows)] if rows else []
 
 
 def _make_datasets_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:

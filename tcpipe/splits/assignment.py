@@ -197,6 +197,12 @@ class Assignment:
         """Return which samples are in one of these splits, shape (N,)."""
         return np.isin(_NAMES, splits)[self.code]
 
+    def exclude(self, rows: Mask) -> Assignment:
+        """Return the assignment with some samples, a mask of shape (N,), in no split."""
+        return Assignment(
+            np.where(rows, _EXCLUDED, self.code).astype(np.uint8), np.where(rows, NO_FOLD, self.fold).astype(np.int8)
+        )
+
     def select(self, rows: Ints) -> Assignment:
         """Return the assignment of some samples."""
         return Assignment(self.code[rows], self.fold[rows])

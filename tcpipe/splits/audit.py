@@ -65,7 +65,9 @@ def audit_leakage(
     """
     crossing = _count_crossing(train, held, run, start_ns, corners_xy_m, chord_m=chord_m)
     ground = Ground(corners_xy_m, np.flatnonzero(train))
-    return tuple(_audit_split(name, np.flatnonzero(of), run, ground, crossing[name]) for name, of in held.items())
+    return tuple(
+        _audit_split(name, np.flatnonzero(is_held), run, ground, crossing[name]) for name, is_held in held.items()
+    )
 
 
 def _count_crossing(
@@ -78,8 +80,8 @@ def _count_crossing(
         before, after = rows[:-1], rows[1:]
         apart_m = np.linalg.norm(np.diff(corners_xy_m[rows].mean(axis=1), axis=0), axis=1)
         adjoining = (run[before] == run[after]) & (apart_m <= 1.5 * chord_m)
-        for name, of in held.items():
-            crosses = (of[before] & train[after]) | (train[before] & of[after])
+        for name, is_held in held.items():
+            crosses = (is_held[before] & train[after]) | (train[before] & is_held[after])
             found[name] += int((crosses & adjoining).sum())
     return found
 

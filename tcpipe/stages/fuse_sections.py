@@ -13,9 +13,17 @@ from numpy.typing import NDArray
 from tcpipe.fusion.checks.audit import audit_trajectory
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.measurements import GNSS, BodyVelocities, InitialState
+from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
+    GNSS,
+    BodyVelocities,
+    InitialState,
+    TrackSection,
+    Trajectory,
+    cut_sections,
+    make_track_stamps,
+)
 from tcpipe.fusion.signals import compute_seconds, hold_last, is_covered
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.power.rails import compute_power_at

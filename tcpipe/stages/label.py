@@ -19,7 +19,7 @@ from tcpipe.cost.labels import (
     subtract_idle_power,
 )
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
+from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, find_common_scale_std

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
+from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.motion import masks
 from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
 from tcpipe.motion.row_sections import Floats, Mask, MotionRows, number_pieces

@@ -78,14 +78,9 @@ def _find_unused_keys(config: ReadConfig, assignment: RoleAssignment) -> Iterato
 
 
 def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Profiles) -> Streams:
-    """Return the streams of a log.
+    """Return the streams of a log; without a ``robot`` its profile is found by message types and topic names.
 
-    Raises `RoleError`: a role cannot be decided, or no topic measures motion; `RecipeError`: no profile has the robot's name.
-
-    Parameters
-    ----------
-    config : topics, extrinsics, clocks and power, where the log does not say.
-    robot : profile name; None finds it by message types and topic names.
+    `RoleError`: a role cannot be decided, or no topic measures motion; `RecipeError`: no profile has the robot's name.
     """
     # 1. Which topic is used as which role, from the topic list alone.
     assignment = decide_roles(config, log.topics.values(), robot, known=known)

@@ -23,7 +23,6 @@ from tcpipe.logs.messages import (
     Readings,
     count_frames,
     find_utc_offset,
-    list_needed_fields,
     read_messages,
     select_ground_velocity,
 )
@@ -78,13 +77,7 @@ def read_sources(
         if topic not in messages:
             findings.append(make_topic_not_decoded(topics[topic]))
             continue
-        found = _read_fields(messages[topic], role, config)
-        needed = () if role == "power" else list_needed_fields(_find_type(topics[topic], role, config))
-        if missing := [name for name in needed if name not in found]:
-            names = {"role": role, "fields": ", ".join(missing)}
-            findings.append(make_finding("fields-missing", Subject("topic", topic), names=names))
-        else:
-            arrays[role, topic] = found
+        arrays[role, topic] = _read_fields(messages[topic], role, config)
     types = {topic: topics[topic].type_name for _, topic in arrays}
     of_power = {topic: (types[topic], columns) for (role, topic), columns in arrays.items() if role == "power"}
     power = read_power_of_topics(of_power, assignment, config, known=known)
@@ -94,7 +87,12 @@ def read_sources(
         columns = arrays.pop((role, topic))
         if role != "power":
             std_m = cast("dict[str, float]", config.fix_std_m)
-            readings = read_messages(columns, role, _find_type(topics[topic], role, config), fix_std_m=std_m)
+            try:
+                readings = read_messages(columns, role, _find_type(topics[topic], role, config), fix_std_m=std_m)
+            except KeyError as error:
+                names = {"role": role, "fields": str(error.args[0])}
+                findings.append(make_finding("fields-missing", Subject("topic", topic), names=names))
+                continue
         elif topic in power.rails:
             readings = select_power_rows(columns, power.rails[topic])
         else:

@@ -88,3 +88,5 @@ class Loss(IntFlag):
     """The footprint is in a region whose `split` is `exclude`."""
     RECORDED_TWICE = 1 << 25
     """Another run of the dataset has the same section of the same drive."""
+    EXCLUDED = 1 << 26
+    """A list of samples to exclude (``--exclude``) names it."""

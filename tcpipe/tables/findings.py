@@ -73,7 +73,9 @@ def read_catalogue() -> Mapping[str, Entry]:
     """Return the entries by code, in the order of the file."""
     entries = dict[str, Entry]()
     for code, values in tomllib.loads(_read_text()).items():
-        fields: dict[str, Any] = {name: tuple(of) if isinstance(of, list) else of for name, of in values.items()}
+        fields: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+        }
         entries[code] = Entry(**fields)
     return entries
 
@@ -190,7 +192,7 @@ def make_finding(
     remedies = tuple(remedies)
     given = {*numbers, *(names or {}), "subject"} | ({"span"} if span_s else set())
     problems = [f"the template needs {{{name}}}" for name in sorted(entry.fields - given)]
-    problems += [f"it has no remedy {of.name!r}" for of in remedies if of.name not in entry.remedies]
+    problems += [f"it has no remedy {remedy.name!r}" for remedy in remedies if remedy.name not in entry.remedies]
     if problems:
         raise ValueError(f"finding {code}: {'; '.join(problems)}")
     numbers = {name: float(number) for name, number in numbers.items() if isfinite(number)}  # JSON has no others
@@ -207,7 +209,7 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
         entry = catalogue.get(finding.code)
         return rank_severity(finding.severity), -len(entry.affects if entry else ())
 
-    objects = {id(of): of for of in findings}.values()  # runs share most of them, and a hash takes long
+    objects = {id(finding): finding for finding in findings}.values()  # runs share most of them, and a hash takes long
     return sorted(dict.fromkeys(objects), key=rank)
 
 
@@ -265,7 +267,11 @@ class Verdict:
 def judge(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict: each label has the grade of the worst finding that affects it."""
     catalogue = read_catalogue()
-    decisive = (of for of in findings if of.severity != "note" and of.code in catalogue and catalogue[of.code].affects)
+    decisive = (
+        finding
+        for finding in findings
+        if finding.severity != "note" and finding.code in catalogue and catalogue[finding.code].affects
+    )
     reasons = tuple(sort_findings(decisive))
     grades: dict[Affected, Grade] = {}
     for finding in reversed(reasons):
@@ -277,9 +283,9 @@ def find_worst_grade(findings: Iterable[Finding]) -> Grade:
     """Return the worst grade of the verdict on findings."""
     catalogue, grades = read_catalogue(), [GRADES[0]]
     grades += [
-        _GRADE_OF[of.severity]
-        for of in findings
-        if of.severity != "note" and of.code in catalogue and catalogue[of.code].affects
+        _GRADE_OF[finding.severity]
+        for finding in findings
+        if finding.severity != "note" and finding.code in catalogue and catalogue[finding.code].affects
     ]
     return max(grades, key=GRADES.index)
 

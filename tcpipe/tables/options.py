@@ -7,10 +7,13 @@ Names of tcpipe 0.8 and data model 2.x, with their names since 0.9 and 3.0: tcpi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from inspect import cleandoc, signature
+from math import isfinite
 from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+from tcpipe.errors import UsageError
 
 P = ParamSpec("P")
 O = TypeVar("O")
@@ -102,9 +105,11 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
     """Return the public function of a command: its keywords are the fields of the options, and ``run`` does the work."""
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        return run(options(*args, **kwargs))
+        asked = options(*args, **kwargs)
+        _check_bounds(asked, run.__name__.removeprefix("run_"))
+        return run(asked)
 
-    shown = {of.name: of.metadata.get("option", Option()).about for of in fields(options)}  # type: ignore[arg-type]
+    shown = {entry.name: entry.metadata.get("option", Option()).about for entry in fields(options)}  # type: ignore[arg-type]
     lines = [f"{name} : {about}" for name, about in shown.items() if about]
     more = f"`{getattr(options, '__module__', '')}` describes each of them."
     call.__name__ = call.__qualname__ = run.__name__.removeprefix("run_")
@@ -112,6 +117,35 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
     call.__doc__ = "\n".join([cleandoc(run.__doc__ or ""), "", "Parameters", "----------", *lines, "", more])
     call.__signature__ = signature(options).replace(return_annotation=signature(run).return_annotation)  # type: ignore[attr-defined]
     return call
+
+
+def _check_bounds(options: Any, function: str) -> None:
+    """Raise `UsageError` for all numbers out of their range, values that are no choice, and points that are none."""
+    problems = []
+    for of in fields(options):
+        kind, value = of.metadata.get("option", Option()).kind, getattr(options, of.name)
+        if value is None or not (expected := _describe_mismatch(kind, value)):
+            continue
+        problems.append(f"{function}: {of.name} is {value!r}; expected {expected}")
+    if problems:
+        raise UsageError(*problems)
+
+
+def _describe_mismatch(kind: Range | tuple[str, ...] | str, value: Any) -> str:
+    """Return what an option is to be, "" where it is that."""
+    if isinstance(kind, Range):
+        is_inside = (
+            _is_number(value) and kind.least <= value <= kind.most and not (kind.is_open and value == kind.least)
+        )
+        return "" if is_inside else f"a number {'above' if kind.is_open else 'from'} {kind.least:g} to {kind.most:g}"
+    if kind == "lonlat":
+        is_point = isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value))
+        return "" if is_point else "longitude and latitude in degrees"
+    return "" if isinstance(kind, str) or value in kind else f"one of {', '.join(kind)}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
 EARLIER_COLUMNS = {
@@ -163,14 +197,6 @@ EARLIER_DOCUMENT_KEYS = {
     "doubtful": "flagged_samples",
 }
 """Keys of manifests and cards; `tcpipe migrate` renames them."""
-
-EARLIER_MODEL_KEYS = {
-    "beside": "extra_features",
-    "seen": "training_range",
-    "batch": "batch_size",
-    "weights": "inverse_variance_weights",
-}
-"""Keys of model.json."""
 
 _EARLIER_PHYSICS = {"standing": "idle", "usual_turn_radpm": "mean_turn_radpm"}
 """Terms and keys below a key ``physics``."""

@@ -464,8 +464,8 @@ def share_shift(
     The shift that all have in common, plus each run's own about it: by the standard deviation (DRMS) of its track, (N,) [m], and by what
     the runs' shifts scatter more. None is taken where they contradict each other, or too few are determined to bound their scatter.
     """
-    shift_m, variance = np.array([of.shift_xy_m for of in alone]), track_std_m**2 / 2.0
-    information = np.stack([of.information for of in alone])
+    shift_m, variance = np.array([registration.shift_xy_m for registration in alone]), track_std_m**2 / 2.0
+    information = np.stack([registration.information for registration in alone])
     weights = _widen(information, variance)
     mean_m = np.linalg.pinv(weights.sum(axis=0), hermitian=True) @ np.einsum("nij,nj->i", weights, shift_m)
     freedom = int(_count_known(information).sum()) - 2
@@ -498,7 +498,7 @@ def _find_contradictions(shift_m: FloatArray, weights: FloatArray) -> list[Share
     error_m = shift_m - (np.median(shift_m[is_known], axis=0) if is_known.any() else shift_m)
     squares = np.where(is_known, _square(error_m, weights), 0.0)
     is_odd = is_known & (squares >= min(_CHI2_999, squares.max()))
-    return [SharedShift(None, of) for of in np.where(is_odd, np.hypot(*error_m.T), np.nan).tolist()]
+    return [SharedShift(None, difference_m) for difference_m in np.where(is_odd, np.hypot(*error_m.T), np.nan).tolist()]
 
 
 def _square(error_m: FloatArray, weights: FloatArray) -> FloatArray:

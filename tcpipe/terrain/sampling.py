@@ -175,7 +175,7 @@ def _interpolate_bands(window: NDArray[np.float32], px: NDArray[np.float64]) -> 
     """Return all bands at positions in a window, (N, S, S, 2), as (N, bands, S, S); a tap of weight zero need not have data."""
     low = np.floor(px).astype(np.int64)
     weight = (px - low).astype(np.float32)
-    (x0, y0), (x1, y1) = (np.moveaxis(of, 3, 0) for of in (low, low + (weight > 0.0)))
+    (x0, y0), (x1, y1) = (np.moveaxis(corner, 3, 0) for corner in (low, low + (weight > 0.0)))
     across, along = weight[..., :1], weight[..., 1:]
     upper = window[y0, x0] + across * (window[y0, x1] - window[y0, x0])
     lower = window[y1, x0] + across * (window[y1, x1] - window[y1, x0])

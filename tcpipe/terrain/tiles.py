@@ -100,7 +100,7 @@ class MapReader(Protocol):
 
 def list_layers(source: MapReader, patch_m: float, patch_px: int) -> dict[str, Layer]:
     """Return all layers of a map, those of several bands last, as patches of a size [m] and pixels have them."""
-    banded = {name: of.layer.at_patch(patch_m, patch_px) for name, of in source.banded.items()}
+    banded = {name: bands.layer.at_patch(patch_m, patch_px) for name, bands in source.banded.items()}
     return {**source.layers, **banded}
 
 
@@ -135,10 +135,12 @@ def read_window(  # noqa: PLR0917
 ) -> NDArray[Any]:
     """Return a window of a layer that may reach beyond the map, where it holds no data; (bands, rows, columns) of one of several."""
     bands = source.banded.get(layer)
-    of, grid = (source.layers[layer], source.grid) if bands is None else (bands.layer, bands.grid)
+    definition, grid = (source.layers[layer], source.grid) if bands is None else (bands.layer, bands.grid)
     read = partial(source.read, layer) if bands is None else bands.read
-    lead = (len(of.bands),) if of.bands else ()
-    out: NDArray[Any] = np.full((*lead, row1 - row0, col1 - col0), find_no_data_value(of.mapped), of.mapped)
+    lead = (len(definition.bands),) if definition.bands else ()
+    out: NDArray[Any] = np.full(
+        (*lead, row1 - row0, col1 - col0), find_no_data_value(definition.mapped), definition.mapped
+    )
     top, bottom, left, right = max(row0, 0), min(row1, grid.rows), max(col0, 0), min(col1, grid.cols)
     if top < bottom and left < right:
         out[..., top - row0 : bottom - row0, left - col0 : right - col0] = read(top, bottom, left, right)

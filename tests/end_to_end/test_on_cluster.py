@@ -11,12 +11,8 @@ pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
 from dask_cluster import dask_cluster
 from installed_command import plain_lines, tcpipe
-from synthetic_store import small_store
 
-from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset import sampling
-from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, make_tiny, simulate
 
@@ -62,15 +58,3 @@ def test_a_cluster_makes_the_bytes_that_this_machine_makes(tmp_path, monkeypatch
     assert "nothing to do" in again.stdout, "what needs no worker asks for none: the cluster is gone"
     gone = tcpipe("ingest", *logs, "--store", "there", "--force", cwd=tmp_path, env={"TCPIPE_CLUSTER": cluster.address})
     assert "no Dask scheduler answers" in plain_lines(gone, 2)
-
-
-def test_workers_make_the_cost_map_that_this_machine_makes(tmp_path):
-    small_store(tmp_path)
-    build_dataset(tmp_path / "dataset", store=tmp_path / "store")
-    train(tmp_path / "dataset", tmp_path / "model", config=FitConfig(model="physics"))
-    how = ("--store", "store", "--cell-size", "4", "--quiet")
-    with dask_cluster(tmp_path) as cluster:
-        far = tcpipe("cost-map", "model", "far", *how, "--cluster", cluster.address, cwd=tmp_path)
-    near = tcpipe("cost-map", "model", "near", *how, cwd=tmp_path)
-    assert (far.returncode, near.returncode) == (0, 0), far.stderr
-    assert _files(tmp_path / "far") == _files(tmp_path / "near")

@@ -62,7 +62,7 @@ class Target:
 
 # ---------------------------------------------------------------- containers
 def read_container(data: bytes) -> None:
-    """Read a file of any container: all topics at once, by pieces and with threads, and the first topic alone."""
+    """Read a file of any container: all topics at once, by pieces, and the first topic alone."""
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as directory:  # noqa: S108
         path = Path(directory, "log")
         path.write_bytes(data)
@@ -72,7 +72,7 @@ def read_container(data: bytes) -> None:
                 whole = _told(log, names)
             with open_log(path) as log:
                 rows: dict[str, int] = {}
-                for tables in log.batches(names, batch_bytes=1 << 12, threads=2):
+                for tables in log.batches(names, batch_bytes=1 << 12):
                     for name, table in tables.items():
                         rows[name] = rows.get(name, 0) + table.num_rows
                 lines = {of for of in log.findings if of.code != "messages-unordered"}
@@ -189,7 +189,9 @@ def _definition(type_name: str, encoding: str) -> str:
 
 def _message_type(type_name: str, text: str, encoding: str) -> MessageType:
     schema = "ros1msg" if encoding == "ros1" else "ros2msg"
-    return TypeLibrary(None).message_type(type_name, definition=text, schema_encoding=schema, ros1=encoding == "ros1")
+    found = TypeLibrary(None).find_type(type_name, definition=text, schema_encoding=schema, ros1=encoding == "ros1")
+    assert isinstance(found, MessageType), found
+    return found
 
 
 def _messages_of(type_name: str, encoding: str, count: int) -> list[bytes]:
@@ -227,11 +229,10 @@ def read_definition(data: bytes) -> None:
         return
     schema = _SCHEMAS[data[0] % len(_SCHEMAS)]
     text = data[1:].decode(errors="backslashreplace")
-    try:
-        found = TypeLibrary(None).message_type(
-            "made_msgs/msg/Made", definition=text, schema_encoding=schema, ros1=schema == "ros1msg"
-        )
-    except DefinitionError:
+    found = TypeLibrary(None).find_type(
+        "made_msgs/msg/Made", definition=text, schema_encoding=schema, ros1=schema == "ros1msg"
+    )
+    if isinstance(found, DefinitionError):
         return
     table = TopicTable(found, "ros1" if schema == "ros1msg" else "cdr")
     table.add(_block([b"\x00\x01\x00\x00" + bytes(60)] * _ALIKE))

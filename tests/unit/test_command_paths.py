@@ -43,6 +43,7 @@ TEXTS = {
     "budget_joule",
     "layers",
     "predictor",
+    "reason",
 }
 """Parameters of commands that are text and no path."""
 
@@ -121,6 +122,7 @@ CALLS = [
     "build-dataset other --store empty",
     "build-dataset file --store empty",
     "build-dataset out --store empty --keep-split other",
+    "build-dataset out --store empty --exclude gone.csv --reason why",
     "cost-map gone out --store empty",
     "demo other",
     "diff empty empty",

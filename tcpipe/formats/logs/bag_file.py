@@ -8,14 +8,12 @@ A bag carries no checksum of its own: bz2 has one, lz4 and plain chunks have non
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import LogError
 from tcpipe.formats.logs.bag_records import (
     MAGIC,
     MAX_HEADER_BYTES,
@@ -32,15 +30,11 @@ from tcpipe.formats.logs.bag_records import (
     stamp_ns,
     walk_chunk,
 )
-from tcpipe.formats.logs.chunk_reading import Entries, Excerpt, Messages, copy_pieces, read_chunk_blocks, sort_by_place
+from tcpipe.formats.logs.chunk_reading import ChunkedPart, Excerpt, Messages
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
-    Bounds,
-    ByteSource,
     DamageError,
-    FetchedFile,
     Int64Array,
-    MessageBlock,
     decompress,
     decompress_prefix,
     outline_of,
@@ -52,7 +46,6 @@ _MAX_CHUNK_HEADER = 128
 _INDEX_ENTRY_BYTES = 12
 _INDEX_HEAD_BYTES = 64
 """As much as an index record's header takes as a rule, and the length behind it."""
-_LEAST_RECORD_BYTES = 8
 _PLACED_AT_ONCE = 1024
 """Of so many chunks the heads are looked at together."""
 _EXPECTED_BYTES = 1 << 24
@@ -85,44 +78,26 @@ class _Connection:
     ends: list[int] = field(default_factory=list)
 
 
-class BagPart:
+class BagPart(ChunkedPart[_Chunk]):
     """One .bag file, open for reading."""
 
-    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
-        self.name = name
-        self.damage: list[Damage] = []
+    container = "bag"
+    least_bytes = 8
+
+    def _open(self) -> dict[int, Topic]:
         self.outline = ""
-        self._bytes = ByteSource(path, fetched)
-        self._connections: dict[int, _Connection] = {}
-        self._chunks: list[_Chunk] = []
         self.is_unchecked = False
         """Whether chunks were read that carry no checksum: all but those of bz2."""
-        self._bounds = Bounds(path, self._bytes.size)
-        try:
-            self._read_index_or_walk()
-        except LogError:
-            self.close()
-            raise
-        self.channels = {number: _make_topic(self._connections[number]) for number in sorted(self._connections)}
-
-    def _read_index_or_walk(self) -> None:
+        self._connections: dict[int, _Connection] = {}
+        self._chunks: list[_Chunk] = []
         try:
             self._read_index()
         except DamageError as error:
-            self.damage.append(Damage(error.cause, self.name, self._bytes.size, reason=error.reason))
+            self._note(error.cause, self._bytes.size, reason=error.reason)
             self._bytes.whole()
             self._connections, self._chunks = {}, []
             self._walk()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._bytes.close()
-
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted connections, chunk by chunk, or some chunks at once where little of them is wanted."""
-        if any(chunk.counts is not None and wanted.isdisjoint(chunk.counts) for chunk in self._chunks):
-            self._bytes.skips()
-        yield from read_chunk_blocks(self, wanted, threads=threads)
+        return {number: _make_topic(self._connections[number]) for number in sorted(self._connections)}
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
         """Return the chunks that may hold wanted connections, each with the number of bytes in all chunks before it, at most."""
@@ -139,6 +114,8 @@ class BagPart:
                 if chunk.counts is None or not wanted.isdisjoint(chunk.counts) or self._is_doubtful(chunk)
             ]
         self._bounds.claim(sizes)
+        if len(found) < len(self._chunks):
+            self._bytes.skips()
         return found
 
     def _is_doubtful(self, chunk: _Chunk) -> bool:
@@ -162,10 +139,9 @@ class BagPart:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
         return read_indexed_messages(found)
 
-    def walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
-        """Return the wanted messages of a chunk by its records; what these lack is added to ``noted``."""
+    def walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
+        """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
         found = self._walked(chunk, data)
-        noted += self._contradictions(chunk, found, len(data))
         return found.messages(data, wanted)
 
     def is_proved(self, chunk: _Chunk) -> bool:
@@ -177,27 +153,24 @@ class BagPart:
         return chunk.counts is not None and not chunk.cut
 
     def _walked(self, chunk: _Chunk, data: memoryview) -> ChunkRecords:
-        """Step through the records of a chunk."""
+        """Step through the records of a chunk, and note what is wrong with them."""
         walked = walk_chunk(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, walked.count)
-        return walked
-
-    def _contradictions(self, chunk: _Chunk, walked: ChunkRecords, size: int) -> list[Damage]:
-        """Return what is wrong with a chunk of ``size`` bytes of which each record was looked at."""
-        found = []
-        if walked.end < size and not chunk.cut:
-            found.append(Damage("record-damaged", self.name, chunk.offset, bytes_lost=size - walked.end))
+        for connection in walked.connections if chunk.counts is None else ():
+            self._take_connection(connection, data[connection.data_offset : connection.end])
+        if walked.end < len(data) and not chunk.cut:
+            self._note("record-damaged", chunk.offset, bytes_lost=len(data) - walked.end)
         if unknown := walked.offsets.keys() - self._connections.keys():
             lost = sum(len(walked.offsets[number]) for number in unknown)
-            found.append(Damage("channel-undeclared", self.name, chunk.offset, messages_lost=lost))
+            self._note("channel-undeclared", chunk.offset, messages_lost=lost)
         counts = {number: len(offsets) for number, offsets in walked.offsets.items()}
         if chunk.counts is not None and counts != chunk.counts:
             lost = max(sum(chunk.counts.values()) - sum(counts.values()), 0)
-            found.append(Damage("chunk-index-damaged", self.name, chunk.offset, messages_lost=lost or None))
-        return found
+            self._note("chunk-index-damaged", chunk.offset, messages_lost=lost or None)
+        return walked
 
-    def entries(self, chunks: list[_Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
-        """Return the messages of several chunks by the index records behind them, and of which chunks these are sound."""
+    def read_indexes(self, chunks: list[_Chunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+        """Return the messages of several chunks by the index records behind them."""
         held: list[bytes] = []
         places: list[tuple[int, int, int]] = []
         unsound = []
@@ -212,16 +185,8 @@ class BagPart:
             places += [(number, connection, len(entries) // _INDEX_ENTRY_BYTES) for connection, entries in found]
         of, connections, counts = np.array(places, np.int64).reshape(-1, 3).T
         words = np.frombuffer(b"".join(held), "<u4").reshape(-1, 3).astype(np.int64)
-        entries, sound = sort_by_place(
-            np.repeat(of, counts),
-            np.repeat(connections, counts),
-            words[:, 2],
-            words[:, 0] * NS + words[:, 1],
-            sizes,
-            least_bytes=_LEAST_RECORD_BYTES,
-        )
-        sound[unsound] = False
-        return entries, sound
+        stamps_ns = words[:, 0] * NS + words[:, 1]
+        return (np.repeat(of, counts), np.repeat(connections, counts), words[:, 2], stamps_ns), unsound
 
     def _index_of(self, chunk: _Chunk) -> list[tuple[int, bytes]]:
         """Return each connection's entries in the index behind a chunk; `DamageError` where it has none, or a broken one."""
@@ -244,19 +209,16 @@ class BagPart:
             raise DamageError("chunk-index-damaged")
         return record.number(b"conn"), record.data_offset, record.data_bytes
 
-    def copy(self, chunk: _Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
-        """Copy pieces (start, stop, place) of a chunk; of a plain one nothing else is read."""
+    def find_plain_data(self, chunk: _Chunk) -> int | None:
+        """Return where the records of a chunk begin that is not compressed."""
         record = chunk.record
         if record is None or record.opcode != OP_CHUNK or record.codec != "none":
-            copy_pieces(self.load(chunk), places, to)
-            return
+            return None
         self.is_unchecked = True
-        self._bytes.read_pieces(
-            [(record.data_offset + start, to[at : at + stop - start]) for start, stop, at in places]
-        )
+        return record.data_offset
 
     def load(self, chunk: _Chunk) -> memoryview:
-        """Return the records of a chunk; of one that the file's end cuts, what can still be had."""
+        """Return the records of a chunk."""
         record = chunk.record or self._record(chunk.offset)
         codec = record.codec
         if codec != "bz2":
@@ -267,13 +229,12 @@ class BagPart:
         if chunk.cut:
             data = self._bytes.read(record.data_offset, self._bytes.size - record.data_offset)
             kept = data if codec == "none" else decompress_prefix(codec, data, size)
-            self.damage.append(Damage("file-cut", self.name, chunk.offset, bytes_lost=size - len(kept)))
+            self._note("file-cut", chunk.offset, bytes_lost=size - len(kept))
             return kept
         if record.end > self._bytes.size:
             raise DamageError("file-cut")
-        if codec == "none":
-            return self._bytes.read(record.data_offset, record.data_bytes)
-        return decompress(codec, self._bytes.read_once(record.data_offset, record.data_bytes), size)
+        data = self._bytes.read_once(record.data_offset, record.data_bytes)
+        return data if codec == "none" else decompress(codec, data, size)
 
     def _read_index(self) -> None:
         """Read the connections and chunk summaries at the file's end; `DamageError` when they cannot be used."""
@@ -340,9 +301,7 @@ class BagPart:
                 position = self._take_record(position)
             except DamageError as error:
                 after = self._next_chunk(position + 1)
-                self.damage.append(
-                    Damage(error.cause, self.name, position, bytes_lost=after - position, reason=error.reason)
-                )
+                self._note(error.cause, position, bytes_lost=after - position, reason=error.reason)
                 position = after
 
     def _take_record(self, position: int) -> int:
@@ -370,11 +329,8 @@ class BagPart:
             self.damage.append(self.lost(chunk, error))
             return
         found = self._walked(chunk, data)
-        for connection in found.connections:
-            self._take_connection(connection, data[connection.data_offset : connection.end])
         self._chunks.append(chunk)
         self._bounds.count(len(self._chunks), 0)
-        self.damage += self._contradictions(chunk, found, len(data))
         for number in found.offsets.keys() & self._connections.keys():
             stamps_ns = found.stamps[number]
             self._tally(number, len(stamps_ns), min(stamps_ns), max(stamps_ns))

@@ -6,15 +6,18 @@ for all of them: what a look costs, however short, is paid once for thousands of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, map_in_order
-from tcpipe.logs.topics import Damage
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, Int64Array, MessageBlock
+from tcpipe.logs.topics import Damage, Topic
 
 GROUP_BYTES = 1 << 23
 """Chunks of about this size together are planned at once."""
@@ -23,6 +26,9 @@ _GAP_BYTES = 1 << 13
 _PLACE_BITS = 40
 MAX_PLANNED_BYTES = (1 << _PLACE_BITS) - 1
 """A larger chunk is not planned, but read on its own."""
+
+Piece = tuple[int, int, int]
+"""Where a piece of a chunk starts and stops in it, and where it is laid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,34 +63,16 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
-class ChunkLayout:
-    """The parts of a span's chunks that hold wanted messages, laid one after the other: ``size`` bytes in all.
-
-    ``places`` gives of each chunk, by its number, where a piece starts and stops in it, and where it is laid; ``offset`` where each
-    message then begins, in the order of their entries, shape (N,).
-    """
-
-    places: dict[int, list[tuple[int, int, int]]]
-    offset: Int64Array
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
 class Excerpt:
-    """Bytes in which a span's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,).
-
-    ``lost`` lists the chunks, by number, of which there is none, and why.
-    """
+    """Bytes in which a span's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,)."""
 
     data: memoryview
     offset: Int64Array
     entries: Entries
-    lost: list[tuple[int, DamageError]]
 
-    def without(self, chunks: Sequence[int]) -> Excerpt:
-        """Return it without the messages of some chunks."""
-        left = ~np.isin(self.entries.chunk, chunks)
-        return Excerpt(self.data, self.offset[left], self.entries.at(left), self.lost)
+    def at(self, chosen: NDArray[np.bool_]) -> Excerpt:
+        """Return it with some of the messages."""
+        return Excerpt(self.data, self.offset[chosen], self.entries.at(chosen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,129 +131,162 @@ class PlacedChunk(Protocol):
 AnyChunk = TypeVar("AnyChunk", bound=PlacedChunk)
 
 
-class ChunkedFile(Protocol[AnyChunk]):
-    """A file of chunks: what `read_chunk_blocks` asks of it. `DamageError` where a chunk is lost."""
+class ChunkedPart(ABC, Generic[AnyChunk]):
+    """A file of chunks, open for reading. Methods raise `DamageError` where a chunk is lost."""
 
-    name: str
-    damage: list[Damage]
+    least_bytes: int
+    """No message's record is shorter."""
 
+    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
+        self.name = name
+        self.damage: list[Damage] = []
+        self._bytes = ByteSource(path, fetched)
+        self._bounds = Bounds(path, self._bytes.size)
+        try:
+            self.channels = self._open()
+        except LogError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._bytes.close()
+
+    def _note(self, cause: str, offset: int, **lost: Any) -> None:
+        self.damage.append(Damage(cause, self.name, offset, **lost))
+
+    @abstractmethod
+    def _open(self) -> dict[int, Topic]:
+        """Read the index, or, where it cannot be used, walk the file; return every channel."""
+
+    @abstractmethod
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, AnyChunk]]:
-        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
+        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it, at most."""
 
-    def entries(self, chunks: list[AnyChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
-        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+    @abstractmethod
+    def read_indexes(self, chunks: list[AnyChunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+        """Return the messages of chunks by their indexes, and which chunks have no sound one.
 
+        Of each message that is its chunk's number in the list, its channel, offset in the chunk and log time, shape (N,) each.
+        """
+
+    @abstractmethod
     def load(self, chunk: AnyChunk) -> memoryview:
-        """Return all records of a chunk."""
+        """Return all records of a chunk, valid until the next read; of one that the file's end cuts, what can still be had."""
 
-    def copy(self, chunk: AnyChunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
-        """Copy pieces (start, stop, place) of a chunk."""
+    @abstractmethod
+    def find_plain_data(self, chunk: AnyChunk) -> int | None:
+        """Return where in the file the records of a chunk begin, of which pieces can be read; None where it must be loaded."""
 
+    @abstractmethod
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
 
-    def walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
-        """Return the wanted messages of a chunk by its records; what these lack is added to ``noted``."""
+    @abstractmethod
+    def walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int]) -> Messages:
+        """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
 
+    @abstractmethod
     def is_proved(self, chunk: AnyChunk) -> bool:
         """Tell whether a checksum covers the chunk's records, so that it is the index that is wrong where they differ."""
 
+    @abstractmethod
     def needs_index(self, chunk: AnyChunk) -> bool:
         """Tell whether a broken index of this chunk is worth a word."""
 
+    @abstractmethod
     def lost(self, chunk: AnyChunk, error: DamageError) -> Damage:
-        """Return the damage of a chunk that is lost as a whole."""
+        """Return the damage of a chunk that is lost as a whole, counted by the index."""
 
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+        chunks = self.chunks_with(wanted)
+        for group in group_chunks(chunk.size for _, chunk in chunks):
+            members = chunks[group.start : group.stop]
+            sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
+            entries, sound = self.entries([chunk for _, chunk in members], sizes)
+            for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
+                yield from self._read_span_blocks(span, members, wanted)
 
-def read_chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
-    """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+    def entries(self, chunks: list[AnyChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+        (chunk, channel, offset, log_time_ns), unsound = self.read_indexes(chunks)
+        entries, sound = sort_by_place(chunk, channel, offset, log_time_ns, sizes, least_bytes=self.least_bytes)
+        sound[unsound] = False
+        return entries, sound
 
-    def read(planned: tuple[Span, list[tuple[int, AnyChunk]]]) -> tuple[list[MessageBlock], list[Damage]]:
-        noted: list[Damage] = []
-        return list(_read_span_blocks(file, *planned, wanted, noted)), noted
-
-    for blocks, noted in map_in_order(read, _plan_spans(file, wanted), threads=threads):
-        file.damage += noted
-        yield from blocks
-
-
-def _plan_spans(
-    file: ChunkedFile[AnyChunk], wanted: frozenset[int]
-) -> Iterator[tuple[Span, list[tuple[int, AnyChunk]]]]:
-    """Yield what to read at once, and the chunks of its group; the indexes of a group are read ahead."""
-    chunks = file.chunks_with(wanted)
-    for group in group_chunks(chunk.size for _, chunk in chunks):
-        members = chunks[group.start : group.stop]
-        sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
-        entries, sound = file.entries([chunk for _, chunk in members], sizes)
-        for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
-            yield span, members
-
-
-def _read_span_blocks(
-    file: ChunkedFile[AnyChunk],
-    span: Span,
-    members: list[tuple[int, AnyChunk]],
-    wanted: frozenset[int],
-    noted: list[Damage],
-) -> Iterator[MessageBlock]:
-    """Yield the wanted messages of a span; what is lost or contradicts itself is added to ``noted``."""
-    doubtful: Sequence[int] = span.chunks
-    if span.entries is not None:
-        found = read_excerpt(
-            span,
-            span.entries,
-            load=lambda number: file.load(members[number][1]),
-            copy=lambda number, places, to: file.copy(members[number][1], places, to),
-        )
-        noted += [file.lost(members[number][1], error) for number, error in found.lost]
-        messages, true = file.indexed(found)
-        ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
-        doubtful = np.unique(found.entries.chunk[~true]).tolist()
-        if doubtful:
-            right = ~np.isin(found.entries.chunk, doubtful)
-            messages, ordinal = messages.at(right), ordinal[right]
-        yield from _split_in_time(file.name, messages, ordinal, noted)
-    for number in doubtful:
-        base, chunk = members[number]
-        try:
-            data = file.load(chunk)
-        except DamageError as error:
-            noted.append(file.lost(chunk, error))
-        else:
-            messages = file.walked(chunk, data, wanted, noted)
+    def _read_span_blocks(
+        self, span: Span, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
+    ) -> Iterator[MessageBlock]:
+        """Yield the wanted messages of a span; what is lost or contradicts itself is added to ``damage``."""
+        doubtful: Sequence[int] = span.chunks
+        if span.entries is not None:
+            found = self.read_excerpt(span, span.entries, [chunk for _, chunk in members])
+            messages, true = self.indexed(found)
+            ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
+            doubtful = np.unique(found.entries.chunk[~true]).tolist()
+            if doubtful:
+                right = ~np.isin(found.entries.chunk, doubtful)
+                messages, ordinal = messages.at(right), ordinal[right]
+            yield from self._split_in_time(messages, ordinal)
+        for number in doubtful:
+            base, chunk = members[number]
+            try:
+                data = self.load(chunk)
+            except DamageError as error:
+                self.damage.append(self.lost(chunk, error))
+                continue
+            messages = self.walked(chunk, data, wanted)
             entries = None if span.entries is None else span.entries.at(span.entries.chunk == number)
-            noted += _find_index_disagreement(file, chunk, messages, entries)
-            yield from _split_in_time(file.name, messages, base + messages.offset, noted)
+            self._note_index_disagreement(chunk, messages, entries)
+            yield from self._split_in_time(messages, base + messages.offset)
 
+    def read_excerpt(self, span: Span, entries: Entries, chunks: Sequence[AnyChunk]) -> Excerpt:
+        """Return the messages of a span with the bytes in which they lie, but for those of chunks that are lost."""
+        pieces, offset, size = lay_out_pieces(entries) if span.compact else ({}, entries.offset, 0)
+        data, lost = np.empty(size, np.uint8).data, []
+        for number in span.chunks:
+            try:
+                if span.compact:
+                    self._copy(chunks[number], pieces.get(number, []), data)
+                else:
+                    data = self.load(chunks[number])
+            except DamageError as error:
+                lost.append(number)
+                self.damage.append(self.lost(chunks[number], error))
+        found = Excerpt(data, offset, entries)
+        return found.at(~np.isin(entries.chunk, lost)) if lost else found
 
-def _split_in_time(name: str, messages: Messages, ordinal: Int64Array, noted: list[Damage]) -> list[MessageBlock]:
-    """Return messages as blocks, without those whose time is past what 63 bits hold."""
-    times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
-    if not times.all():
-        noted.append(Damage("time-invalid", name, messages_lost=int((~times).sum())))
-        messages, ordinal = messages.at(times), ordinal[times]
-    return messages.blocks(ordinal)
+    def _copy(self, chunk: AnyChunk, pieces: list[Piece], to: memoryview) -> None:
+        """Copy pieces of a chunk; what need not be read as a whole, to check or decompress it, is not."""
+        start = self.find_plain_data(chunk)
+        if start is not None:
+            self._bytes.read_pieces([(start + a, to[at : at + b - a]) for a, b, at in pieces])
+            return
+        data = self.load(chunk)
+        for a, b, at in pieces:
+            to[at : at + b - a] = data[a:b]
 
+    def _split_in_time(self, messages: Messages, ordinal: Int64Array) -> list[MessageBlock]:
+        """Return messages as blocks, without those whose time is past what 63 bits hold."""
+        times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
+        if not times.all():
+            self.damage.append(Damage("time-invalid", self.name, messages_lost=int((~times).sum())))
+            messages, ordinal = messages.at(times), ordinal[times]
+        return messages.blocks(ordinal)
 
-def _find_index_disagreement(
-    file: ChunkedFile[AnyChunk], chunk: AnyChunk, messages: Messages, entries: Entries | None
-) -> list[Damage]:
-    """Return the damage where a chunk's index is broken, or names other messages than its records hold."""
-    lost = 0
-    if entries is None and (chunk.size > MAX_PLANNED_BYTES or not file.needs_index(chunk)):
-        return []
-    if entries is not None:
-        held = messages.at(np.argsort(messages.offset, kind="stable"))
-        mine = np.stack([held.offset, held.channel, held.log_time_ns])
-        if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
-            return []
-        lost = max(len(entries.offset) - len(held.offset), 0)
-    return [
-        Damage(
-            "chunk-index-damaged", file.name, chunk.offset, messages_lost=0 if file.is_proved(chunk) else lost or None
-        )
-    ]
+    def _note_index_disagreement(self, chunk: AnyChunk, messages: Messages, entries: Entries | None) -> None:
+        """Note where a chunk's index is broken, or names other messages than its records hold."""
+        lost = 0
+        if entries is None and (chunk.size > MAX_PLANNED_BYTES or not self.needs_index(chunk)):
+            return
+        if entries is not None:
+            held = messages.at(np.argsort(messages.offset, kind="stable"))
+            mine = np.stack([held.offset, held.channel, held.log_time_ns])
+            if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+                return
+            lost = max(len(entries.offset) - len(held.offset), 0)
+        self._note("chunk-index-damaged", chunk.offset, messages_lost=0 if self.is_proved(chunk) else lost or None)
 
 
 def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
@@ -312,11 +333,7 @@ def plan_chunk_spans(
 ) -> Iterator[Span]:
     """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
 
-    Parameters
-    ----------
-    entries : the messages of those chunks whose index is sound.
-    sizes, sound : the chunks' decompressed sizes [byte], and which have a sound index, shape (M,).
-    wanted : the channels to read.
+    ``entries`` are the messages of those whose index is sound; ``sizes`` [byte] and ``sound`` are of all chunks, shape (M,).
     """
     entries = entries.at(np.isin(entries.channel, wanted))
     wanted_bytes = np.bincount(entries.chunk, entries.end - entries.offset, len(sizes))
@@ -332,8 +349,11 @@ def plan_chunk_spans(
         first = after
 
 
-def find_chunk_layout(entries: Entries) -> ChunkLayout:
-    """Return the pieces of a span's chunks that hold its messages."""
+def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Int64Array, int]:
+    """Return how the pieces of chunks that hold messages are laid one after the other.
+
+    That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the bytes in all.
+    """
     begins = np.ones(len(entries.offset), np.bool_)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
     begins[1:] = far | (entries.chunk[1:] != entries.chunk[:-1])
@@ -341,43 +361,7 @@ def find_chunk_layout(entries: Entries) -> ChunkLayout:
     start, stop = entries.offset[at], entries.end[np.append(at[1:], len(begins)) - 1] if len(at) else at
     to = np.cumsum(stop - start) - (stop - start)
     offset = entries.offset + (to - start)[np.cumsum(begins) - 1] if len(at) else entries.offset
-    places: dict[int, list[tuple[int, int, int]]] = {}
+    pieces: dict[int, list[Piece]] = {}
     for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
-        places.setdefault(chunk, []).append((place[0], place[1], place[2]))
-    return ChunkLayout(places, offset, int((stop - start).sum()))
-
-
-def read_excerpt(
-    span: Span,
-    entries: Entries,
-    *,
-    load: Callable[[int], memoryview],
-    copy: Callable[[int, list[tuple[int, int, int]], memoryview], None],
-) -> Excerpt:
-    """Read what a span wants.
-
-    Parameters
-    ----------
-    span, entries : the span, and its messages.
-    load : returns all records of a chunk by its number.
-    copy : copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
-    """
-    kept = find_chunk_layout(entries) if span.compact else None
-    data = np.empty(kept.size if kept else 0, np.uint8).data
-    lost = []
-    for number in span.chunks:
-        try:
-            if kept:
-                copy(number, kept.places.get(number, []), data)
-            else:
-                data = load(number)
-        except DamageError as error:
-            lost.append((number, error))
-    found = Excerpt(data, kept.offset if kept else entries.offset, entries, lost)
-    return found.without([number for number, _ in lost]) if lost else found
-
-
-def copy_pieces(data: memoryview, places: list[tuple[int, int, int]], to: memoryview) -> None:
-    """Copy pieces (start, stop, place) of ``data``."""
-    for start, stop, place in places:
-        to[place : place + stop - start] = data[start:stop]
+        pieces.setdefault(chunk, []).append((place[0], place[1], place[2]))
+    return pieces, offset, int((stop - start).sum())

@@ -10,27 +10,35 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from types import TracebackType
 from typing import Self
 
 import pyarrow as pa
 
 from tcpipe.errors import LogError
+from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.finding_lines import describe_finding
+from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
 from tcpipe.formats.logs.arrow_columns import TopicTable
-from tcpipe.formats.logs.log_container import WANTED, find_autopilot, find_container, open_part
+from tcpipe.formats.logs.bag_file import BagPart
 from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
+from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
     METADATA,
     STORAGE_SUFFIXES,
+    ZSTD_MAGIC,
     Rosbag2Files,
     decompress_blocks,
+    decompress_file,
     find_rosbag2_files,
     is_one_bag,
 )
+from tcpipe.formats.logs.sqlite_file import SqlitePart
+from tcpipe.formats.logs.table_folders import is_table
 from tcpipe.formats.object_storage import StoredObject, is_url, lay_out_objects
-from tcpipe.logs.topics import Damage, Topic, find_damage, split_notes
+from tcpipe.logs.topics import AutopilotKind, Damage, Topic, find_damage, split_notes
 from tcpipe.progress import Meter
 from tcpipe.tables.findings import Finding
 
@@ -51,15 +59,27 @@ _LISTED = 5
 _OTHER_FILES = 256
 _FILE_SYSTEMS_OWN = ("lost+found",)
 
+WANTED = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg, ArduPilot's .bin or tables that the recipe maps"
+_AUTOPILOTS: dict[bytes, AutopilotKind] = {b"ULog\x01\x12\x35": "ulog", b"\xa3\x95\x80\x80\x59": "dataflash"}
+"""How their logs begin; DataFlash's with the format of formats."""
+_KNOWN_MAGIC = (
+    (b"PK\x03\x04", "a zip archive"),
+    (b"\x1f\x8b", "a gzip file"),
+    (b"BZh", "a bzip2 file"),
+    (b"\xfd7zXZ", "an xz file"),
+    (b"\x89HDF", "an HDF5 file"),
+    (b"PAR1", "a Parquet file"),
+    (b"%PDF", "a PDF"),
+    (b"II*\0", "a TIFF"),
+    (b"MM\0*", "a TIFF"),
+)
+
 
 def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
-    """Open a log, whatever its container; `LogError` says what was found where the path is no log.
+    """Open a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; `LogError` says what else it is.
 
-    Parameters
-    ----------
-    path : a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``): of an .mcap
-        or .bag with an index only what is asked for is fetched, anything else is copied until the log is closed.
-    message_definitions : a directory of .msg files for types that the log does not define.
+    Or the URL of one (``s3://…``): of an .mcap or .bag with an index only what is asked for is fetched, anything else is copied until the
+    log is closed. ``message_definitions``: a directory of .msg files for types that the log does not define.
     """
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}
@@ -73,9 +93,74 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
         if path.is_dir():
             opened = _open_directory(path, stack, fetched)
         else:
-            part, kind = open_part(path, path.name, stack, fetched.get(path)), find_container(path, fetched.get(path))
-            opened = _OpenFiles(kind, Rosbag2Files((path,)), (part,), fetched)
+            part = open_part(path, path.name, stack, fetched.get(path))
+            opened = _OpenFiles(part.container, Rosbag2Files((path,)), (part,), fetched)
         return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
+
+
+def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | None) -> LogPart:
+    """Open a file of a log until the stack ends; `LogError` where it is none, which says what it seems to be."""
+    magic, given = _read_magic(path, fetched), path
+    if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_records.MAGIC)):
+        fetched.whole()
+    if magic.startswith(ZSTD_MAGIC):
+        path = decompress_file(path, stack.enter_context(make_scratch_directory()))
+        magic = _read_magic(path, None)
+    part: LogPart
+    if magic.startswith(mcap_records.MAGIC) or _read_tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
+        part = McapPart(path, name, fetched)
+    elif magic.startswith(bag_records.MAGIC):
+        part = BagPart(path, name, fetched)
+    elif magic.startswith(sqlite_file.MAGIC):
+        part = SqlitePart(path, name)
+    else:
+        held = "" if path == given else "what it holds, decompressed: "
+        wanted = (
+            f"'tcpipe init --from {quote(str(given))}' writes a recipe for a table" if is_table(given.name) else WANTED
+        )
+        raise LogError(f"{given}: not a log: {held}{_describe_other_file(path, magic)}; {wanted}")
+    stack.callback(part.close)
+    return part
+
+
+def find_autopilot(path: Path) -> AutopilotKind | None:
+    """Return ``ulog`` or ``dataflash`` where a file begins like a log of an autopilot, None elsewhere."""
+    magic = _read_magic(path, None) if path.is_file() else b""
+    return next((kind for start, kind in _AUTOPILOTS.items() if magic.startswith(start)), None)
+
+
+def _read_magic(path: Path, fetched: FetchedFile | None) -> bytes:
+    if fetched is not None and not fetched.is_whole:
+        return fetched.read(0, 16)
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except OSError as error:
+        raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
+
+
+def _read_tail(path: Path, size: int) -> bytes:
+    """Return a file's last bytes; nothing where they cannot be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - size, 0))
+            return file.read(size)
+    except OSError:
+        return b""
+
+
+def _describe_other_file(path: Path, magic: bytes) -> str:
+    """Say what a file that is no log seems to be."""
+    if not magic:
+        return "it is empty (0 bytes)"
+    if magic.startswith(b"#ROSBAG V"):
+        return f"it is a ROS bag of version {magic[9:12].decode(errors='replace')} (rosbag fix converts it)"
+    for start, kind in _KNOWN_MAGIC:
+        if magic.startswith(start):
+            return f"it is {kind}"
+    if not any(magic):
+        return "it begins with zeros"
+    return f"it is {path.stat().st_size} bytes that begin with {magic[:8]!r}"
 
 
 def _refuse_what_is_not_there(path: Path) -> None:
@@ -216,11 +301,6 @@ class Log(OpenLog):
         return [[stat.st_size, stat.st_mtime_ns] for stat in found]
 
     @property
-    def fetched_bytes(self) -> int | None:
-        """How much of a log in object storage was fetched so far, other than what was copied; None of one on this machine."""
-        return sum(file.fetched_bytes for file in self._fetched) if self._fetched else None
-
-    @property
     def outline(self) -> str:
         """A hash (hex) of the sizes and indexes of all files, the same wherever they lie; "" where a file has no index."""
         outlines = [part.outline for part in self._parts]
@@ -266,13 +346,13 @@ class Log(OpenLog):
             raise LogError(f"{self.path}: topic {topic} cannot be read: {self._message_type(topic)}")
         return tables[topic]
 
-    def tables(self, topics: Iterable[str], *, threads: int = 1) -> dict[str, pa.Table]:
-        """Return the tables of several topics, read in one pass; the result does not depend on ``threads``.
+    def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+        """Return the tables of several topics, read in one pass.
 
         A table has one row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
         A topic that cannot be decoded is missing and named in `findings`. `LogError`: a topic is not in the log.
         """
-        (tables,) = self.batches(topics, batch_bytes=None, threads=threads)
+        (tables,) = self.batches(topics, batch_bytes=None)
         return tables
 
     def first_rows(self, topics: Iterable[str]) -> dict[str, pa.Table]:
@@ -286,9 +366,7 @@ class Log(OpenLog):
                     break
         return found
 
-    def batches(
-        self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES, threads: int = 1
-    ) -> Iterator[dict[str, pa.Table]]:
+    def batches(self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES) -> Iterator[dict[str, pa.Table]]:
         """Yield the tables of several topics piece by piece, as `tables`, in memory that does not grow with the log.
 
         Each dict holds the next rows of some topics (those that hold most); the last one names every topic. Rows are in the order of
@@ -301,7 +379,7 @@ class Log(OpenLog):
         held, size = 0, self.size_bytes
         meter, messages = Meter("reading", size), sum(self.topics[name].message_count or 0 for name in collected)
         for index in range(len(self._parts)):
-            for topic_table, block in self._blocks(index, collected, threads):
+            for topic_table, block in self._blocks(index, collected):
                 meter.add(size * len(block.offsets) / max(messages, 1))
                 held -= topic_table.held_bytes
                 topic_table.add(block)
@@ -340,9 +418,7 @@ class Log(OpenLog):
                 )
         return {name: TopicTable(of, self.topics[name].encoding) for name, of in types.items()}
 
-    def _blocks(
-        self, index: int, collected: Mapping[str, TopicTable], threads: int
-    ) -> Iterator[tuple[TopicTable, MessageBlock]]:
+    def _blocks(self, index: int, collected: Mapping[str, TopicTable]) -> Iterator[tuple[TopicTable, MessageBlock]]:
         """Yield one file's blocks, each with its topic's table; channels that differ from their topic's type are set aside."""
         part, channels = self._parts[index], {}
         for number, channel in part.channels.items():
@@ -353,7 +429,7 @@ class Log(OpenLog):
                     reason = f"the topic changes its type to {channel.type_name} ({channel.encoding})"
                     self._note_undecoded(part.name, channel.name, channel.message_count, reason)
         if channels:
-            for block in decompress_blocks(part, frozenset(channels), threads=threads):
+            for block in decompress_blocks(part, frozenset(channels)):
                 later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
                 yield channels[block.channel], later
 
@@ -374,15 +450,21 @@ class Log(OpenLog):
         self._damage.append(Damage("messages-not-decoded", file, topic=topic, messages_lost=count, reason=reason))
 
     def _resolved(self, channel: Topic) -> MessageType | DefinitionError:
-        try:
-            return self._types.message_type(
-                channel.type_name,
-                definition=channel.definition,
-                schema_encoding=channel.schema_encoding,
-                ros1=channel.encoding == "ros1",
-            )
-        except DefinitionError as error:
-            return error
+        return self._types.find_type(
+            channel.type_name,
+            definition=channel.definition,
+            schema_encoding=channel.schema_encoding,
+            ros1=channel.encoding == "ros1",
+        )
+
+    def _find_problem(self, channel: Topic) -> str | None:
+        """Return why messages cannot be decoded; a definition that cannot be used is found when they are read."""
+        if channel.encoding not in ("cdr", "ros1"):
+            return f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
+        if not channel.type_name:
+            return "the log does not state the type of its messages"
+        found = None if channel.definition.strip() else self._resolved(channel)
+        return str(found) if isinstance(found, DefinitionError) else None
 
     def _note_losses(self, name: str, topic_table: TopicTable, rows: int) -> None:
         missing = (self.topics[name].message_count or 0) - rows - topic_table.undecodable
@@ -401,7 +483,7 @@ class Log(OpenLog):
         topics: dict[str, Topic] = {}
         channels = [channel for part in self._parts for channel in part.channels.values()]
         for channel in sorted(channels, key=lambda c: (c.name, -(c.message_count or 0), not c.definition)):
-            topic = replace(channel, problem=_find_problem(channel, self._types))
+            topic = replace(channel, problem=self._find_problem(channel))
             first = self._channel_of.setdefault(channel.name, channel)
             if channel is first:
                 topics[channel.name] = topic
@@ -410,18 +492,6 @@ class Log(OpenLog):
             elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
                 topics[channel.name] = topics[channel.name].joined(topic)
         return topics
-
-
-def _find_problem(channel: Topic, types: TypeLibrary) -> str | None:
-    """Return why messages cannot be decoded; a definition that cannot be used is found when they are read."""
-    if channel.encoding not in ("cdr", "ros1"):
-        return f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
-    if not channel.type_name:
-        return "the log does not state the type of its messages"
-    if channel.definition.strip() or types.knows(channel.type_name):
-        return None
-    where = "the log contains no definition of it, and none is bundled"
-    return f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
 
 
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:

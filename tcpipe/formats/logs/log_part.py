@@ -8,14 +8,12 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-import threading
-from collections import OrderedDict, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import OrderedDict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -52,9 +50,6 @@ _GAP_BLOCKS = 4
 """Blocks no further apart are fetched as one piece: a request costs as much as some."""
 
 Int64Array = NDArray[np.int64]
-
-_Piece = TypeVar("_Piece")
-_Result = TypeVar("_Result")
 
 
 class DamageError(Exception):
@@ -94,6 +89,8 @@ class LogPart(Protocol):
     """One file of a log, open for reading."""
 
     name: str
+    container: str
+    """``mcap``, ``bag`` or ``rosbag2``."""
     damage: list[Damage]
     """What was found damaged so far; the same place may be in it twice."""
 
@@ -109,27 +106,21 @@ class LogPart(Protocol):
     def outline(self) -> str:
         """A hash (hex) of the file's size and index, which tell it from any other recording; "" where it has no index."""
 
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over.
-
-        The blocks, their order and what is noted do not depend on ``threads``.
-        """
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over."""
 
     def close(self) -> None:
         """Close the file."""
 
 
 class FetchedFile:
-    """A file in object storage with its stand-in on this machine; safe to use by several threads."""
+    """A file in object storage with its stand-in on this machine."""
 
     def __init__(self, stored: StoredObject, stand_in: Path) -> None:
         self._stored, self._stand_in = stored, stand_in
         self._held: OrderedDict[int, memoryview] = OrderedDict()
-        self._lock = threading.Lock()
         self.is_whole = False
         """Whether the stand-in holds all of the file by now."""
-        self.fetched_bytes = 0
-        """How much was fetched so far."""
 
     def read(self, offset: int, size: int) -> bytes:
         """Return ``size`` bytes at ``offset``, fewer where the file ends before."""
@@ -155,16 +146,14 @@ class FetchedFile:
         """Fetch all of the file to its stand-in, which holds nothing before."""
         if not self.is_whole:
             self._stored.copy(self._stand_in)
-            self.fetched_bytes += self._stored.size_bytes
             self.is_whole = True
             self._held.clear()
 
     def _blocks(self, numbers: Collection[int]) -> dict[int, memoryview]:
         """Return blocks by number; those that are not held are fetched."""
-        with self._lock:
-            found = {number: self._held[number] for number in numbers if number in self._held}
-            for number in found:
-                self._held.move_to_end(number)
+        found = {number: self._held[number] for number in numbers if number in self._held}
+        for number in found:
+            self._held.move_to_end(number)
         runs = _find_runs(sorted(set(numbers) - found.keys()))
         size = self._stored.size_bytes
         spans = [(run.start * _BLOCK_BYTES, min(run.stop * _BLOCK_BYTES, size)) for run in runs]
@@ -173,11 +162,9 @@ class FetchedFile:
                 number: data[(number - run.start) * _BLOCK_BYTES : (number + 1 - run.start) * _BLOCK_BYTES]
                 for number in run
             }
-        with self._lock:
-            self.fetched_bytes += sum(stop - start for start, stop in spans)
-            self._held.update(found)
-            while len(self._held) > _HELD_BLOCKS:
-                self._held.popitem(last=False)
+        self._held.update(found)
+        while len(self._held) > _HELD_BLOCKS:
+            self._held.popitem(last=False)
         return found
 
 
@@ -199,7 +186,7 @@ class ByteSource:
         self._file, self._fetched = path.open("rb"), fetched
         self.size = os.fstat(self._file.fileno()).st_size
         self._peeked = 0, b""
-        self._scratch = threading.local()
+        self._scratch = bytearray()
 
     def read(self, offset: int, size: int) -> memoryview:
         """Return ``size`` bytes at ``offset``; raise `DamageError` where the file ends before."""
@@ -214,13 +201,12 @@ class ByteSource:
         return memoryview(data)
 
     def read_once(self, offset: int, size: int) -> memoryview:
-        """Return bytes as `read` does, valid only until this thread reads again: their memory, still in the cache, is used again."""
+        """Return bytes as `read` does, valid only until the next call: their memory, still in the cache, is used again."""
         if size < 0 or offset + size > self.size:
             raise DamageError("file-cut")
-        held = getattr(self._scratch, "held", b"")
-        if len(held) < size:
-            held = self._scratch.held = bytearray(size)
-        view = memoryview(held)[:size]
+        if len(self._scratch) < size:
+            self._scratch = bytearray(size)
+        view = memoryview(self._scratch)[:size]
         return view if self._fill(view, offset) else self.read(offset, size)
 
     def read_pieces(self, pieces: Sequence[tuple[int, memoryview]]) -> None:
@@ -233,7 +219,7 @@ class ByteSource:
 
     def peek(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes at ``offset`` (fewer at the end); cheap for many small, mostly ascending reads."""
-        at, held = self._peeked  # one assignment below: threads may lose each other's piece, never mix two
+        at, held = self._peeked
         if offset < at or offset + size > at + len(held):
             at, held = self._peeked = offset, self._some(offset, max(size, _PEEK_BYTES))
             if len(held) < size and offset + len(held) < self.size:  # what can be read ends here
@@ -296,25 +282,6 @@ class ByteSource:
             raise DamageError("data-unreadable", str(error.strerror)) from None
 
 
-def map_in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
-    """Yield ``work(piece)`` of each piece in their order; several threads run ahead by one piece each."""
-    if threads <= 1:
-        yield from map(work, pieces)
-        return
-    ahead: deque[Future[_Result]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for piece in pieces:
-                ahead.append(pool.submit(work, piece))
-                if len(ahead) > threads:
-                    yield ahead.popleft().result()
-            while ahead:
-                yield ahead.popleft().result()
-        finally:
-            for waiting in ahead:
-                waiting.cancel()
-
-
 def outline_of(size: int, index: bytes | memoryview) -> str:
     """Return a hash (hex) of a file's size [byte] and its index, which holds where its chunks lie and when they were recorded."""
     return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
@@ -362,10 +329,7 @@ class Bounds:
 def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
     """Return the ``size`` bytes that ``data`` holds; `DamageError` where it does not decompress, or not to ``size``.
 
-    Parameters
-    ----------
-    codec : ``lz4`` (frames), ``zstd`` or ``bz2``.
-    checked : a checksum of the result is compared afterwards.
+    ``codec`` is ``lz4`` (frames), ``zstd`` or ``bz2``; ``checked``: a checksum of the result is compared afterwards.
     """
     if size > MAX_CHUNK_BYTES or is_bomb(len(data), size, whole=True):
         raise DamageError("record-damaged")

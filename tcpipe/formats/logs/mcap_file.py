@@ -9,29 +9,21 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from tcpipe.errors import LogError
 from tcpipe.formats.logs.chunk_reading import (
     MAX_PLANNED_BYTES,
-    Entries,
+    ChunkedPart,
     Excerpt,
     Messages,
-    copy_pieces,
-    read_chunk_blocks,
-    sort_by_place,
 )
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
-    Bounds,
-    ByteSource,
     DamageError,
-    FetchedFile,
     Int64Array,
     MessageBlock,
     decompress,
@@ -73,38 +65,18 @@ _AT_ONCE = 256
 """The heads of so many chunks are looked at together."""
 
 
-@dataclass(slots=True)
-class _Tally:
-    """Messages of a channel met on a walk."""
-
-    count: int = 0
-    start_ns: int | None = None
-    end_ns: int | None = None
-
-
-class McapPart:
+class McapPart(ChunkedPart[Chunk]):
     """One .mcap file, open for reading."""
 
-    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
-        self.name = name
-        self.damage: list[Damage] = []
-        self._bytes = ByteSource(path, fetched)
-        self._tallies: dict[int, _Tally] = {}
+    container = "mcap"
+    least_bytes = RECORD_HEAD + MESSAGE_HEAD
+
+    def _open(self) -> dict[int, Topic]:
+        self._tallies: dict[int, tuple[int, int, int]] = {}
+        """By channel, how many messages a walk met, the first and the last log time."""
         self._untimed = 0
         self._complete = False
         self._without_crc: set[int] = set()
-        self._bounds = Bounds(path, self._bytes.size)
-        try:
-            self._read_index()
-            self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
-            self._note_twins()
-        except LogError:
-            self.close()
-            raise
-        self.channels = {number: self._topic(number) for number in sorted(self._contents.channels)}
-
-    def _read_index(self) -> None:
-        """Read the summary, or, where it cannot be used, walk the file."""
         try:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
                 self._note("record-damaged", 0, messages_lost=0)
@@ -122,10 +94,9 @@ class McapPart:
             self._complete = True
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
             self._count_messages()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._bytes.close()
+        self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
+        self._note_twins()
+        return {number: self._topic(number) for number in sorted(self._contents.channels)}
 
     @property
     def outline(self) -> str:
@@ -137,14 +108,11 @@ class McapPart:
         """Whether chunks were read that carry no CRC."""
         return bool(self._without_crc)
 
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels."""
         if not self._complete:
             self._fill_gaps()
-        if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
-            self._bytes.skips()
-
-        yield from read_chunk_blocks(self, wanted, threads=threads)
+        yield from super().blocks(wanted)
         self._note_odd_ones_without_crc()
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
@@ -154,6 +122,8 @@ class McapPart:
             if chunk.index is None or not wanted.isdisjoint(chunk.index):
                 found.append((base, chunk))
             base += min(chunk.size, MAX_CHUNK_BYTES)
+        if len(found) < len(self._contents.chunks):
+            self._bytes.skips()
         return found
 
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
@@ -170,20 +140,20 @@ class McapPart:
         self._bounds.walk(chunk.offset, len(records))
         return records, end
 
-    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
+    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; where these end too early, or are none, that is noted."""
         records, end = self._records(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
         if lost := every - len(messages.offset):
-            noted.append(Damage("time-invalid", self.name, chunk.offset, messages_lost=lost))
+            self._note("time-invalid", chunk.offset, messages_lost=lost)
         if end < len(data) and not chunk.cut:
-            noted.append(Damage("record-damaged", self.name, chunk.offset, bytes_lost=len(data) - end))
+            self._note("record-damaged", chunk.offset, bytes_lost=len(data) - end)
         unknown = [n for n in np.unique(messages.channel).tolist() if n not in self._contents.channels]
         counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
         if unknown and not counted:
             lost = int(np.isin(messages.channel, unknown).sum())
-            noted.append(Damage("channel-undeclared", self.name, chunk.offset, messages_lost=lost))
+            self._note("channel-undeclared", chunk.offset, messages_lost=lost)
         return messages.at(np.isin(messages.channel, sorted(wanted)))
 
     def is_proved(self, chunk: Chunk) -> bool:
@@ -194,13 +164,12 @@ class McapPart:
         """Tell whether a broken index is worth a word: nothing else proves what the chunk holds."""
         return chunk.index is not None and not chunk.cut and not self._crc(chunk)
 
-    def copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
-        """Copy pieces (start, stop, place) of a chunk; what need not be read as a whole, to check or decompress it, is not."""
+    def find_plain_data(self, chunk: Chunk) -> int | None:
+        """Return where the records of a chunk begin that is neither compressed nor has a CRC."""
         if chunk.compression or self._crc(chunk):
-            copy_pieces(self.load(chunk, once=True), places, to)
-            return
+            return None
         self._without_crc.add(chunk.offset)
-        self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in places])
+        return chunk.data_offset
 
     def _crc(self, chunk: Chunk) -> int:
         """Return the CRC of a chunk's records; 0 where there is none."""
@@ -231,32 +200,24 @@ class McapPart:
         self._bytes.expect([(chunk.offset, RECORD_HEAD + CHUNK_HEAD) for chunk in chunks])
         return any(self._crc(chunk) for chunk in chunks)
 
-    def load(self, chunk: Chunk, *, once: bool = False) -> memoryview:
-        """Return the chunk's records, its CRC checked; of a chunk that the file's end cuts, what can still be had.
-
-        With ``once`` they may be overwritten when this thread reads again.
-        """
+    def load(self, chunk: Chunk) -> memoryview:
+        """Return the chunk's records, its CRC checked."""
         crc = self._crc(chunk)
         if not crc:
             self._without_crc.add(chunk.offset)
+        data, size = self._bytes.read_once(chunk.data_offset, chunk.data_bytes), chunk.uncompressed_bytes
         if chunk.cut:
-            return self._load_cut(chunk, self._bytes.read(chunk.data_offset, chunk.data_bytes))
+            kept = decompress_prefix(chunk.compression, data, size) if chunk.compression else data
+            self._note("file-cut", chunk.offset, bytes_lost=size - len(kept))
+            return kept
         if chunk.compression:
-            data = self._bytes.read_once(chunk.data_offset, chunk.data_bytes)
-            data = decompress(chunk.compression, data, chunk.uncompressed_bytes, checked=bool(crc))
-        else:
-            data = (self._bytes.read_once if once else self._bytes.read)(chunk.data_offset, chunk.data_bytes)
+            data = decompress(chunk.compression, data, size, checked=bool(crc))
         if crc and crc32(data) != crc:
             raise DamageError("chunk-damaged")
         return data
 
-    def _load_cut(self, chunk: Chunk, data: memoryview) -> memoryview:
-        kept = decompress_prefix(chunk.compression, data, chunk.uncompressed_bytes) if chunk.compression else data
-        self._note("file-cut", chunk.offset, bytes_lost=chunk.uncompressed_bytes - len(kept))
-        return kept
-
-    def entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
-        """Return the messages of several chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+    def read_indexes(self, chunks: list[Chunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+        """Return the messages of several chunks by their indexes."""
         regions: list[memoryview | bytes] = []
         places: list[tuple[int, int, int, int]] = []
         unsound, before = [], 0
@@ -276,12 +237,7 @@ class McapPart:
             before = end
         of, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
         right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
-        entries, sound = sort_by_place(
-            of[record], channels[record], offsets, stamps, sizes, least_bytes=RECORD_HEAD + MESSAGE_HEAD
-        )
-        sound[unsound] = False
-        sound[of[~right]] = False
-        return entries, sound
+        return (of[record], channels[record], offsets, stamps), [*unsound, *of[~right].tolist()]
 
     def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview | bytes, list[tuple[int, int]]]:
         """Return bytes that hold a chunk's message indexes, and of each channel's where it begins in them.
@@ -332,36 +288,40 @@ class McapPart:
     def _walk(self, contents: Contents, start: int, end: int) -> bool:
         """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
         position = start
-        run = _LooseMessages()
-        closed = False
         while position + RECORD_HEAD <= end:
-            try:
-                head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
-            except DamageError as error:
-                run.finish(contents.chunks)
-                position = self._stepped_over(contents, position, end, error)
-                continue
-            opcode, length = head[0], int.from_bytes(head[1:9], "little")
-            after = position + RECORD_HEAD + length
-            if opcode in (OP_FOOTER, OP_DATA_END) and length <= FOOTER:
-                closed = True
-                break
-            if opcode == OP_MESSAGE and after <= end and length >= MESSAGE_HEAD:
-                stamp = int.from_bytes(head[15:23], "little")
-                self._tally(int.from_bytes(head[9:11], "little"), 1, stamp, stamp)
-                run.extend(position, after, contents.chunks)
+            if (after := self._take_loose_messages(contents, position, end)) > position:
                 position = after
                 continue
-            run.finish(contents.chunks)
             try:
+                head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
+                opcode, length = head[0], int.from_bytes(head[1:9], "little")
+                if opcode in (OP_FOOTER, OP_DATA_END) and length <= FOOTER:
+                    if opcode == OP_DATA_END:
+                        self._check_data_section(contents, position)
+                    return True
+                after = position + RECORD_HEAD + length
                 self._take_record(contents, opcode, position, after, end)
             except DamageError as error:
                 after = self._stepped_over(contents, position, end, error)
             position = after
-        run.finish(contents.chunks)
-        if closed and opcode == OP_DATA_END:
-            self._check_data_section(contents, position)
-        return closed
+        return False
+
+    def _take_loose_messages(self, contents: Contents, position: int, end: int) -> int:
+        """Take messages outside chunks that follow one another as if they were a chunk; return where they end."""
+        after = position
+        with suppress(DamageError):
+            while after - position <= _LOOSE_BYTES and after + RECORD_HEAD <= end:
+                head = self._bytes.peek(after, RECORD_HEAD + MESSAGE_HEAD)
+                length = int.from_bytes(head[1:9], "little")
+                if head[0] != OP_MESSAGE or length < MESSAGE_HEAD or after + RECORD_HEAD + length > end:
+                    break
+                stamp = int.from_bytes(head[15:23], "little")
+                self._tally(int.from_bytes(head[9:11], "little"), 1, stamp, stamp)
+                after += RECORD_HEAD + length
+        size = after - position
+        if size:
+            contents.chunks.append(Chunk(position, position, size, "", size, 0, 0, headless=True))
+        return after
 
     def _stepped_over(self, contents: Contents, position: int, end: int, error: DamageError) -> int:
         """Note what cannot be at ``position``; return where the next chunk begins."""
@@ -451,7 +411,7 @@ class McapPart:
         if self._untimed:
             self._note("time-invalid", 0, messages_lost=self._untimed)
         if unknown := self._tallies.keys() - self._contents.channels.keys():
-            self._note("channel-undeclared", 0, messages_lost=sum(self._tallies[channel].count for channel in unknown))
+            self._note("channel-undeclared", 0, messages_lost=sum(self._tallies[channel][0] for channel in unknown))
 
     def _declare_and_count(self, chunk: Chunk) -> None:
         try:
@@ -480,8 +440,7 @@ class McapPart:
         if statistics:
             count, (start_ns, end_ns) = statistics.messages_by_channel.get(number, 0), self._times(number)
         else:
-            tally = self._tallies.get(number, _Tally())
-            count, start_ns, end_ns = tally.count, tally.start_ns, tally.end_ns
+            count, start_ns, end_ns = self._tallies.get(number, (0, None, None))
         return Topic(
             channel.topic,
             normalize_type_name(schema.name),
@@ -513,29 +472,14 @@ class McapPart:
         return min(first, default=None), max(last, default=None)
 
     def _tally(self, channel: int, count: int, start_ns: int, end_ns: int) -> None:
-        tally = self._tallies.setdefault(channel, _Tally())
-        tally.count += count
-        tally.start_ns = start_ns if tally.start_ns is None else min(start_ns, tally.start_ns)
-        tally.end_ns = end_ns if tally.end_ns is None else max(end_ns, tally.end_ns)
+        known, first_ns, last_ns = self._tallies.get(channel, (0, start_ns, end_ns))
+        self._tallies[channel] = known + count, min(start_ns, first_ns), max(end_ns, last_ns)
 
     def _tally_messages(self, data: memoryview, messages: Int64Array) -> None:
         channels = gather_integers(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
         for channel, of in group_by_key(channels):
             stamps = gather_integers(data, messages[of] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
-
-    def _note(
-        self,
-        cause: str,
-        offset: int,
-        *,
-        messages_lost: int | None = None,
-        bytes_lost: int | None = None,
-        reason: str = "",
-    ) -> None:
-        self.damage.append(
-            Damage(cause, self.name, offset, messages_lost=messages_lost, bytes_lost=bytes_lost, reason=reason)
-        )
 
     def lost(self, chunk: Chunk, error: DamageError) -> Damage:
         """Return the damage of a chunk that is lost as a whole, counted by the message index beside it."""
@@ -547,28 +491,6 @@ class McapPart:
         return Damage(
             error.cause, self.name, chunk.offset, messages_lost=lost or None, bytes_lost=size, reason=error.reason
         )
-
-
-class _LooseMessages:
-    """Messages outside chunks that follow one another: read together, as if they were a chunk."""
-
-    def __init__(self) -> None:
-        self._start = self._end = 0
-
-    def extend(self, start: int, end: int, chunks: list[Chunk]) -> None:
-        """Add one message."""
-        if self._end - self._start > _LOOSE_BYTES:
-            self.finish(chunks)
-        if self._end == self._start:
-            self._start = start
-        self._end = end
-
-    def finish(self, chunks: list[Chunk]) -> None:
-        """Append the run to the chunks."""
-        size = self._end - self._start
-        if size:
-            chunks.append(Chunk(self._start, self._start, size, "", size, 0, 0, headless=True))
-        self._start = self._end = 0
 
 
 def _find_needed_bytes(chunk: Chunk) -> tuple[int, int]:

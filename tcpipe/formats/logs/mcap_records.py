@@ -23,10 +23,10 @@ MESSAGE_HEAD = 22
 """Bytes of a message's content before its payload: channel, sequence, log time, publish time."""
 CHUNK_HEAD = 40
 """Bytes of a chunk's content before its data, without the name of its compression."""
-_INDEX_HEAD = struct.Struct("<BQHI")
 _CHUNK_INDEX_HEAD, _CHUNK_INDEX_MIDDLE, _CHUNK_INDEX_TAIL = (
     struct.Struct(f"<{form}") for form in ("QQQQI", "QI", "QQ")
 )
+_INDEX_HEAD = struct.Struct("<BQHI")
 _CHANNEL_OFFSET = struct.Struct("<HQ")
 FOOTER = 20
 """Bytes of a footer's content."""
@@ -101,8 +101,6 @@ class Statistics:
 
     messages: int
     chunks: int
-    start_ns: int
-    end_ns: int
     messages_by_channel: dict[int, int]
 
 
@@ -189,8 +187,8 @@ def parse_chunk_index(content: bytes | memoryview) -> Chunk:
 def parse_statistics(content: bytes | memoryview) -> Statistics:
     """Return the counts of the file."""
     fields = FieldReader(content)
-    messages, _, _, _, _, chunks, start_ns, end_ns, map_bytes = fields.take("QHIIIIQQI")
-    return Statistics(messages, chunks, start_ns, end_ns, fields.pairs(map_bytes))
+    messages, _, _, _, _, chunks, _, _, map_bytes = fields.take("QHIIIIQQI")
+    return Statistics(messages, chunks, fields.pairs(map_bytes))
 
 
 def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:
@@ -208,15 +206,9 @@ def index_messages(
 ) -> tuple[NDArray[np.bool_], Int64Array, Int64Array, Int64Array]:
     """Read several message indexes at once.
 
-    Parameters
-    ----------
-    data : bytes that hold them.
-    records, ends, channels : of each index, shape (R,), where it begins, before which byte it must end, and of which channel it should be.
-
-    Returns
-    -------
-    right : which of the indexes are what they should be, shape (R,).
-    record, log_time_ns, offset : of each message of those, shape (N,), the number of its index, its log time and its offset in the chunk.
+    ``records``, ``ends`` and ``channels`` say of each index, shape (R,), where it begins in ``data``, before which byte it must end, and
+    of which channel it should be. The result says which of the indexes are what they should be, shape (R,), and of each message of those,
+    shape (N,), the number of its index, its log time [ns] and its offset in the chunk.
     """
     whole = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
     right, size = np.zeros(len(records), np.bool_), np.zeros(len(records), np.int64)

@@ -93,9 +93,7 @@ class MessageType:
     def row_decoder(self, encoding: str) -> Callable[[bytes], dict[str, Any]]:
         """Return a function from one serialised message to its fields by dotted name, by rosbags; it raises `RowError`.
 
-        Raises
-        ------
-        DefinitionError : rosbags makes no type of the definition.
+        `DefinitionError`: rosbags makes no type of the definition.
         """
         store = _make_typestore(self.definitions)
         name = self.wire.name
@@ -137,12 +135,12 @@ class TypeLibrary:
         self._own = _read_definitions_of_directory(message_definitions) if message_definitions else {}
         self._types: dict[tuple[str, str, str, bool], MessageType | DefinitionError] = {}
 
-    def message_type(self, type_name: str, *, definition: str, schema_encoding: str, ros1: bool) -> MessageType:
+    def find_type(
+        self, type_name: str, *, definition: str, schema_encoding: str, ros1: bool
+    ) -> MessageType | DefinitionError:
         """Return the type for a definition text ("" where the log has none).
 
-        Raises
-        ------
-        DefinitionError : no definition is known, or it cannot be parsed, is recursive, or uses a type no reader supports.
+        Or what is in the way: no definition is known, or it cannot be parsed, is recursive, or uses a type no reader supports.
         """
         key = (type_name, definition, schema_encoding, ros1)
         if key not in self._types:
@@ -150,14 +148,7 @@ class TypeLibrary:
                 self._types[key] = self._resolve(type_name, definition, schema_encoding, ros1=ros1)
             except DefinitionError as error:
                 self._types[key] = error
-        found = self._types[key]
-        if isinstance(found, DefinitionError):
-            raise found
-        return found
-
-    def knows(self, type_name: str) -> bool:
-        """Return whether a type can be read of which a log holds no definition."""
-        return type_name in self._own or self._fallback(type_name, ros1=False) is not None
+        return self._types[key]
 
     def _resolve(self, type_name: str, definition: str, schema_encoding: str, *, ros1: bool) -> MessageType:
         known, source = self._known(type_name, definition, schema_encoding)

@@ -164,10 +164,10 @@ def _decompress_stream(path: Path) -> Iterator[bytes]:
             yield block
 
 
-def decompress_blocks(part: LogPart, wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
+def decompress_blocks(part: LogPart, wanted: frozenset[int]) -> Iterator[MessageBlock]:
     """Yield a part's messages of the wanted channels; those that are zstd frames each (``compression_mode: MESSAGE``) decompressed."""
     compressed: dict[int, bool] = {}
-    for block in part.blocks(wanted, threads=threads):
+    for block in part.blocks(wanted):
         if block.channel not in compressed:
             start = block.offsets[0] if len(block.offsets) else len(block.buffer)
             is_frame = bytes(block.buffer[start : start + 4]) == ZSTD_MAGIC  # as no CDR message begins

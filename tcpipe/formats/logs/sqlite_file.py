@@ -47,6 +47,8 @@ _Row = tuple[int, int, int, int, bytes]
 class SqlitePart:
     """One .db3 file, open for reading."""
 
+    container = "rosbag2"
+
     def __init__(self, path: Path, name: str) -> None:
         self.name = name
         self.damage: list[Damage] = []
@@ -82,7 +84,7 @@ class SqlitePart:
         """Close the file, and remove its copy where one was needed."""
         self._opened.close()
 
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:  # noqa: ARG002
+    def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted topics in the order of their ids, some thousand rows at a time."""
         topics = sorted(wanted & self.channels.keys())
         if not topics:

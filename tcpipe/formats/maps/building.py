@@ -142,17 +142,18 @@ def build_map(
         with write_atomic_directory(out_path) as half:
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
-            for of in banded.values():
-                of.write(writer)
+            for banded_layer in banded.values():
+                banded_layer.write(writer)
             every = layers | {
-                role: min(of.bands, key=lambda band: band.tally.pixels) for role, of in banded.items()
+                role: min(banded_layer.bands, key=lambda band: band.tally.pixels)
+                for role, banded_layer in banded.items()
             }  # of several bands that with the least data counts
             _refuse_empty(every)
-            sides_m = {role: of.grid.pixel_size_m for role, of in banded.items()}
+            sides_m = {role: banded_layer.grid.pixel_size_m for role, banded_layer in banded.items()}
             facts = _make_facts(grid, every, sides_m, origin, inputs or MapInputs())
             facts = replace(facts, origins=tuple(origins))
             ranges = {role: _set_range(source) for role, source in layers.items()}
-            writer.finish(facts, ranges | {role: of.describe() for role, of in banded.items()})
+            writer.finish(facts, ranges | {role: banded_layer.describe() for role, banded_layer in banded.items()})
             write_checksums(half)
     return facts
 
@@ -181,15 +182,20 @@ class BandedLayer:
         return make_banded_layer(layer.name, layer.unit, ranges, self.dtype, pixel_size_m)
 
 
-def _place_bands(of: RasterLayer, grid: MapGrid, name: str) -> BandedLayer:
+def _place_bands(source: RasterLayer, grid: MapGrid, name: str) -> BandedLayer:
     """Return the bands of a raster on a grid of their own; log how large that becomes."""
-    count, dtype = of.raster.band_count, "float16" if all(tile.is_half for tile in of.raster.tiles) else "float32"
+    count, dtype = (
+        source.raster.band_count,
+        "float16" if all(tile.is_half for tile in source.raster.tiles) else "float32",
+    )
     size_mb = count * grid.rows * grid.cols * np.dtype(dtype).itemsize / 1e6
     message = "map %s: layer %s: %d bands, %d x %d px of %g m, %s: up to %.1f MB"
-    logger.info(message, name, of.layer.name, count, grid.cols, grid.rows, grid.pixel_size_m, dtype, size_mb)
+    logger.info(message, name, source.layer.name, count, grid.cols, grid.rows, grid.pixel_size_m, dtype, size_mb)
     if count * grid.rows * grid.cols > MAX_PIXELS:
-        raise MapError(f"{of.label}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all")
-    bands = [replace(of, raster=of.raster.select_band(band), tally=Tally()) for band in range(count)]
+        raise MapError(
+            f"{source.label}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all"
+        )
+    bands = [replace(source, raster=source.raster.select_band(band), tally=Tally()) for band in range(count)]
     return BandedLayer(tuple(bands), grid, dtype)
 
 

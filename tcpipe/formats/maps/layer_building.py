@@ -69,7 +69,7 @@ class Raster:
     @property
     def name(self) -> str:
         """The label without its folder."""
-        return _label([tile.path for tile in self.tiles], of=lambda path: path.name)
+        return _label([tile.path for tile in self.tiles], name_path=lambda path: path.name)
 
     def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.RasterTiles.read` does of one tile."""
@@ -122,7 +122,9 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
             affine=affine,
             rows=int(corners[:, 1].max()),
             cols=int(corners[:, 3].max()),
-            findings=tuple({of.code: of for tile in reversed(tiles) for of in reversed(tile.findings)}.values()),
+            findings=tuple(
+                {finding.code: finding for tile in reversed(tiles) for finding in reversed(tile.findings)}.values()
+            ),
             names=_join_value_names(tiles),
             tiles=tuple(tiles),
             _corners=corners,
@@ -130,8 +132,8 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
         )
 
 
-def _label(paths: Sequence[Path], of: Callable[[Path], str] = str) -> str:
-    return of(paths[0]) if len(paths) == 1 else f"{of(paths[0])} … {paths[-1].name} ({len(paths)} files)"
+def _label(paths: Sequence[Path], name_path: Callable[[Path], str] = str) -> str:
+    return name_path(paths[0]) if len(paths) == 1 else f"{name_path(paths[0])} … {paths[-1].name} ({len(paths)} files)"
 
 
 def _shorten_list(lines: list[str]) -> list[str]:

@@ -64,11 +64,11 @@ class RasterOrigin:
 def origin_lines(origins: Sequence[RasterOrigin]) -> list[str]:
     """Return where rasters are from, a line for each, and the licences."""
     lines = [
-        f"{of.layer:8s} {of.date[:10] or 'no date'}, {of.resolution}, {of.to_read_bytes / 1e6:.2f} MB: {of.url}"
-        + (f" (heights above {of.vertical_datum or 'an unknown datum'})" if of.layer == "height" else "")
-        for of in origins
+        f"{origin.layer:8s} {origin.date[:10] or 'no date'}, {origin.resolution}, {origin.to_read_bytes / 1e6:.2f} MB: {origin.url}"
+        + (f" (heights above {origin.vertical_datum or 'an unknown datum'})" if origin.layer == "height" else "")
+        for origin in origins
     ]
-    return lines + [f"licence: {text}" for text in dict.fromkeys(of.licence for of in origins)]
+    return lines + [f"licence: {text}" for text in dict.fromkeys(origin.licence for origin in origins)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,29 +116,29 @@ _SHARES = 5
 """Classes that a line lists by their share, commonest first."""
 
 
-def map_lines(of: MapSummary) -> list[str]:
+def map_lines(summary: MapSummary) -> list[str]:
     """Return where a map lies and what each layer holds."""
-    rows, cols, pixel_size_m = of.rows, of.cols, of.pixel_size_m
-    crs = of.crs if len(of.crs) < 20 else "a CRS of its own"
+    rows, cols, pixel_size_m = summary.rows, summary.cols, summary.pixel_size_m
+    crs = summary.crs if len(summary.crs) < 20 else "a CRS of its own"
     lines = [
         f"{cols} x {rows} px of {pixel_size_m:g} m ({cols * pixel_size_m:.0f} x {rows * pixel_size_m:.0f} m) in {crs}"
     ]
-    width = max(8, *(len(layer) for layer in of.layers))
-    for layer in of.layers:
-        line = f"{layer:{width}s} {_format_percent(of.covered[layer]):>5s} covered, from {of.sources[layer]}"
-        lines.append(line + _format_detail(layer, of))
-    return lines + origin_lines(of.origins)
+    width = max(8, *(len(layer) for layer in summary.layers))
+    for layer in summary.layers:
+        line = f"{layer:{width}s} {_format_percent(summary.covered[layer]):>5s} covered, from {summary.sources[layer]}"
+        lines.append(line + _format_detail(layer, summary))
+    return lines + origin_lines(summary.origins)
 
 
-def _format_detail(layer: str, of: MapSummary) -> str:
+def _format_detail(layer: str, summary: MapSummary) -> str:
     if layer == "height":
-        return f": {of.height_min_m:.1f} to {of.height_max_m:.1f} m"
-    own = read_layers(of.described, (), Path(of.name)).get(layer)
+        return f": {summary.height_min_m:.1f} to {summary.height_max_m:.1f} m"
+    own = read_layers(summary.described, (), Path(summary.name)).get(layer)
     if own is not None and own.kind == "continuous" and own.stack != "greys":
         bands = f" {len(own.bands)} bands of {own.pixel_size_m:g} m ({own.mapped})," if own.bands else ""
         return f":{bands} {own.low:.6g} to {own.high:.6g}" + ("" if own.unit == "1" else f" {own.unit}")
     if layer == "terrain" or own is not None:
-        classes = of.class_share if layer == "terrain" else of.class_shares[layer]
+        classes = summary.class_share if layer == "terrain" else summary.class_shares[layer]
         shares = sorted(classes.items(), key=lambda entry: (-entry[1], entry[0]))
         listed = [f"{_format_percent(share)} {name}" for name, share in shares[:_SHARES]]
         return ": " + ", ".join(listed) + (" …" if len(shares) > _SHARES else "")
@@ -261,15 +261,22 @@ def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass
     """Return the layers that `describe_layer` wrote into ``path``, by name; ``classes`` are those of terrain, if any."""
     layers: dict[str, Layer] = {}
     for name, description in found.items():
-        told = parse_typed(description, _LayerDescription, path)
+        layer_description = parse_typed(description, _LayerDescription, path)
         if name in PAPER_LAYERS:
             known = make_paper_layers([name], ClassTable(tuple(classes))) if classes else PAPER_LAYERS
-            layers[name] = replace(known[name], long_name=told.long_name or known[name].long_name)
-        elif told.kind == "categorical":
-            layers[name] = make_categorical_layer(name, ClassTable(told.classes))
-        elif told.bands:
-            layers[name] = make_banded_layer(name, told.units, told.bands, told.dtype, told.pixel_size_m, told.own_px)
+            layers[name] = replace(known[name], long_name=layer_description.long_name or known[name].long_name)
+        elif layer_description.kind == "categorical":
+            layers[name] = make_categorical_layer(name, ClassTable(layer_description.classes))
+        elif layer_description.bands:
+            layers[name] = make_banded_layer(
+                name,
+                layer_description.units,
+                layer_description.bands,
+                layer_description.dtype,
+                layer_description.pixel_size_m,
+                layer_description.own_px,
+            )
         else:
-            low, high = told.actual_range
-            layers[name] = make_continuous_layer(name, unit=told.units, low=low, high=high)
+            low, high = layer_description.actual_range
+            layers[name] = make_continuous_layer(name, unit=layer_description.units, low=low, high=high)
     return layers

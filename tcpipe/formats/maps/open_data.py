@@ -124,7 +124,7 @@ def find_items(client: HttpsClient, catalogue: Catalogue, collection: str, area:
     ------
     MapError : the catalogue cannot be asked, replies something else, or has none.
     """
-    query = urlencode({"bbox": ",".join(f"{of:.7f}" for of in area.bounds), "limit": _PAGE_ITEMS})
+    query = urlencode({"bbox": ",".join(f"{bound:.7f}" for bound in area.bounds), "limit": _PAGE_ITEMS})
     url = f"{catalogue.stac.rstrip('/')}/collections/{collection}/items?{query}"
     found: dict[str, Item] = {}
     for _ in range(_MOST_PAGES):
@@ -154,8 +154,10 @@ def _iterate_items(page: Any, url: str, pattern: str) -> Iterator[Item]:
     """Yield the items of a page, each with its finest GeoTIFF."""
     for item in page["features"]:
         about, name = item["properties"], item["id"]
-        assets = {key: of for key, of in item["assets"].items() if _is_geotiff(of) and fnmatchcase(key, pattern)}
-        sizes = {key: of.get("gsd") or of.get("eo:gsd") for key, of in assets.items()}
+        assets = {
+            key: asset for key, asset in item["assets"].items() if _is_geotiff(asset) and fnmatchcase(key, pattern)
+        }
+        sizes = {key: asset.get("gsd") or asset.get("eo:gsd") for key, asset in assets.items()}
         if len(assets) > 1 and None in sizes.values():
             raise MapError(
                 f"{url}: item {name} has the GeoTIFFs {', '.join(assets)}, and does not tell which is finest (gsd); "
@@ -185,7 +187,7 @@ def choose_newest(items: Sequence[Item], area: Geometry) -> tuple[list[Item], fl
     """Return the newest items that together cover what there is of an area, the newest last, and the share that they cover."""
     chosen: list[Item] = []
     missing = area
-    for item in sorted(items, key=lambda of: (of.date, of.id), reverse=True):
+    for item in sorted(items, key=lambda item: (item.date, item.id), reverse=True):
         left = missing.difference(item.footprint)
         if missing.area - left.area > _NEW_GROUND_FRACTION * area.area:
             chosen.insert(0, item)

@@ -216,15 +216,22 @@ def _iterate_blocks(dataset: Any, window: Window, url: str) -> Iterator[tuple[in
     if len(rows) * len(cols) > _MOST_BLOCKS_READ:
         raise MapError(f"{url}: {len(rows) * len(cols)} blocks around the track, at most {_MOST_BLOCKS_READ}")
     for row, col, band in itertools.product(rows, cols, bands):
-        found = [dataset.get_tag_item(f"BLOCK_{of}_{col}_{row}", "TIFF", bidx=band) for of in ("OFFSET", "SIZE")]
+        found = [dataset.get_tag_item(f"BLOCK_{tag}_{col}_{row}", "TIFF", bidx=band) for tag in ("OFFSET", "SIZE")]
         if all(found):
             yield int(found[0]), int(found[1])
 
 
-def _move(of: Any, window: Window) -> rasterio.Affine:
+def _move(affine: Any, window: Window) -> rasterio.Affine:
     """Return an affine for the pixels of a window."""
     col, row = window.col_off, window.row_off
-    return rasterio.Affine(of.a, of.b, of.a * col + of.b * row + of.c, of.d, of.e, of.d * col + of.e * row + of.f)
+    return rasterio.Affine(
+        affine.a,
+        affine.b,
+        affine.a * col + affine.b * row + affine.c,
+        affine.d,
+        affine.e,
+        affine.d * col + affine.e * row + affine.f,
+    )
 
 
 def _copy_pixels(dataset: Any, window: Window, path: Path) -> None:

@@ -15,7 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import GNSS, WHEELS, BodyVelocities, Measurements, Positions
+from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
+    GNSS,
+    WHEELS,
+    BodyVelocities,
+    Measurements,
+    Positions,
+    Trajectory,
+)
 from tcpipe.fusion.process import SCALE_STD
 from tcpipe.fusion.signals import (
     compute_interval_means,
@@ -23,7 +31,6 @@ from tcpipe.fusion.signals import (
     compute_seconds,
     is_covered,
 )
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.facts import Disagreement

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import shlex
 import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
+from pyarrow.csv import write_csv
 
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
@@ -27,6 +27,7 @@ from tcpipe.formats.dataset_files import (
     CLASSES,
     CROISSANT,
     DRIVE_NEXT,
+    EXCLUDED,
     HUB_CARD,
     OVERVIEW,
     RELIEF,
@@ -71,6 +72,7 @@ from tcpipe.pipeline.dataset.redaction import (
 )
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
+from tcpipe.pipeline.dataset.splitting import read_exclusions
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import Recipe, TrainConfig
@@ -79,7 +81,7 @@ from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_o
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import READ_VERSIONS
 from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
@@ -133,7 +135,7 @@ class BuildResult:
         ledger += "".join(f", {-metres:.0f} m {name.replace('_', ' ')}" for metres, name in sorted(lost))
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
         verdict = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
-        return [head, ledger, *floor, *verdict]
+        return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
         if self.card is None or self.card.redaction is None:
@@ -174,6 +176,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         robot=robot,
         region=region,
         covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
+        exclusions=read_exclusions(options.exclude, options.reason),
     )
     inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
     left_out = _find_left_out(
@@ -208,7 +211,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
             workers.waiting.delete(entry.name)
         result = _make_result(place, "done", card, left_out)
         counts = {"runs": len(inputs.runs), "samples": card.samples}
-        written = sum(of.size_bytes for of in card.checksums.values())
+        written = sum(checksum.size_bytes for checksum in card.checksums.values())
         took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
         dataset = _describe_dataset(result, inputs)
         replaced = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
@@ -373,31 +376,15 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         buffer_m=content.split.buffer_m,
     )
     write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redact_features(drive_next, redaction))
+    if content.excluded.num_rows and redaction is None:
+        write_csv(content.excluded, directory / EXCLUDED)
     card = make_dataset_card(figures, options, inputs, content, balance=balance, shards=shards)
     card = card if redaction is None else redact_card(card, redaction)
     shutil.rmtree(waiting)
-    spool, schema = content.spool, content.samples.schema
+    write_text(directory / HUB_CARD, format_hub_card(card, samples_file=SAMPLES, picture=OVERVIEW))
     files = compute_checksums(directory)
-    write_text(
-        directory / HUB_CARD,
-        format_hub_card(replace(card, checksums=files), schema, samples_file=SAMPLES, picture=OVERVIEW),
-    )
-    files = {**files, HUB_CARD: compute_checksum(directory / HUB_CARD)}
-    sizes = {name: math.prod(layer.patch_shape(spool.patch_px)) for name, layer in spool.layers.items()}
-    patches = {name: (sizes[name], layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
-    croissant = format_croissant(
-        name=card.name,
-        description=card.description,
-        licence=card.licence,
-        creator=card.creator,
-        attributions=card.attributions,
-        files=files,
-        samples_file=SAMPLES,
-        samples=schema,
-        version=f"{DATA_MODEL_VERSION}.0+{inputs.digest[:12]}",
-        shards=None if patches is None else f"{SHARDS}/*.parquet",
-        layers=patches,
-    )
+    shards_pattern = f"{SHARDS}/*.parquet"
+    croissant = format_croissant(card, content.samples.schema, files, samples_file=SAMPLES, shards=shards_pattern)
     write_text(directory / CROISSANT, croissant)
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)

@@ -110,6 +110,7 @@ def make_dataset_card(
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
         physics=fit_physics_by_robot(samples),
         covariates=content.covariates,
+        exclusions=content.exclusions,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
         checksums={},
@@ -184,7 +185,9 @@ def _compute_statistics(samples: pa.Table) -> dict[str, LabelStatistics]:
     for name in _DESCRIBED:
         values = samples.column(name).filter(train).to_numpy()
         figures = (
-            [float(of()) for of in (values.mean, values.std, values.min, values.max)] if len(values) else [None] * 4
+            [float(compute()) for compute in (values.mean, values.std, values.min, values.max)]
+            if len(values)
+            else [None] * 4
         )
         found[name] = LabelStatistics(len(values), *figures)
     return found
@@ -223,7 +226,7 @@ def count_flagged(quality: pa.ChunkedArray) -> FlaggedSamples:
     counts = {flag_name(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
     common = int(np.bitwise_and.reduce(bits)) if len(bits) > 1 else 0
     count = int(np.count_nonzero(bits & ~common))
-    return FlaggedSamples(count, count / max(len(bits), 1), {name: of for name, of in counts.items() if of})
+    return FlaggedSamples(count, count / max(len(bits), 1), {name: count for name, count in counts.items() if count})
 
 
 def find_in_samples(card: DatasetCard) -> Iterator[Finding]:

@@ -24,6 +24,7 @@ from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all, unwrap_result
 from tcpipe.formats.dataset_card import (
     Covariate,
+    Exclusion,
     MapRegistration,
     Removal,
     RunSource,
@@ -59,7 +60,7 @@ from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.map_checks import find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
-from tcpipe.pipeline.dataset.splitting import draw_splits
+from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded
 from tcpipe.recipe import CovariateConfig, Recipe
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
@@ -267,6 +268,9 @@ class Content:
     registrations: Sequence[tuple[MapRegistration, ...]]
     """By map, one for each run."""
     covariates: tuple[Covariate, ...]
+    exclusions: tuple[Exclusion, ...]
+    excluded: pa.Table
+    """Each id of these lists with its reason and outcome."""
     removal: Removal
     findings: tuple[Finding, ...]
 
@@ -280,9 +284,9 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     segments, distance_by_reason_m, unusable = _pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
     ranks = _rank_segments(segments, seed=recipe.split.seed)
-    sources = tuple(open_map(*of) for of in inputs.maps())
+    sources = tuple(open_map(*arguments) for arguments in inputs.maps())
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
-    shifts = [list_shifts(of) for of, _ in registered]
+    shifts = [list_shifts(registrations) for registrations, _ in registered]
     sampled, slot, spool = sample_all_segments(
         segments,
         ranks,
@@ -300,14 +304,24 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
     tags = _read_tags(segments, inputs, recipe)
+    excluded = find_excluded(inputs.exclusions, segments.column("segment_id"), sampled.kept)
     assigned, result = draw_splits(
-        segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
+        segments,
+        sampled,
+        sources[0].grid,
+        options.regions,
+        recipe,
+        excluded=excluded.mask,
+        earlier=options.earlier,
+        tags=tags,
     )
-    arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
-    unused_m = {
-        loss: arc_m[assigned.is_in(name)].sum()
-        for loss, name in ((Loss.SPLIT_BUFFER, "buffer"), (Loss.SPLIT_EXCLUDED, EXCLUDED))
+    unused = {
+        Loss.SPLIT_BUFFER: assigned.is_in("buffer"),
+        Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED) & ~excluded.mask,
+        **({Loss.EXCLUDED: excluded.mask} if inputs.exclusions else {}),
     }
+    arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
+    unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
@@ -334,10 +348,21 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         sources=sources,
         split=result,
         distance_by_reason_m=_move_losses(distance_by_reason_m, {**lost_m, **unused_m}),
-        registrations=[of for of, _ in registered],
+        registrations=[registrations for registrations, _ in registered],
         covariates=covariates,
+        exclusions=excluded.lists,
+        excluded=excluded.ids,
         removal=removal,
-        findings=(*inputs.findings, *unusable, *shifted, *sampled.findings, *narrow, *biased, *incomplete),
+        findings=(
+            *inputs.findings,
+            *unusable,
+            *shifted,
+            *sampled.findings,
+            *excluded.findings,
+            *narrow,
+            *biased,
+            *incomplete,
+        ),
     )
 
 
@@ -516,8 +541,8 @@ def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tu
     tags = {run.run_id: run.tags or {} for run in runs}
     place = pc.index_in(run_ids, value_set=pa.array(list(tags), pa.string()))
     columns, fields, findings = list[pa.Array](), list[pa.Field](), list[Finding]()
-    for key in sorted({key for of in tags.values() for key in of}):
-        texts = [of.get(key) for of in tags.values()]
+    for key in sorted({key for run_tags in tags.values() for key in run_tags}):
+        texts = [run_tags.get(key) for run_tags in tags.values()]
         different = {text for text in texts if text is not None}
         words = sorted(text for text in different if not _NUMBER.fullmatch(text.strip()))
         if words and len(words) < len(different):

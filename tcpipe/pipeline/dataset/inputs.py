@@ -29,7 +29,7 @@ from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.pipeline.dataset.splitting import regions_to_json
+from tcpipe.pipeline.dataset.splitting import ExcludedIds, regions_to_json
 from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.recipe import Recipe
 from tcpipe.splits.regions import Regions
@@ -76,6 +76,7 @@ class Inputs:
     findings: tuple[Finding, ...]
     """On the choice of runs."""
     covariates: tuple[CovariateTable, ...] = ()
+    exclusions: tuple[ExcludedIds, ...] = ()
 
 
 def choose_inputs(
@@ -87,6 +88,7 @@ def choose_inputs(
     robot: str | None,
     region: bytes | None,
     covariates: tuple[CovariateTable, ...],
+    exclusions: tuple[ExcludedIds, ...],
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe, and the maps; `DatasetError` lists the candidates."""
     problems = list[str]()
@@ -118,12 +120,17 @@ def choose_inputs(
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
             "format": options.file_format,
-            **({"covariates": [(of.name, of.checksum) for of in covariates]} if covariates else {}),
+            **({"covariates": [(table.name, table.checksum) for table in covariates]} if covariates else {}),
+            **(
+                {"excluded": [(table.name, table.checksum, table.reason) for table in exclusions]} if exclusions else {}
+            ),
             **({} if options.earlier is None else {"kept_split": _hash_table(options.earlier)}),
         }
     )
     findings = (*chosen.findings, *once.findings)
-    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings, covariates)
+    return Inputs(
+        runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings, covariates, exclusions
+    )
 
 
 def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
@@ -166,7 +173,11 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
     """Return one hash over the checksums of files, or of those below a directory."""
     start = f"{below}/" if below else ""
     return digest(
-        {name.removeprefix(start): (of.size_bytes, of.sha256) for name, of in files.items() if name.startswith(start)}
+        {
+            name.removeprefix(start): (checksum.size_bytes, checksum.sha256)
+            for name, checksum in files.items()
+            if name.startswith(start)
+        }
     )
 
 
@@ -238,7 +249,12 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
     yield "--map", tuple(entry.name for entry in card.maps), inputs.map_names
     regions = None if options.regions is None else regions_to_json(options.regions)
     yield "--split", _format_region(card.split.region), _format_region(regions)
-    yield "--covariates", tuple(of.name for of in card.covariates), tuple(of.name for of in inputs.covariates)
+    yield (
+        "--covariates",
+        tuple(table.name for table in card.covariates),
+        tuple(table.name for table in inputs.covariates),
+    )
+    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in inputs.exclusions)
     yield "--format", card.format, options.file_format
     if not options.keeps_own_split:
         yield "--keep-split", card.split.kept is not None, options.earlier is not None
@@ -257,7 +273,7 @@ def _find_chosen_tags(card: DatasetCard, wanted: Mapping[str, str], inputs: Inpu
 
 
 def _find_shared_tags(tags: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    every = [set(of.items()) for of in tags]
+    every = [set(run_tags.items()) for run_tags in tags]
     return dict(sorted(set.intersection(*every))) if every else {}
 
 

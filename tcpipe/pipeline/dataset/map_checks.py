@@ -215,7 +215,7 @@ def _is_other_ground(misfit_m: float, expected_m: float) -> bool:
 
 def _find_height_datum(registrations: Sequence[MapRegistration], name: str, geoid_m: float | None) -> list[Finding]:
     """Return the finding, if any, that heights of the tracks and of the map are above different surfaces."""
-    offsets_m = np.array([of.height_offset_m for of in registrations] or [0.0])
+    offsets_m = np.array([registration.height_offset_m for registration in registrations] or [0.0])
     offset_m, apart_m = float(np.median(offsets_m)), read_threshold(_DATUM, "max_scatter_m")
     if abs(offset_m) < read_threshold(_DATUM, "min_offset_m") or (np.abs(offsets_m - offset_m) > apart_m).any():
         return []
@@ -230,7 +230,10 @@ def _make_map_registration(run_id: str, found: Registration, expected_m: float, 
     """Return the registration for the card: no shift where the ground cannot determine one."""
     unknown = {} if np.isfinite(found.shift_std_m) else dict.fromkeys(("shift_xy_m", "shift_std_m", "shifted_misfit_m"))
     if is_applied:  # to a tenth of a millimetre, so that the last bits of another processor do not move a pixel
-        unknown = {"shift_xy_m": tuple(round(of, 4) for of in found.shift_xy_m), "applied_std_m": found.position_std_m}
+        unknown = {
+            "shift_xy_m": tuple(round(shift_m, 4) for shift_m in found.shift_xy_m),
+            "applied_std_m": found.position_std_m,
+        }
     return convert_record(
         found,
         MapRegistration,

@@ -205,7 +205,7 @@ def _redact_finding(finding: Finding) -> Finding:
 def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     """Return a card, made from redacted inputs and samples, without other names and places."""
     region = card.split.region
-    moved = None if region is None else {kind: _move_polygon(of, redaction) for kind, of in region.items()}
+    moved = None if region is None else {kind: _move_polygon(polygon, redaction) for kind, polygon in region.items()}
     bare = replace(Recipe(), **{name: getattr(card.recipe, name) for name in _KEPT_SECTIONS})
     findings, maps = redact_findings(card.findings), tuple(_redact_map(source, redaction) for source in card.maps)
     runs = tuple(replace(run, findings=redact_findings(run.findings)) for run in card.runs)
@@ -214,21 +214,28 @@ def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
         recipe=bare,
         run_tags=None,
         split=replace(
-            card.split, region=moved, audit=tuple(_convert_distances(of, redaction.scale) for of in card.split.audit)
+            card.split,
+            region=moved,
+            audit=tuple(_convert_distances(part, redaction.scale) for part in card.split.audit),
         ),
         label=replace(card.label, includes=()),
         runs=runs,
         maps=maps,
         findings=findings,
         verdict=judge_dataset(findings, runs, maps),
-        covariates=tuple(replace(of, name=f"covariates{n}") for n, of in enumerate(card.covariates, 1)),
+        covariates=tuple(replace(covariate, name=f"covariates{n}") for n, covariate in enumerate(card.covariates, 1)),
+        exclusions=tuple(
+            replace(exclusion, name=f"excluded{n}", reason="") for n, exclusion in enumerate(card.exclusions, 1)
+        ),
         redaction=Redacted(),
     )
 
 
 def _convert_distances(held: HeldOut, scale: float) -> HeldOut:
     """Return an entry of the audit with distances in metres of ground."""
-    names = [of.name for of in fields(held) if of.name.endswith("_m") and getattr(held, of.name) is not None]
+    names = [
+        entry.name for entry in fields(held) if entry.name.endswith("_m") and getattr(held, entry.name) is not None
+    ]
     return replace(held, **{name: getattr(held, name) / scale for name in names})
 
 
@@ -263,7 +270,9 @@ def _move_polygon(polygon: PolygonGeometry, redaction: Redaction) -> PolygonGeom
 def redact_features(collection: FeatureCollection, redaction: Redaction) -> FeatureCollection:
     """Return polygons (WGS84) at public places: whole cells of the maps' plane, since a scale would reveal itself."""
     redaction = replace(redaction, scale=1.0)
-    features = (replace(of, geometry=_move_polygon(of.geometry, redaction)) for of in collection.features)
+    features = (
+        replace(feature, geometry=_move_polygon(feature.geometry, redaction)) for feature in collection.features
+    )
     return replace(collection, features=tuple(features))
 
 
@@ -289,8 +298,8 @@ def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
             if (np.abs(degrees) > REACH_DEG).any():
                 yield f"{end}_{axis}_deg is beyond {REACH_DEG:g} degrees"
     yield from (f"map {source.name} has the CRS {source.crs}" for source in card.maps if source.crs != PLANE)
-    origins = [of for source in card.maps for of in source.origins]
-    yield from (f"names the raster {of.url}" for of in origins if of != _redact_origin(of))
+    origins = [origin for source in card.maps for origin in source.origins]
+    yield from (f"names the raster {origin.url}" for origin in origins if origin != _redact_origin(origin))
     named = [run.run_id for run in card.runs if run.logs or not re.fullmatch(r"run\d{4,}-[0-9a-f]+", run.run_id)]
     yield from (f"reveals the name of the log of run {name}" for name in named)
     ratio, _, most = compute_plane_per_chord(samples)

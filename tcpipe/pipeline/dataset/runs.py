@@ -191,7 +191,7 @@ def group_similar_runs(
     """
     groups: list[tuple[list[str], SensorsByRole]] = []
     sensors_by_run = {
-        run_id: {role: (of.topic, of.type_name, of.frame_id.strip("/")) for role, of in own.items()}
+        run_id: {role: (sensor.topic, sensor.type_name, sensor.frame_id.strip("/")) for role, sensor in own.items()}
         for run_id, own in sensors.items()
     }
     for run_id, own_sensors in sorted(sensors_by_run.items(), key=lambda item: (-len(item[1]), item[0])):
@@ -201,7 +201,9 @@ def group_similar_runs(
                 shared or not (own_sensors or group_sensors)
             ):
                 runs.append(run_id)
-                group_sensors.update({role: of for role, of in own_sensors.items() if role not in group_sensors})
+                group_sensors.update(
+                    {role: sensor for role, sensor in own_sensors.items() if role not in group_sensors}
+                )
                 break
         else:
             groups.append(([run_id], own_sensors))

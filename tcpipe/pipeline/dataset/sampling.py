@@ -202,14 +202,16 @@ def sample_all_segments(
     ``shifts`` say for each map by how much runs are moved on it.
     The results are arrays in files in ``directory``. `TcpipeError` if the map or the segments cannot be used.
     """
-    sources = [open_map(*of) for of in maps()]
+    sources = [open_map(*arguments) for arguments in maps()]
     check_same_layers(sources, config)
     found = [list_layers(source, config.patch_m, config.patch_px) for source in sources]
     layers = sort_layers(join_layers(found))
     spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
     each = spool.sample_bytes
     if len(layers) > len(sources[0].layers):
-        shapes = (f"{name} {' x '.join(map(str, of.patch_shape(0)))}" for name, of in layers.items() if of.bands)
+        shapes = (
+            f"{name} {' x '.join(map(str, layer.patch_shape(0)))}" for name, layer in layers.items() if layer.bands
+        )
         message = "patches: %d segments of %.1f kB (%s) take up to %.1f MB before compression"
         logger.info(message, segments.num_rows, each / 1e3, ", ".join(shapes), segments.num_rows * each / 1e6)
     rows = list(_iterate_batches(segments, max(min(_BATCH_ROWS, _BATCH_BYTES // each), 1)))
@@ -282,7 +284,7 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     try:
         if (sampled := batch.spool.find(batch.number)) is not None:
             return sampled
-        held = [_reuse_map(*of, batch.config) for of in batch.maps()]
+        held = [_reuse_map(*arguments, batch.config) for arguments in batch.maps()]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(
             batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools, shifts=batch.shifts

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -12,17 +14,20 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import KeptSplit, SplitResult
+from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.dataset_card import Exclusion, KeptSplit, SplitResult
+from tcpipe.formats.dataset_files import EXCLUDED_IDS, IS_EXCLUDED, read_sample_ids
 from tcpipe.formats.geojson import PolygonGeometry
+from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.formats.parquet import take_rows
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
-from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits, hash_ranks
+from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, SPLITS, Assignment, assign_splits, hash_ranks
 from tcpipe.splits.audit import audit_leakage
 from tcpipe.splits.regions import Regions, project_regions
 from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import to_integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.target_grid import MapGrid
 
@@ -32,6 +37,70 @@ _MARGIN_DEG = 0.05
 """Regions are cut this far around the samples (3 km or more below 60° latitude)."""
 
 
+@dataclass(frozen=True, slots=True)
+class ExcludedIds:
+    """A list of samples that a user excludes: the file's name and checksum, why, and the ids."""
+
+    name: str
+    checksum: Checksum
+    reason: str
+    ids: tuple[str, ...]
+
+
+def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Sequence[str]) -> tuple[ExcludedIds, ...]:
+    """Return the lists of samples to exclude; `UsageError` unless each has a reason, `DatasetError` if one cannot be read."""
+    paths = [Path(of) for of in ([files] if isinstance(files, str | Path) else files)]
+    texts = [text.strip() for text in ([reasons] if isinstance(reasons, str) else reasons)]
+    if len(texts) != len(paths) or not all(texts):
+        raise UsageError(
+            f"--exclude: {len(paths)} lists of samples and {len([text for text in texts if text])} reasons; "
+            "give each list its --reason TEXT, in the same order"
+        )
+    if len({path.name for path in paths}) < len(paths):
+        raise UsageError("--exclude: two lists have one name, by which the dataset names them; rename one")
+    return tuple(
+        ExcludedIds(path.name, compute_checksum(path), text, tuple(read_sample_ids(path)))
+        for path, text in zip(paths, texts, strict=True)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ExcludedSamples:
+    """What lists exclude: which of N samples, the lists for the card, each id with list, reason and outcome, and findings."""
+
+    mask: NDArray[np.bool_]
+    lists: tuple[Exclusion, ...]
+    ids: pa.Table
+    findings: tuple[Finding, ...]
+
+
+def find_excluded(
+    lists: Sequence[ExcludedIds], segment_ids: pa.ChunkedArray, kept: NDArray[np.int64]
+) -> ExcludedSamples:
+    """Return which samples the lists exclude; ``kept`` are the rows of ``segment_ids`` that are samples, (N,)."""
+    mask, told, tables, findings = np.zeros(len(kept), np.bool_), list[Exclusion](), [EXCLUDED_IDS.empty_table()], []
+    known = segment_ids.combine_chunks() if lists else None
+    sample = np.full(len(segment_ids), -1)
+    sample[kept] = np.arange(len(kept))
+    for of in lists:
+        row = pc.index_in(pa.array(of.ids), value_set=known).fill_null(-1).to_numpy()
+        rows = sample[row[row >= 0]]
+        rows = rows[rows >= 0]
+        told.append(Exclusion(of.name, of.checksum, of.reason, len(of.ids), int((~mask[rows]).sum())))
+        mask[rows] = True
+        outcome = np.select([row < 0, sample[row] < 0], ["no segment", "no sample"], IS_EXCLUDED)
+        texts = [[of.name] * len(row), [of.reason] * len(row), outcome.tolist()]
+        tables.append(pa.table([of.ids, *texts], schema=EXCLUDED_IDS))
+        if missing := int((row < 0).sum()):
+            names, subject = {"example": of.ids[int(np.argmin(row))]}, Subject("file", of.name)
+            findings.append(
+                make_finding(
+                    "exclusion-unmatched", subject, names=names, unmatched_count=missing, listed_count=len(row)
+                )
+            )
+    return ExcludedSamples(mask, tuple(told), pa.concat_tables(tables), tuple(findings))
+
+
 def draw_splits(
     segments: pa.Table,
     sampled: Sampled,
@@ -39,11 +108,13 @@ def draw_splits(
     regions: Regions | None,
     recipe: Recipe,
     *,
+    excluded: NDArray[np.bool_],
     earlier: pa.Table | None = None,
     tags: Mapping[str, str] | None = None,
 ) -> tuple[Assignment, SplitResult]:
     """Assign every patch of ``sampled`` to a split by its whole footprint, and audit the result.
 
+    ``excluded`` samples, (N,), take part in the draw, so that all others have the split and fold that they would have without exclusion.
     ``regions`` are in WGS84 lon/lat; None: everything is train and test. ``earlier`` has ``sample_id``, ``split`` and ``fold`` of a dataset
     whose samples keep their split; ``tags`` the holdout's tag by run. `DatasetError` if no footprint lies inside the region.
     """
@@ -76,6 +147,9 @@ def draw_splits(
     del ranks
     if regions is not None and not assigned.is_in("train", "test").any():
         raise DatasetError(_describe_nothing_inside(regions, sampled.footprint_lonlat_deg, assigned))
+    assigned = assigned.exclude(excluded)
+    if excluded.any() and not assigned.is_in(*SPLITS).any():
+        raise DatasetError(f"the lists of excluded samples (--exclude) name all {len(rows)} samples; shorten them")
     held = {name: assigned.is_in(name) for name in ("test", "unseen")}
     audit = audit_leakage(assigned.is_in("train"), held, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
     counts = None

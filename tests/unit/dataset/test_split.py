@@ -76,6 +76,26 @@ def test_it_is_a_mapping_of_splits(path):
         dataset["validation"]
 
 
+def test_samples_are_selected_by_id_in_the_order_given(path, tmp_path):
+    dataset = open_dataset(path)
+    train, unseen = dataset["train"], dataset["unseen"]
+    ids = train.column("sample_id")[[9, 2, 5]].tolist()
+    chosen = train.select(ids)
+    assert chosen.samples["sample_id"].to_pylist() == ids
+    np.testing.assert_array_equal(chosen.patches, train.patches[[9, 2, 5]])
+    np.testing.assert_array_equal(chosen.labels, train.labels[[9, 2, 5]])
+    (tmp_path / "ids.csv").write_text("split;sample_id\n" + "".join(f"train;{name}\n" for name in ids))
+    assert train.select(tmp_path / "ids.csv").column("sample_id").tolist() == ids
+    assert len(train.select([])) == 0
+    others = unseen.column("sample_id")[:2].tolist()
+    both = dataset.select([others[1], ids[0]])
+    np.testing.assert_array_equal(both.patches, np.stack([unseen.patches[1], train.patches[9]]))
+    with pytest.raises(DatasetError) as caught:
+        train.select([ids[0], "x", *others, "y"])
+    assert len(caught.value.problems) == 1
+    assert f"no sample x, {others[0]}, {others[1]}, y in train; 2 of them in unseen" in caught.value.problems[0]
+
+
 def test_one_sample_and_a_batch_are_rows_of_the_whole(path):
     train = open_dataset(path)["train"]
     patch, label = train[7]

@@ -7,7 +7,9 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from tcpipe.fusion.densities import fit_noise
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.pair_residuals import find_residuals
 
 ZERO_NS = 1_700_000_000_000_000_000
 DT = 0.0025
@@ -204,3 +206,8 @@ def errors(drive, trajectory, *, after_s=0.0):
 def integral(stamp_ns, values):
     """Return the integral from the first sample to each, by trapezia."""
     return np.concatenate(([0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(stamp_ns) * 1e-9)))
+
+
+def estimate_noise(measurements):
+    """Return the noise of each sensor of a section, by the residuals of all pairs."""
+    return fit_noise(measurements, find_residuals(measurements))

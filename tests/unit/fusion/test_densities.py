@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from unit.fusion import drive
 
-from tcpipe.fusion.densities import GaussMarkov, estimate_noise, fit_noise, make_prior_model
+from tcpipe.fusion.densities import GaussMarkov, fit_noise, make_prior_model
 from tcpipe.fusion.event_candidates import find_event_candidates
 from tcpipe.fusion.measurements import (
     GNSS,
@@ -70,7 +70,7 @@ def numbers(value):
 @pytest.mark.parametrize(("correlated_m", "time_s"), [(0.008, 5.0), (0.015, 10.0), (0.03, 5.0)])
 @pytest.mark.parametrize("visual", [True, False])
 def test_correlated_noise_of_fixes_is_recovered(seed, correlated_m, time_s, visual):
-    model = estimate_noise(measure(seed, 0.006, correlated_m, time_s, visual=visual))
+    model = drive.estimate_noise(measure(seed, 0.006, correlated_m, time_s, visual=visual))
     true = GaussMarkov(correlated_m**2, time_s)
     for after_s in (10.0, 40.0):
         wanted = np.sqrt(2.0 * 0.006**2 + true.difference_variance(np.array(after_s)))
@@ -82,27 +82,18 @@ def test_correlated_noise_of_fixes_is_recovered(seed, correlated_m, time_s, visu
 
 @pytest.mark.parametrize("seed", range(2))
 def test_white_noise_is_hardly_taken_for_correlated(seed):
-    model = estimate_noise(measure(seed))
+    model = drive.estimate_noise(measure(seed))
     assert np.sqrt(model.horizontal.white_m2) == pytest.approx(0.015, rel=0.1)
     assert np.sqrt(model.horizontal.correlated.variance) < 0.007
     assert np.sqrt(model.vertical.correlated.variance) < 0.018
 
 
 def test_odometries_and_turns_are_recovered():
-    model = estimate_noise(measure(seed=3, visual_scale=1.05))
+    model = drive.estimate_noise(measure(seed=3, visual_scale=1.05))
     assert model.odometries["visual_odometry"].velocity_m2ps == pytest.approx(0.03**2 / 30.0, rel=0.6)
     assert model.turns["wheel_odometry"].white_rad2ps == pytest.approx(0.02**2 / 50.0, rel=0.5)
     slip = model.odometries["wheel_odometry"].scale
     assert 0.002 < np.sqrt(slip.variance) < 0.03  # 3 % at most, which comes and goes
-
-
-def test_fit_and_measurement_agree_at_every_time_difference():
-    model = estimate_noise(measure(0, 0.006, 0.015))
-    levels = [each for each in model.residuals if "gnss" in each.pair and each.axis != "up" and not each.stationary]
-    assert {each.axis for each in levels} == {"along", "across"}
-    assert max(each.time_s for each in levels) > 60.0
-    ratio = np.array([each.measured / each.fitted for each in levels if each.time_s < 30.0])
-    assert (np.abs(ratio - 1.0) < 0.3).all()
 
 
 def test_jumps_and_an_outage_do_not_enter():
@@ -112,7 +103,7 @@ def test_jumps_and_an_outage_do_not_enter():
     wrong = gnss.position_enu_m + np.where((t > 200.0) & (t < 230.0), 0.5, 0.0)[:, None]
     kept = (t < 400.0) | (t > 440.0)
     faulty = replace(gnss, stamp_ns=gnss.stamp_ns[kept], position_enu_m=wrong[kept], variance_m2=gnss.variance_m2[kept])
-    before, after = estimate_noise(clean).horizontal, estimate_noise(replace(clean, gnss=faulty)).horizontal
+    before, after = drive.estimate_noise(clean).horizontal, drive.estimate_noise(replace(clean, gnss=faulty)).horizontal
     for time_s in (1.0, 10.0):
         assert compute_change_std(after, time_s) == pytest.approx(compute_change_std(before, time_s), rel=0.3)
 
@@ -126,7 +117,7 @@ def short():
 def test_no_set_of_sensors_fails(present, short):
     names = ("gnss", "imu", "wheels", "visual")
     sensors = {name: getattr(short, name) if here else None for name, here in zip(names, present, strict=True)}
-    model = estimate_noise(Measurements(**sensors))
+    model = drive.estimate_noise(Measurements(**sensors))
     assert (model.horizontal is not None) == (model.vertical is not None) == present[0]
     assert set(model.odometries) == {
         role
@@ -140,7 +131,7 @@ def test_no_set_of_sensors_fails(present, short):
 def test_short_sections_keep_the_larger_of_fit_and_prior(length_s, short):
     start_ns = int(short.gnss.stamp_ns[100])
     section = select_measurements(short, start_ns, start_ns + int(length_s * 1e9))
-    model, prior = estimate_noise(section), make_prior_model(section)
+    model, prior = drive.estimate_noise(section), make_prior_model(section)
     assert all(np.isfinite(number) for number in numbers(model))
     assert compute_change_std(model.horizontal, 40.0) > 0.9 * compute_change_std(prior.horizontal, 40.0)
     assert model.horizontal.correlated.told < 0.3
@@ -164,8 +155,8 @@ DEGENERATE = {
 
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_degenerate_input_gives_finite_noise(name, short):
-    model = estimate_noise(DEGENERATE[name](short))
-    assert all(np.isfinite(number) and number >= 0.0 for number in numbers(replace(model, residuals=())))
+    model = drive.estimate_noise(DEGENERATE[name](short))
+    assert all(np.isfinite(number) and number >= 0.0 for number in numbers(model))
 
 
 def test_fixes_without_claims_keep_the_prior(short):
@@ -174,7 +165,7 @@ def test_fixes_without_claims_keep_the_prior(short):
         unclaimed=np.ones(short.gnss.stamp_ns.size, np.bool_),
         variance_m2=np.ones_like(short.gnss.variance_m2),
     )
-    model = estimate_noise(unclaimed)
+    model = drive.estimate_noise(unclaimed)
     assert model.horizontal == make_prior_model(unclaimed).horizontal
     assert model.horizontal.white_m2 + model.horizontal.correlated.variance == pytest.approx(1.0)
 
@@ -189,7 +180,7 @@ def test_fixes_at_one_hertz_and_of_metres():
         position_enu_m=gnss.position_enu_m[rows],
         variance_m2=gnss.variance_m2[rows],
     )
-    model = estimate_noise(replace(whole, gnss=slow))
+    model = drive.estimate_noise(replace(whole, gnss=slow))
     true = np.sqrt(2.0 * 0.2**2 + GaussMarkov(1.2**2, 60.0).difference_variance(np.array(10.0)))
     assert 0.7 < compute_change_std(model.horizontal, 10.0) / true < 1.5
 

@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import dblquad
 from unit.fusion import drive
 
-from tcpipe.fusion.densities import FixNoise, GaussMarkov, OdometryNoise, make_prior_model
-from tcpipe.fusion.noise_curves import describe_noise
+from tcpipe.fusion.densities import FixNoise, GaussMarkov, OdometryNoise, describe_noise, make_prior_model
 
 TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 

@@ -9,7 +9,6 @@ from unit.fusion import drive
 from unit.fusion.test_error_state import fuse, truth
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import estimate_noise
 from tcpipe.fusion.measurements import Measurements, Positions
 from tcpipe.fusion.preparation import prepare_imu
 from tcpipe.fusion.process import (
@@ -28,7 +27,7 @@ def measured(**options):
 def estimate_density(m, at_ns, mode):
     """Return the density of the velocity's noise forward [m²/s³] at some stamps."""
     modes = np.full(at_ns.size, mode, np.int8)
-    return make_motion_noise(m, estimate_noise(m), at_ns, modes, np.zeros((at_ns.size, 3)), 0.05)[:, 3] / 0.05
+    return make_motion_noise(m, drive.estimate_noise(m), at_ns, modes, np.zeros((at_ns.size, 3)), 0.05)[:, 3] / 0.05
 
 
 def test_vibration_counts_where_it_is():

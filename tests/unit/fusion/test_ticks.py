@@ -8,10 +8,15 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import estimate_noise
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.measurements import (
+    BodyVelocities,
+    InertialMeasurements,
+    Measurements,
+    Positions,
+    cut_sections,
+    make_track_stamps,
+)
 from tcpipe.fusion.ticks import build_ticks, find_tick_period_ns
-from tcpipe.fusion.trajectory import cut_sections, make_track_stamps
 
 NOWHERE = np.empty((0, 2), np.int64)
 TICK_NS = 50_000_000
@@ -19,7 +24,7 @@ TICK_NS = 50_000_000
 
 def ticks_of(m, start_ns, end_ns, stationary_ns=NOWHERE, period_ns=TICK_NS):
     output_ns = np.arange(-(-start_ns // period_ns) * period_ns, end_ns + 1, period_ns, dtype=np.int64)
-    return build_ticks(m, estimate_noise(m), stationary_ns, start_ns, end_ns, output_ns=output_ns)
+    return build_ticks(m, drive.estimate_noise(m), stationary_ns, start_ns, end_ns, output_ns=output_ns)
 
 
 def ramp_imu(stamp_ns):
@@ -56,7 +61,7 @@ def test_a_tick_is_a_whole_part_of_the_tracks_period(period_ns, tick_ns):
 def test_each_tick_holds_the_mean_of_what_a_sensor_measures_around_it():
     m = drive.measure(drive.make_drive(20.0), 2)
     found = ticks_of(m, int(m.gnss.stamp_ns[0]), int(m.gnss.stamp_ns[-1]))
-    noise = estimate_noise(m)
+    noise = drive.estimate_noise(m)
     white = np.array([fix.white_m2 / fix.claimed_m2 for fix in (noise.horizontal, noise.horizontal, noise.vertical)])
     for kind, stamp_ns, values in (
         (state.WHEELS, m.wheels.stamp_ns, m.wheels.velocity_mps[:, :1]),
@@ -85,7 +90,7 @@ def test_a_sensor_of_any_rate_carries_the_information_that_it_claims(hz):
     found = ticks_of(slow, int(drive.ns(0.1)), int(drive.ns(29.5)))
     told = np.isfinite(found.inputs.value[:, state.FIX, 0])
     assert told.sum() == pytest.approx(min(hz, 20.0) * 28.8, rel=0.02)
-    noise = estimate_noise(slow)
+    noise = drive.estimate_noise(slow)
     white_m2 = noise.horizontal.white_m2 / noise.horizontal.claimed_m2
     assert np.sum(1.0 / found.inputs.variance[told, state.FIX, 0]) == pytest.approx(stamp_ns.size / white_m2, rel=0.02)
 

@@ -29,16 +29,11 @@ def log(tmp_path):
     return write_mcap(tmp_path / "a.mcap", random_messages(1, count=20, types=TYPES))
 
 
-def test_units_and_definition_stand_in_the_file(tmp_path, log):
+def test_the_definition_stands_in_the_file(tmp_path, log):
     files = {of.topic: of.path for of in export(log, tmp_path / "out").topics}
-    schema, about = described(files["/Imu"])
+    _, about = described(files["/Imu"])
     assert (about["topic"], about["type"], about["definition_from"]) == ("/Imu", "sensor_msgs/msg/Imu", "log")
     assert "float64[9] angular_velocity_covariance" in about["definition"]
-    units = {"log_time_ns": b"ns", "angular_velocity.z": b"rad/s", "linear_acceleration_covariance": b"m2/s4"}
-    assert {name: schema.field(name).metadata[b"unit"] for name in units} == units
-    assert schema.field("header.frame_id").metadata in (None, {})
-    schema, _ = described(files["/Path"])
-    assert json.loads(schema.field("poses").metadata[b"units"])["pose.position.x"] == "m"
 
 
 @pytest.mark.parametrize("ros1", [True, False])
@@ -53,13 +48,6 @@ def test_a_definition_that_the_log_lacks_is_told_all_the_same(tmp_path, ros1):
     _, about = described(of.path)
     assert about["definition_from"] == "bundled"
     assert "float32 voltage" in about["definition"]
-
-
-def test_a_bare_number_is_told_by_the_name_of_its_topic(tmp_path):
-    messages = random_messages(3, count=5, types=("std_msgs/msg/Float64",))
-    path = write_mcap(tmp_path / "a.mcap", renamed(messages, "/battery/voltage", "/battery/current", "/depth"))
-    units = {of.topic: described(of.path)[0].field("data").metadata for of in export(path, tmp_path / "out").topics}
-    assert units == {"/battery/voltage": {b"unit": b"V"}, "/battery/current": {b"unit": b"A"}, "/depth": None}
 
 
 @pytest.mark.parametrize(

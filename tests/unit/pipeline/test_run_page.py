@@ -26,7 +26,7 @@ def store(tmp_path_factory):
     add_map("site", store=here / "store", height=site.rasters["height"])
     add_map("damaged", store=here / "store", height=site.rasters["height"])
     store = Store(here / "store")
-    (store.map_path("damaged") / "zarr.json").write_text("{")
+    (store.map_files("damaged")[0] / "zarr.json").write_text("{")
     return store
 
 
@@ -53,7 +53,7 @@ def damage_pixels(map_path):
 def test_without_any_readable_map_the_path_stands_alone(store, tmp_path, damage):
     alone = tmp_path / "store"
     shutil.copytree(store.root, alone)
-    damage(Store(alone).map_path("site"))
+    damage(Store(alone).map_files("site")[0])
     _, html = page(Store(alone))
     assert data_of(html)["ground"] == []
     assert "east [m]" in html
@@ -108,13 +108,13 @@ def test_where_streams_are_gone_the_track_is_drawn_and_the_page_says_so(store, t
 def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     run, html = page(store)
     facts = run.manifest.info.report.facts
-    trust = html.split("<h2>Rejected measurements by sensor</h2>")[1].split("<h2>")[0]
+    trust = html.split("<h3>Rejected measurements by sensor</h3>")[1].split("<h3>")[0]
     for role, nis in facts.fuse.nis_mean.items():
         (row,) = [row for row in trust.split("<tr>") if f"<td>{role.replace('_', ' ')}</td>" in row]
         assert f"<td>{nis:.2f}</td>" in row
         refused = facts.fuse.rejected[role]
         assert (f"<td>{refused} gate</td>" in row) == (refused > 0)
-    clocks = html.split("<h2>Clocks</h2>")[1].split("<h2>")[0]
+    clocks = html.split("<h3>Clocks</h3>")[1].split("</section>")[0]
     assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts.clock_offsets.offsets)
     assert f"Noise floor of E {100 * facts.label.energy_budget.total:.1f} %" in html
     assert "Kept and excluded distances add up to the odometer" in html
@@ -125,7 +125,7 @@ def test_the_noise_of_every_fused_sensor_is_in_the_facts_and_on_the_page(store):
     noise = run.manifest.info.report.facts.fuse.stretches[0].noise
     assert {"gnss", "gnss height", "wheel_odometry", "visual_odometry", "imu turn"} <= set(noise)
     assert all(0.0 <= share <= 1.0 for each in noise.values() for share in each.data_share)
-    section = html.split("<h2>Noise of the sensors</h2>")[1].split("<h2>")[0]
+    section = html.split("<h2>Sensors</h2>")[1].split("<h2>")[0]
     assert all(name.replace("_", " ") in section for name in noise)
 
 

@@ -1,10 +1,8 @@
 """Cost maps: right everywhere, each tile decoded once, whole or resumable, and readable by others."""
 
 import json
-import pickle
 from collections import Counter
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from xml.etree.ElementTree import fromstring
 
@@ -20,11 +18,10 @@ from ruamel.yaml import YAML
 
 from tcpipe.cost.prediction_errors import fit_errors
 from tcpipe.errors import MapError, ModelError, UsageError
-from tcpipe.execution import Outcome
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_grid import ANGLES_DEG, iterate_blocks, make_grid
-from tcpipe.planning.cost_map import Cluster, make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card
+from tcpipe.planning.cost_map import make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import Reason
 
 MODEL = PhysicsModel()
@@ -198,51 +195,6 @@ def test_an_interrupted_map_goes_on_where_it_was_and_ends_the_same(made, tmp_pat
     for path in sorted(Path(whole.path).iterdir()):
         assert (Path(again.path) / path.name).read_bytes() == path.read_bytes(), path.name
     assert [entry.name for entry in tmp_path.iterdir()] == ["cost-map"]
-
-
-def _sloping(rise_east=0.2):
-    """What a worker finds under the caller's names."""
-    return MODEL, _map(rise_east=rise_east, rise_north=0.1, classes=_trees)
-
-
-@pytest.fixture
-def sent(monkeypatch):
-    """The tasks of a cluster that ends the last one first and passes on nothing but bytes."""
-    seen = []
-
-    def elsewhere(function, tasks, _):
-        for index, task in reversed([*tasks]):
-            seen.append(index)
-            function, task = pickle.loads(pickle.dumps((function, task)))  # noqa: S301, PLW2901  our own
-            yield Outcome(index, pickle.loads(pickle.dumps(function(task))))  # noqa: S301
-
-    monkeypatch.setattr("tcpipe.planning.cost_map._BLOCKS_KEPT", 2)
-    monkeypatch.setattr("tcpipe.execution._run_elsewhere", elsewhere)
-    return seen
-
-
-def test_a_cluster_makes_the_same_bytes(made, sent, tmp_path):
-    source, whole = made
-    source = replace(source, reads=Counter())
-    result = make_cost_map(
-        MODEL, source, tmp_path / "costs", cell_size_m=1.0, cluster=Cluster("tcp://nowhere:1", partial(_sloping, 0.2))
-    )
-    assert len(sent) > 2
-    for path in sorted(Path(whole.path).iterdir()):
-        assert (Path(result.path) / path.name).read_bytes() == path.read_bytes(), path.name
-
-
-def test_a_worker_that_finds_another_model_is_refused(made, sent, tmp_path):
-    other = replace(MODEL, checksum="1" * 64)
-    with pytest.raises(UsageError, match=r"^[^:]+: a worker finds another map .* or model .* than the caller"):
-        make_cost_map(
-            other,
-            replace(made[0], reads=Counter()),
-            tmp_path / "costs",
-            cell_size_m=1.0,
-            cluster=Cluster("tcp://nowhere:1", _sloping),
-        )
-    assert len(sent) == 1
 
 
 def test_a_second_call_does_nothing_and_another_step_replaces_it(tmp_path: Path):

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from physics_model import PhysicsModel
 from synthetic_store import box, region_file, small_store
@@ -42,9 +41,6 @@ def test_a_drive_that_was_held_back_is_summed_where_the_model_knows_the_ground(m
     for of in (found.duration_s, found.energy_joule):
         assert of.low <= of.predicted <= of.high  # its held-out velocities are exact
     assert found.energy_joule.low < found.energy_joule.high
-    assert len(found.along.distance_m) == len(found.along.energy_joule) == 60
-    assert found.along.energy_joule[-1] == found.energy_joule
-    assert (np.diff([of.measured for of in found.along.energy_joule]) > 0.0).all()
 
 
 def test_ground_that_was_not_met_is_named_and_left_out(made):
@@ -65,14 +61,12 @@ def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
     assert south.near_training_percent < 20.0
     assert "of its samples trained the model; it is in no sum" in str(said)
     assert said.values.energy_joule.measured == south.energy_joule.measured
-    page = (tmp_path / "out" / "drives.html").read_text()
-    assert page.count('class="plot"') == 4  # time and energy of both
     findings = {of.code: of for of in said.values.findings}
     assert findings["drive-in-training"].subject.name == north.run_id
     assert findings["few-drives"].numbers == {"drive_count": 1.0}
     assert "energy-overconfident" not in findings  # one drive decides nothing
-    assert "[few-drives]" in page
-    assert "J measured" in page
+    assert "[drive-in-training]" in str(said)
+    assert "J measured" in str(said)
     assert json.loads((tmp_path / "out" / "drives.json").read_text())["drives"][1]["run_id"] == "south"
 
 

@@ -15,7 +15,8 @@ from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.geojson import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
-from tcpipe.planning.path_files import PlanRequest, make_summary_path, plan, predict_path
+from tcpipe.planning.path_files import make_summary_path, plan, predict_path
+from tcpipe.planning.path_options import PlanPathOptions
 
 MODEL = PhysicsModel()
 
@@ -46,23 +47,23 @@ def _write_path(path: Path, points) -> None:
 
 @pytest.mark.parametrize("ending", ["csv", "parquet", "json"])
 def test_the_table_is_the_same_in_every_format(source, path, ending):
-    out = path.with_name(f"pieces.{ending}")
+    out = path.with_name(f"path-segments.{ending}")
     found = predict_path(MODEL, source, path, out)
     assert found.status == "done"
     assert found.exit_code == 0
     rows = {
         "csv": lambda: pyarrow.csv.read_csv(out).to_pylist(),
         "parquet": lambda: pyarrow.parquet.read_table(out).to_pylist(),
-        "json": lambda: json.loads(out.read_text())["pieces"],
+        "json": lambda: json.loads(out.read_text())["path_segments"],
     }[ending]()
-    assert len(rows) == found.pieces == 18
+    assert len(rows) == found.path_segments == 18
     assert sum(row["energy_joule"] for row in rows) == pytest.approx(found.energy_joule, rel=1e-9)
     assert rows[0]["terrain_name"] == "grass"
     assert json.loads(make_summary_path(out).read_text())["duration_s"] == found.duration_s
 
 
 def test_parquet_says_units_and_what_the_bits_mean(source, path):
-    out = path.with_name("pieces.parquet")
+    out = path.with_name("path-segments.parquet")
     predict_path(MODEL, source, path, out)
     schema = pyarrow.parquet.read_schema(out)
     assert schema.field("energy_joule").metadata[b"unit"] == b"J"
@@ -70,7 +71,7 @@ def test_parquet_says_units_and_what_the_bits_mean(source, path):
 
 
 def test_a_second_call_does_nothing_until_something_changes(source, path):
-    out = path.with_name("pieces.csv")
+    out = path.with_name("path-segments.csv")
     first = predict_path(MODEL, source, path, out)
     second = predict_path(MODEL, source, path, out)
     assert second.status == "unchanged"
@@ -86,28 +87,28 @@ def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
     found = predict_path(MODEL, source, tmp_path / "off.geojson", None)
     assert found.exit_code == 3
     assert "outside map" in str(found)
-    assert f"without {found.pieces_without_cost} of {found.pieces} path segments" in str(found)
+    assert f"without {found.path_segments_without_cost} of {found.path_segments} path segments" in str(found)
 
 
-def _request(source, **options) -> PlanRequest:
+def _request(source, **options) -> PlanPathOptions:
     start, goal = lonlat(source, (3.0, 3.0), (20.0, 18.0)).tolist()
-    return PlanRequest(tuple(start), tuple(goal), **options)
+    return PlanPathOptions("model", tuple(start), tuple(goal), **options)
 
 
 def test_a_plan_is_found_once_and_again_when_its_picture_is_gone(source, tmp_path):
     out, picture = tmp_path / "plan.geojson", tmp_path / "plan.png"
-    request = _request(source, objective="distance", cell_size_m=2.0)
-    first = plan(MODEL, source, request, out=out, picture=picture)
+    request = _request(source, objective="distance", cell_size_m=2.0, out=out, picture=picture)
+    first = plan(MODEL, source, request)
     assert list(first.plans) == ["distance", "energy", "time"]
     assert len(read_line(out)) == 2
-    second = plan(MODEL, source, request, out=out, picture=picture)
+    second = plan(MODEL, source, request)
     assert second.status == "unchanged"
     assert list(second.plans) == list(first.plans)
     assert "nothing to do" in str(second)
     picture.unlink()
-    assert plan(MODEL, source, request, out=out, picture=picture).status == "done"
-    other = _request(source, objective="time", cell_size_m=2.0)
-    assert plan(MODEL, source, other, out=out, picture=None).status == "done"
+    assert plan(MODEL, source, request).status == "done"
+    other = _request(source, objective="time", cell_size_m=2.0, out=out)
+    assert plan(MODEL, source, other).status == "done"
     found = json.loads(out.read_text())["features"][0]["properties"]
     assert found["objective"] == "time"
     assert found["complete"]
@@ -117,39 +118,33 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
     costs = tmp_path / "costs"
     make_cost_map(MODEL, source, costs, cell_size_m=2.0)
     plans = [
-        plan(MODEL, source, _request(source, cell_size_m=2.0, cost_map=given), out=tmp_path / name, picture=None)
+        plan(MODEL, source, _request(source, cell_size_m=2.0, cost_map=given, out=tmp_path / name))
         for name, given in (("with.geojson", costs), ("without.geojson", None))
     ]
     ours, theirs = (found.plans["energy"] for found in plans)
     assert ours.energy_joule == pytest.approx(theirs.energy_joule, rel=1e-9)
     with pytest.raises(ModelError, match="made from another model or map"):
-        plan(
-            replace(MODEL, checksum="1" * 64),
-            source,
-            _request(source, cost_map=costs),
-            out=tmp_path / "p.json",
-            picture=None,
-        )
+        plan(replace(MODEL, checksum="1" * 64), source, _request(source, cost_map=costs, out=tmp_path / "p.json"))
     with pytest.raises(UsageError, match="not a cost map"):
-        plan(MODEL, source, _request(source, cost_map=tmp_path), out=tmp_path / "p.json", picture=None)
+        plan(MODEL, source, _request(source, cost_map=tmp_path, out=tmp_path / "p.json"))
 
 
 def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refused(source, tmp_path):
     costs, out = tmp_path / "costs", tmp_path / "plan.geojson"
-    request = _request(source, cost_map=costs)
+    request = _request(source, cost_map=costs, out=out)
     for cell_size_m in (2.0, 3.0):
         make_cost_map(MODEL, source, costs, cell_size_m=cell_size_m)
-        assert plan(MODEL, source, request, out=out, picture=None).status == "done"
-        assert plan(MODEL, source, request, out=out, picture=None).status == "unchanged"
+        assert plan(MODEL, source, request).status == "done"
+        assert plan(MODEL, source, request).status == "unchanged"
     (costs / "cost-map.json").write_text("{}")
     with pytest.raises(ModelError, match="has changed since it was written"):
-        plan(MODEL, source, request, out=out, picture=None)
+        plan(MODEL, source, request)
 
 
 def test_files_of_the_user_are_left_alone(source, path):
     before = path.read_bytes()
     with pytest.raises(UsageError, match="is no plan; it is not changed"):
-        plan(MODEL, source, _request(source, cell_size_m=2.0), out=path, picture=None)
+        plan(MODEL, source, _request(source, cell_size_m=2.0, out=path))
     mine = path.rename(path.with_suffix(".json"))
     with pytest.raises(UsageError, match="is the file of the path"):
         predict_path(MODEL, source, mine, mine)
@@ -158,10 +153,10 @@ def test_files_of_the_user_are_left_alone(source, path):
 
 def test_names_and_points_that_cannot_be_are_one_line(source, path, tmp_path):
     with pytest.raises(UsageError, match=r"ends in \.csv"):
-        predict_path(MODEL, source, path, tmp_path / "pieces.xlsx")
+        predict_path(MODEL, source, path, tmp_path / "path-segments.xlsx")
     with pytest.raises(UsageError, match=r"ends in \.geojson"):
-        plan(MODEL, source, _request(source), out=tmp_path / "plan.kml", picture=None)
+        plan(MODEL, source, _request(source, out=tmp_path / "plan.kml"))
     with pytest.raises(UsageError, match=r"ends in \.png"):
-        plan(MODEL, source, _request(source), out=tmp_path / "plan.json", picture=tmp_path / "plan.svg")
+        plan(MODEL, source, _request(source, out=tmp_path / "plan.json", picture=tmp_path / "plan.svg"))
     with pytest.raises(PathError, match="no lon/lat"):
-        plan(MODEL, source, PlanRequest((200.0, 47.0), (15.0, 47.0)), out=tmp_path / "plan.json", picture=None)
+        plan(MODEL, source, PlanPathOptions("model", (200.0, 47.0), (15.0, 47.0), out=tmp_path / "plan.json"))

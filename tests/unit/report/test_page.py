@@ -7,9 +7,10 @@ from html.parser import HTMLParser
 
 import numpy as np
 
+from tcpipe.formats.finding_lines import group_findings
 from tcpipe.report.page import Link, Number, Section, Shaded, render_page, show_verdict
 from tcpipe.report.plots import draw_histogram, draw_waterfall, make_plot, render_plots
-from tcpipe.tables.findings import Remedy, Subject, judge, make_finding
+from tcpipe.tables.findings import Remedy, Subject, judge, make_finding, read_catalogue
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
 """Ends a script, colours a terminal, turns its text round, reads as two formulas, leaves an attribute."""
@@ -91,7 +92,8 @@ def test_the_verdict_has_grades_then_reasons_the_worst_first_then_folded_notes()
     keep = Remedy("keep", recipe={"mask": {"require_full_speed": False}})
     slow = make_finding("driven-below-limit", Subject("role", "command"), remedies=[keep], **speeds)
     note = make_finding("no-command", Subject("role", "command"))
-    findings = [note, *[replace(slow, numbers={**slow.numbers, "top_mps": 0.1 * n}) for n in range(9)], empty]
+    others = [replace(slow, code=code, remedies=()) for code in read_catalogue() if code.startswith("power-")][:8]
+    findings = [note, slow, *others, replace(slow, numbers={**slow.numbers, "top_mps": 0.2}), empty]
     html = render_page(title="t", lead="", numbers=[], sections=[], verdict=show_verdict(judge(findings), findings))
     box = html.split('<section class="verdict"')[1].split("</section>")[0]
     assert re.findall('<span class="([a-z-]+)">([a-z]+)', box) == [
@@ -100,17 +102,43 @@ def test_the_verdict_has_grades_then_reasons_the_worst_first_then_folded_notes()
     at_once = re.sub("<details>.*?</details>", "", box, flags=re.DOTALL)
     assert re.findall('<li class="([a-z]+)">', at_once) == ["error", *["warning"] * 7]
     assert "largest loss: gap, 10 m" in at_once
-    assert "To accept any speed: [mask] require_full_speed = false [driven-below-limit]" in at_once
+    assert "Most of the drive was commanded below the robot&#39;s maximum speed" in at_once
+    assert "the top command was 0.2 m/s <code>[driven-below-limit]</code>" in at_once  # below the first of this code
+    assert "To accept any speed:" in at_once
+    assert '<pre tabindex="0">[mask]\nrequire_full_speed = false</pre>' in at_once
     assert re.findall("<summary>(.*?)</summary>", box) == ["2 more findings", "1 note"]
 
 
-def test_a_recipe_that_fits_in_no_line_stands_below_its_finding():
+def test_a_remedy_is_the_lines_of_a_recipe_and_without_one_the_catalogue_advises():
     source = {"type": "std_msgs/msg/Float32", "topic": "/current", "current": "data", "rail": "a", "sign": "auto"}
     remedy = Remedy("keep", recipe={"power_sources": [source]})
-    finding = make_finding("max-velocity-unknown", Subject("role", "command"), severity="warning", remedies=[remedy])
+    subject = Subject("role", "command")
+    finding = make_finding("max-velocity-unknown", subject, severity="warning", remedies=[remedy])
     (line,) = show_verdict(judge([finding]), [finding]).shown
-    assert line.text.endswith("To accept any speed: the recipe below [max-velocity-unknown]")
-    assert line.recipe.startswith('[[power_sources]]\ntype = "std_msgs/msg/Float32"\n')
+    ((purpose, (recipe,)),) = line.remedies
+    assert purpose == "To accept any speed"
+    assert recipe.startswith('[[power_sources]]\ntype = "std_msgs/msg/Float32"\n')
+    lost = make_finding("lost-gap", Subject("run", "a"), severity="warning", lost_m=9.0, lost_fraction=0.2)
+    groups = [(group, 2, "runs") for group in group_findings([("a", [lost, lost]), ("b", [lost])])]
+    (line,) = show_verdict(judge([]), groups=groups).shown
+    assert line.title == read_catalogue()["lost-gap"].title
+    assert line.observed[0][0].startswith("2 of 2 runs: ")
+    assert line.remedies == [(read_catalogue()["lost-gap"].advice, [])]
+
+
+def test_parts_without_figures_are_folded_and_long_texts_from_the_second_line():
+    plot = make_plot("small", alt="small", axes=("x", "y"))
+    plot.figure.line([0.0, 1.0], [0.0, 1.0])
+    parts = [Section("drawn", plots=[plot]), Section("listed", header=("a",), rows=[("cell",)])]
+    html = render_page(title="t", lead="", numbers=[], sections=[Section("s", "short\nlong", parts=parts)])
+    body = html.split('<section id="s1">')[1].split("</section>")[0]
+    at_once = re.sub("<details.*?</details>", "", body, flags=re.DOTALL)
+    assert "short" in at_once
+    assert "drawn" in at_once
+    assert "long" in body
+    assert "<h3>listed</h3>" in body
+    assert "long" not in at_once
+    assert "cell" not in at_once
 
 
 def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares():
@@ -142,7 +170,7 @@ def test_the_same_page_is_the_same_bytes_whatever_was_drawn_before():
 
 def test_a_page_without_figures_carries_no_bokeh():
     html = render_page(title="t", lead="", numbers=[], warnings=[], sections=[Section("s", "text")])
-    assert len(html) < 20_000
+    assert len(html) < 24_000
 
 
 def test_nothing_is_asked_of_the_network():

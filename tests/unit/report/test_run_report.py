@@ -1,6 +1,7 @@
 """The page of a run of which only its store is known: what is thinned keeps its peaks, times survive clocks that step, lacks are said."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -8,8 +9,10 @@ import pytest
 from page_reading import data_of, unpacked
 from synthetic_store import add_run, driven, lanes, make_noise_facts, segments
 
+from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.report.run_plots import (
     downsample_columns,
+    find_finding_spans,
     find_mask_spans,
     make_rail_series,
     make_speed_series,
@@ -19,7 +22,7 @@ from tcpipe.report.run_plots import (
 from tcpipe.report.run_report import run_report
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.facts import ClockStep, StageFacts
+from tcpipe.tables.facts import StageFacts
 from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import POWER, REJECTIONS, Sensor
 
@@ -111,7 +114,7 @@ def test_speed_of_a_sensor_that_tells_places_is_its_chord_over_a_second():
 
 def test_the_noise_of_the_longest_section_is_on_the_page(tmp_path):
     html = page_of(tmp_path, drive(), track=driven(drive()), facts=make_noise_facts())
-    section = html.split("<h2>Noise of the sensors</h2>")[1].split("<h2>")[0]
+    section = html.split("<h2>Sensors</h2>")[1].split("<h2>")[0]
     assert section.count("<figure") == 2
     assert "for gnss, wheel odometry: fitted to the run" in section
     assert "for wheel odometry turn: fitted to the run" in section
@@ -169,12 +172,20 @@ def test_names_are_text(tmp_path):
 def test_a_step_of_the_clock_has_its_place_and_its_size():
     track, half = stepped(driven(drive()), 10**12)
     axis = make_timeline(track)
-    facts = StageFacts(clock_steps=(ClockStep(10**18, 1000.0, ("/gnss",)),))
+    at_s = half * 0.05 + 1000.0  # of stamps
+    step = make_finding(
+        "clock-step", Subject("log", "clock"), span_s=(at_s, at_s), names={"topics": "/gnss"}, step_s=1000.0, at_s=at_s
+    )
+    found = find_finding_spans([step, replace(step, severity="note")], track, axis)
     spans, rejections = find_mask_spans(track, axis, 20.0), REJECTIONS.empty()
-    plots, _ = time_plots(axis, lines=[], spans=spans, facts=facts, rejections=rejections, has_labels=False)
+    plots, _ = time_plots(
+        axis, lines=[], spans=spans, facts=StageFacts(), rejections=rejections, has_labels=False, findings=found
+    )
     (event,) = [drawn.data_source.data for drawn in plots[0].figure.renderers if "text" in drawn.data_source.data]
-    assert event["text"] == ("the clock steps by +1000.000 s",)
-    assert event["right"][0] == pytest.approx((half - 1) * 0.05 + 1.0)
+    assert event["row"] == ("clock-step",)
+    assert event["text"] == (describe_finding(step),)
+    assert event["left"][0] == pytest.approx((half - 1) * 0.05 + 1.0)
+    assert event["left"][0] < event["right"][0]
 
 
 def test_what_is_short_is_carried_whole():

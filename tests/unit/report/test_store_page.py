@@ -92,8 +92,8 @@ def test_the_verdict_is_that_of_the_current_runs_with_findings_by_code(store):
     box = html.split('<section class="verdict"')[1].split("</section>")[0]
     assert '<span class="usable">position <b>usable</b></span>' in box
     assert '<span class="usable-with-care">time <b>usable with care</b></span>' in box
-    assert "2 of 3 runs: Most of the drive was commanded below" in box
-    assert "(command; 60 % to 70 %)" in box
+    assert "Most of the drive was commanded below" in box
+    assert "2 of 3 runs: command; 60 % to 70 %" in box
 
 
 def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
@@ -178,9 +178,9 @@ def test_a_change_is_told_from_scatter():
     assert find_shift(scatter) is None
     assert find_shift(scatter[:11]) is None
     found = find_shift([*scatter[:15], *(scatter[15:] + 12.0)])
-    assert (found.earlier_count, found.latest_count) == (15, 5)
-    assert find_shift([*np.tile(scatter, 50), *(scatter + 12.0)]).latest_count == 20
-    assert found.after - found.before == pytest.approx(12.0, abs=1.0)
+    assert (found["earlier_count"], found["latest_count"]) == (15, 5)
+    assert find_shift([*np.tile(scatter, 50), *(scatter + 12.0)])["latest_count"] == 20
+    assert found["after"] - found["before"] == pytest.approx(12.0, abs=1.0)
     assert find_shift([5.0] * 20) is None
     assert find_shift([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
     assert find_shift([5.0] * 15 + [6.0] * 5) is not None

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from suggested_recipes import proposed
 
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
-from tcpipe.fusion.trajectory import TrackSection
+from tcpipe.fusion.measurements import (
+    BodyVelocities,
+    InertialMeasurements,
+    InitialState,
+    Measurements,
+    Positions,
+    TrackSection,
+)
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs

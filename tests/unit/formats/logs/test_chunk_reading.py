@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 
 from tcpipe.formats.logs.chunk_reading import (
     GROUP_BYTES,
-    copy_pieces,
+    ChunkedPart,
     group_chunks,
     plan_chunk_spans,
-    read_excerpt,
     sort_by_place,
 )
 from tcpipe.formats.logs.log_part import DamageError
@@ -42,6 +41,26 @@ def planned(chunks):
     )
 
 
+class HeldChunks:
+    """A file of chunks that are called by their numbers, of which one is broken."""
+
+    read_excerpt, _copy = ChunkedPart.read_excerpt, ChunkedPart._copy
+
+    def __init__(self, chunks, broken=None):
+        self.chunks, self.broken, self.damage = chunks, broken, []
+
+    def load(self, number):
+        if number == self.broken:
+            raise DamageError("broken")
+        return memoryview(self.chunks[number][0])
+
+    def find_plain_data(self, _number):
+        return None
+
+    def lost(self, number, _error):
+        return number
+
+
 @given(made_chunks())
 def test_an_excerpt_holds_the_bytes_of_every_wanted_message_and_of_no_other(chunks):
     wanted = [1, 2]
@@ -57,12 +76,7 @@ def test_an_excerpt_holds_the_bytes_of_every_wanted_message_and_of_no_other(chun
     for span in plan_chunk_spans(entries, sizes, sound, wanted):
         followed += span.chunks
         assert span.compact or len(span.chunks) == 1
-        got = read_excerpt(
-            span,
-            span.entries,
-            load=lambda number: memoryview(chunks[number][0]),
-            copy=lambda number, places, to: copy_pieces(memoryview(chunks[number][0]), places, to),
-        )
+        got = HeldChunks(chunks).read_excerpt(span, span.entries, range(len(chunks)))
         of = got.entries
         lengths = of.end - of.offset
         for chunk, channel, at, length in zip(of.chunk, of.channel, got.offset, lengths, strict=True):
@@ -75,17 +89,10 @@ def test_an_excerpt_holds_the_bytes_of_every_wanted_message_and_of_no_other(chun
 @given(made_chunks(), st.integers(0, 4))
 def test_a_chunk_that_is_lost_costs_no_other(chunks, broken):
     sizes, entries, sound = planned(chunks)
-
-    def load(number):
-        if number == broken:
-            raise DamageError("broken")
-        return memoryview(chunks[number][0])
-
     for span in plan_chunk_spans(entries, sizes, sound, [1, 2]):
-        got = read_excerpt(
-            span, span.entries, load=load, copy=lambda number, places, to: copy_pieces(load(number), places, to)
-        )
-        assert [number for number, _ in got.lost] == [number for number in span.chunks if number == broken]
+        file = HeldChunks(chunks, broken)
+        got = file.read_excerpt(span, span.entries, range(len(chunks)))
+        assert file.damage == [number for number in span.chunks if number == broken]
         assert broken not in got.entries.chunk
         assert len(got.offset) == len(got.entries.chunk) == (span.entries.chunk != broken).sum()
 

@@ -212,7 +212,7 @@ def test_the_index_of_an_intact_bag_is_used(tmp_path):
     assert len(entries.offset) == len(messages)
 
     def borne_out(offset, entries):
-        return read_indexed_messages(Excerpt(data, offset, entries, []))[1]
+        return read_indexed_messages(Excerpt(data, offset, entries))[1]
 
     assert borne_out(entries.offset, entries).all()
     for wrong in (

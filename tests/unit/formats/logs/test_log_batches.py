@@ -1,4 +1,4 @@
-"""Piece by piece: the pieces are the tables, in order, none larger than asked; threads change nothing."""
+"""Piece by piece: the pieces are the tables, in order, none larger than asked."""
 
 import json
 
@@ -48,17 +48,6 @@ def test_the_pieces_are_the_tables(tmp_path, kind, ragged):
         parts = [piece[name] for piece in pieces if name in piece]
         assert table_bytes(pa.concat_tables(parts)) == table_bytes(table)
     assert max(sum(table.nbytes for table in piece.values()) for piece in pieces) < 2 * LIMIT_BYTES
-
-
-@pytest.mark.parametrize("kind", WRITERS)
-def test_threads_change_nothing(tmp_path, kind):
-    path = WRITERS[kind](tmp_path, made(kind))
-    found = {}
-    for threads in (1, 2, 5):
-        with open_log(path) as log:
-            pieces = log.batches(log.topics, batch_bytes=LIMIT_BYTES, threads=threads)
-            found[threads] = [{name: table_bytes(table) for name, table in piece.items()} for piece in pieces]
-    assert found[1] == found[2] == found[5]
 
 
 def test_rows_swapped_nearby_are_sorted_and_rows_far_behind_are_counted(tmp_path):

@@ -82,7 +82,6 @@ def test_only_the_index_and_the_chunks_that_are_wanted_are_fetched(drives, kind)
         assert opened_bytes < 0.02 * size  # of 8 MB: 64 kB of its end are fetched at once
         assert_same(log.table(TOPIC), expected_columns(messages, TOPIC, store))
         assert not log.damage
-        assert log.fetched_bytes == fetched.sent_bytes
         assert fetched.sent_bytes < 0.2 * size  # heads are looked at, 8 kB each: of a chunk of a megabyte 1 %
         assert log.path.stat().st_blocks == 0
 

@@ -9,7 +9,10 @@ SEPARATOR = "=" * 80 + "\n"
 
 
 def resolve(text, name="acme_msgs/msg/Thing", *, ros1=False, schema_encoding="ros2msg"):
-    return TypeLibrary().message_type(name, definition=text, schema_encoding=schema_encoding, ros1=ros1)
+    found = TypeLibrary().find_type(name, definition=text, schema_encoding=schema_encoding, ros1=ros1)
+    if isinstance(found, DefinitionError):
+        raise found
+    return found
 
 
 def test_fields_constants_defaults_and_comments():
@@ -61,7 +64,7 @@ def test_parts_that_the_log_leaves_out_come_from_the_bundled_definitions():
 def test_one_name_may_mean_two_things():
     library = TypeLibrary()
     kinds = [
-        library.message_type("a/msg/A", definition=text, schema_encoding="ros2msg", ros1=False).wire.fields
+        library.find_type("a/msg/A", definition=text, schema_encoding="ros2msg", ros1=False).wire.fields
         for text in ("float32 x\n", "float64 y\n")
     ]
     assert kinds == [(("x", Scalar("f4")),), (("y", Scalar("f8")),)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion.checks.audit import Audit, audit_trajectory, is_astray
-from tcpipe.fusion.trajectory import Rejections, Trajectory
+from tcpipe.fusion.measurements import Rejections, Trajectory
 
 
 def seconds(track, stamp_ns):

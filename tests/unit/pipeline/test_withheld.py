@@ -11,10 +11,10 @@ from unit.stages.test_fuse import filled, sensor, streams_of
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.withheld import Comparison, place_windows, score_comparisons
+from tcpipe.pipeline import audit as withheld
+from tcpipe.pipeline.audit import compare_withheld, withhold
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages import withheld
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.withheld import compare_withheld, withhold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import ParameterFacts
 from tcpipe.tables.findings import Subject, make_finding
