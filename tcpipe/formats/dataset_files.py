@@ -31,7 +31,7 @@ from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
 from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
-from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
+from tcpipe.formats.parquet import read_column_names, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
@@ -314,12 +314,6 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
         absent = later.intersection(asked).difference(read_column_names(directory / SAMPLES))
         there = None if columns is None else [name for name in columns if name not in absent]
         return SAMPLES_SCHEMA.select_columns(*asked).add_missing_columns(read_table(directory / SAMPLES, there))
-
-
-def sample_count(directory: Path) -> int:
-    """Return the rows of a dataset's samples table, from its footer; `DatasetError` if that cannot be read."""
-    with _convert_errors():
-        return read_row_count(directory / SAMPLES)
 
 
 def sample_columns(directory: Path) -> list[str]:

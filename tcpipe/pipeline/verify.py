@@ -10,7 +10,6 @@ from pathlib import Path
 from tcpipe.errors import TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import find_leftovers
 from tcpipe.formats.bucket_directories import CARDS, FoundCard, find_newest, find_unlisted_files
-from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
 from tcpipe.formats.integrity import Checksums, find_broken_seal
@@ -119,7 +118,7 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
         f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)
     )
     if is_bucket(path):
-        yield from (line for line in verify_log(open_place(path).below(LOG)) if isinstance(line, str))
+        yield from (line for line in verify_log(open_place(path)) if isinstance(line, str))
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
         yield from _verify_counts(place.proved(SAMPLES, checksums[SAMPLES]), card, where)
 
