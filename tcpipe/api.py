@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from tcpipe.cost.adaptation import Run
     from tcpipe.formats.maps.map_files import MapFile
     from tcpipe.learning.evaluation_files import AdaptationResult, EvaluationResult
+    from tcpipe.learning.models import Model
     from tcpipe.learning.training import TrainResult
-    from tcpipe.planning.cost_model import CostModel
     from tcpipe.planning.drives import DrivesResult
     from tcpipe.planning.path_files import PathResult, PlanResult
 
@@ -117,7 +117,7 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     return run(asked, source, Path(options.path), None if options.out is None else Path(options.out), adapted_by=known)
 
 
-def _collect_run(model: CostModel, source: MapFile, store: str | Path, log: str | Path) -> Run:
+def _collect_run(model: Model, source: MapFile, store: str | Path, log: str | Path) -> Run:
     from tcpipe.planning.drives import collect_run, find_drive
     from tcpipe.store import open_store
 
