@@ -370,21 +370,20 @@ class PatchFiles:
         rows = int(self.starts[piece + 1] - self.starts[piece])
         into = {layer: self.make_room(layer, self.piece_rows) for layer in layers} if out is None else out
         try:
-            if self.arrays:
-                for layer in layers:
-                    array = self.arrays[layer]
-                    array.chunk((piece, *(0 for _ in array.shape[1:])), out=into[layer][: self.piece_rows])
-            else:
-                name, group = self.groups[piece]
-                path = self.directory / name
-                table = read_row_group(
-                    path if self.fetched is None else self.fetched.fetch_file(path), group, list(layers)
-                )
-                for layer in layers:
-                    flat = table.column(layer).combine_chunks().flatten().to_numpy()
-                    into[layer][:rows] = flat.reshape(rows, *into[layer].shape[1:])
-        except StoreError as error:
-            raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
+            with _convert_errors(_AGAIN):
+                if self.arrays:
+                    for layer in layers:
+                        array = self.arrays[layer]
+                        array.chunk((piece, *(0 for _ in array.shape[1:])), out=into[layer][: self.piece_rows])
+                else:
+                    name, group = self.groups[piece]
+                    path = self.directory / name
+                    table = read_row_group(
+                        path if self.fetched is None else self.fetched.fetch_file(path), group, list(layers)
+                    )
+                    for layer in layers:
+                        flat = table.column(layer).combine_chunks().flatten().to_numpy()
+                        into[layer][:rows] = flat.reshape(rows, *into[layer].shape[1:])
         except (KeyError, ValueError):
             raise DatasetError(
                 f"{self.directory}: piece {piece} of its patches contradicts the card; build it again"
