@@ -29,7 +29,7 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
-from tcpipe.formats.json_files import parse_typed, read_document
+from tcpipe.formats.json_files import Json, parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
@@ -280,7 +280,7 @@ def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> Datase
         raise DatasetError(*problems) from None
 
 
-def _describe_outdated(directory: Path | str, version: object) -> str:
+def _describe_outdated(directory: Path | str, version: Json) -> str:
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
     return f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}"
 

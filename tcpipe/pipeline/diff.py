@@ -285,6 +285,6 @@ def _iterate_lines(found: Difference) -> Iterator[str]:
             count = f"{change['samples']:.0f} samples"
             yield f"{name} of {count}: changed by {change['median']:.3g} in the median, by {change['largest']:.3g} at most"
     for name, of in found.labels.items():
-        if (of["mean_a"], of["std_a"]) != (of["mean_b"], of["std_b"]):
+        if not np.allclose((of["mean_a"], of["std_a"]), (of["mean_b"], of["std_b"])):
             means, deviations = f"{of['mean_a']:.4g} → {of['mean_b']:.4g}", f"{of['std_a']:.4g} → {of['std_b']:.4g}"
             yield f"{name} of all samples: mean {means}, deviation {deviations}"

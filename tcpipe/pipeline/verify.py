@@ -15,7 +15,6 @@ from tcpipe.formats.commit_log import COMMIT, LOG, SNAPSHOT, read_snapshot, refr
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
-from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
@@ -182,7 +181,8 @@ def verify_log(place: Place) -> Iterator[CheckResult]:
     """Yield how many commits a place has, and what is wrong with them and with snapshots."""
     log, state = place.below(LOG), refresh(place, State())
     yield "commits", state.number - len(state.problems)
-    yield from (f"{place.where()}/{describe_finding(problem.finding)}" for problem in state.problems)
+    wrong = {"commit-missing": "is missing", "commit-damaged": "has changed, or does not follow the commit before"}
+    yield from (f"{problem.log[0]}: {wrong[problem.finding.code]}" for problem in state.problems)
     for name in log.files():
         if name.startswith(SNAPSHOT):
             yield from _isolate_errors(_verify_snapshot(log, name))
