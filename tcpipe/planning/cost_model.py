@@ -211,7 +211,7 @@ def iterate_predictions(
         bits = find_reasons(patches, on_map, model, source)
         asked = (bits & NO_COST == 0) & ask
         turns = np.full(on_map.size, np.nan) if turn_radpm is None else turn_radpm[first : first + on_map.size]
-        said = _predict_patches(model, patches, asked, turns)
+        said = predict_patches(model, patches, asked, turns)
         power_watt, velocity_mps = correction.apply(said.mean[:, 0], said.mean[:, 1], patches.terrain_class)
         stated = propagate_stated(said.mean, said.covariance)
         bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
@@ -240,7 +240,7 @@ def iterate_predictions(
             first += on_map.size
 
 
-def _predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats) -> Prediction:
+def predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats) -> Prediction:
     """Return what the model says of the patches that it is asked about, shape (N,), else NaN; tensors are formed in batches.
 
     ``turn_radpm`` is how far a metre of each turns; NaN is as usual, and so is the speed that is commanded.

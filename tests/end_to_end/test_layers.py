@@ -28,6 +28,8 @@ from tcpipe.store import Store, open_store
 from tcpipe.terrain.classes import PAPER_CLASSES
 from tcpipe.terrain.layers import Layer
 
+DRAWS_DATASET_PAGES = True
+
 PITCH_M = 0.2
 
 
