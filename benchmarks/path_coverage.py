@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, format_adaptations
+from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, format_adaptations, predict
 from tcpipe.cost.coverage import measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.learning.fitting import FitConfig
@@ -91,11 +91,8 @@ def coverage_line(quantity: str, length: int, found: Found) -> str:
     """Return how many paths of a length are inside their interval, and how wide that is."""
     inside, names, widths = [], [], []
     for name, errors, of in list_paths(found, quantity, length):
-        alone, total = (
-            errors.compute_intervals(of.predicted, of.class_id),
-            errors.compute_sum(of.predicted, of.class_id),
-        )
-        low, high = (float(end[0]) for end in alone) if length == 1 else total.interval
+        said = predict(errors, of)
+        low, high = (float(said.low[0]), float(said.high[0])) if length == 1 else said.total.interval
         inside.append(low <= float(of.measured.sum()) <= high)
         names.append(name)
         widths.append((high - low) / 2.0 / float(np.abs(of.predicted).sum()))
@@ -113,9 +110,8 @@ def budget_line(found: Found, length: int = 30) -> str:
     """Return for how many ways there and back of a drive a budget suffices that `plan-path --budget --return` calls enough at 95 %."""
     is_enough, names = [], []
     for name, errors, of in list_paths(found, "energy", 2 * length):
-        sums = [
-            errors.compute_sum(of.predicted[way], of.class_id[way]) for way in (slice(0, length), slice(length, None))
-        ]
+        at = np.arange(2 * length)
+        sums = [predict(errors, of.take(way)).total for way in (at < length, at >= length)]
         is_enough.append(float(of.measured.sum()) <= (sums[0] + sums[1]).compute_quantile(RISK))
         names.append(name)
     if not is_enough:

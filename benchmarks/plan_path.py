@@ -49,7 +49,7 @@ from tcpipe.terrain.target_grid import MapGrid
 
 JOULE_PER_RAD = 264.0
 TURNING = PhysicsTerm("turning", "all", JOULE_PER_RAD, 5.0, "W s/rad")
-FIT = PhysicsFit(500, (TURNING,), {}, 0.4, 8.0, {}, None, None, 0.05, None)
+FIT = PhysicsFit(500, (TURNING,), {}, 0.4, 8.0, {}, None, 0.05)
 RANGES = {"slope_rad": (-1.5, 1.5), "cross_slope_rad": (-1.5, 1.5), "relief_m": (0.0, 9.0)}
 MODEL = replace(PhysicsModel(), physics=FIT, training_range=RANGES)
 

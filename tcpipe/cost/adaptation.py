@@ -69,7 +69,8 @@ class Metres:
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
         values: dict[str, Any] = {of.name: getattr(self, of.name) for of in fields(self)}
-        return Metres(**{name: None if of is None else of[rows] for name, of in values.items()})
+        values = {name: None if of is None else of[rows] for name, of in values.items()}
+        return Metres(**values)
 
 
 @dataclass(frozen=True, slots=True)

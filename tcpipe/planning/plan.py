@@ -117,11 +117,6 @@ def plan_paths(
     allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
     risk : the probability with which a path shall take no more than what is least; None: its prediction is least.
     step : is told how many blocks of how many are looked at, or predicted, in each round.
-
-    Raises
-    ------
-    PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
-    ModelError : the model states no errors for ``risk``.
     """
     errors = survey.model.errors
     if risk is not None and errors is None:
@@ -138,7 +133,7 @@ def plan_paths(
     plans = {}
     for objective in objectives:
         of_all = [_judge(cost, objective, risk) for cost in costs]
-        best = min(range(len(lines)), key=lambda at, of_all=of_all: (costs[at].totals.pieces_without_cost, of_all[at]))  # type: ignore[misc]
+        best = min((cost.totals.path_segments_without_cost, of_all[at], at) for at, cost in enumerate(costs))[-1]
         totals = convert_record(
             costs[best].totals,
             PlanTotals,
