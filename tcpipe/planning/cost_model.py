@@ -67,6 +67,9 @@ def check_model(model: Model, source: MapReader) -> None:
 LANE_M = 0.7
 """Width of the strip that a robot needs, about the paper's Husky (0.67 m) [m]."""
 
+_ROUNDED = 1.0 + 1e-6
+"""Factor up to which a distance is that of training."""
+
 _STRAY = 0.05
 """Share of a lane's pixels that may be wrongly classed."""
 
@@ -94,6 +97,8 @@ class Reason(IntFlag):
     """More than 5 % of the strip that the robot drives over (0.7 m wide) is not traversable, though the middle is."""
     CURVED = 1 << 9
     """The path is more curved here than any training segment (its recipe's `max_arc_to_chord`)."""
+    LAYER_OUTSIDE_TRAINING = 1 << 10
+    """The mean of a band of a layer of yours, or the share of a class of it, is farther from that of training than in any sample."""
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION
@@ -120,6 +125,9 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, sour
     for reason, (values, name) in ranges.items():
         low, high = model.card.training_range.ranges[name]
         bits[~((values >= low) & (values <= high))] |= np.uint16(reason)
+    for name, known in model.card.training_range.layers.items():
+        values = model.card.layout.known[name].compute_means(patches.pixels[name])
+        bits[known.compute_distance(values) > known.largest * _ROUNDED] |= np.uint16(Reason.LAYER_OUTSIDE_TRAINING)
     if "terrain" in patches.pixels:
         bits |= _find_class_reasons(patches, patches.pixels["terrain"], model, source)
     bits[~on_map] = Reason.OUTSIDE_MAP
@@ -203,7 +211,7 @@ def iterate_predictions(
         bits = find_reasons(patches, on_map, model, source)
         asked = (bits & NO_COST == 0) & ask
         turns = np.full(on_map.size, np.nan) if turn_radpm is None else turn_radpm[first : first + on_map.size]
-        said = _predict_patches(model, patches, asked, turns)
+        said = predict_patches(model, patches, asked, turns)
         power_watt, velocity_mps = correction.apply(said.mean[:, 0], said.mean[:, 1], patches.terrain_class)
         stated = propagate_stated(said.mean, said.covariance)
         bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
@@ -232,7 +240,7 @@ def iterate_predictions(
             first += on_map.size
 
 
-def _predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats) -> Prediction:
+def predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats) -> Prediction:
     """Return what the model says of the patches that it is asked about, shape (N,), else NaN; tensors are formed in batches.
 
     ``turn_radpm`` is how far a metre of each turns; NaN is as usual, and so is the speed that is commanded.
