@@ -168,10 +168,9 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Changes, and their score against that of none, in nats."""
+    """Changes that together explain what is measured."""
 
     changes: tuple[Change, ...]
-    score: float
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -198,7 +197,7 @@ class Hypothesis:
         )
 
 
-UNCHANGED = Hypothesis((), 0.0)
+UNCHANGED = Hypothesis(())
 
 
 def find_suspects(tests: Tests, period_s: float) -> list[Suspect]:
@@ -249,17 +248,17 @@ def explain(
         else:
             break
         last = min(size, end + round(_HORIZON_S / period_s))
-        tried: list[Hypothesis] = []
+        tried: list[tuple[float, Hypothesis]] = []
         for change in changes:
             if _is_possible(change, best, active):
-                changed = Hypothesis((*best.changes, change), 0.0)
+                changed = Hypothesis((*best.changes, change))
                 first = min(c.first for c in changed.changes)
                 plain = compute_evidence(tests, gates, first, last)
                 gained = compute_evidence(run(changed, first, last).tests, gates, first, last) - plain - change.cost
-                tried.append(replace(changed, score=best.score + gained))
-        top = max(tried, key=lambda each: each.score, default=best)
+                tried.append((gained, changed))
+        most, top = max(tried, key=lambda each: each[0], default=(0.0, best))
         # Fixes that are rejected have to be explained: the filter would follow them in the end.
-        if top.score >= best.score + _SURELY or (tried and number and suspects[0].role == state.FIX):
+        if most >= _SURELY or (tried and number and suspects[0].role == state.FIX):
             best = top
             if (change := top.changes[-1]).kind == "pose" and change.size < _CARRIED_M:
                 # Such a step is one of the fixes, which err before or after it; if neither is more likely, around it.
@@ -304,7 +303,7 @@ def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> Hypothe
             before = changes.pop()
             first, last, off_m = before.first, max(last, before.last or size), max(off_m, before.size)
         changes.append(Change("wander", state.FIX, first, None if last >= size else last, off_m))
-    return Hypothesis(tuple(changes), 0.0)
+    return Hypothesis(tuple(changes))
 
 
 def _make_jump(made: Pass, jump: TurnJump) -> Change:

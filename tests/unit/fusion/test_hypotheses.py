@@ -135,11 +135,11 @@ def test_evidence_counts_what_is_beyond_the_gate_as_the_gate():
 
 
 def test_events_are_in_order():
-    best = Hypothesis((Change("antenna", state.FIX, 50, 90), Change("clock", state.FIX, 20)), 30.0)
+    best = Hypothesis((Change("antenna", state.FIX, 50, 90), Change("clock", state.FIX, 20)))
     assert [(event.tick, event.place) for event in best.events] == [
         (20, state.FIX_LAG),
         (50, state.ARM),
         (90, state.ARM),
     ]
-    useless = Hypothesis((Change("useless", state.VISUAL, 5, 8),), 0.0)
+    useless = Hypothesis((Change("useless", state.VISUAL, 5, 8),))
     assert (useless.events, useless.ignored) == ((), ((state.VISUAL, 5, 8),))
