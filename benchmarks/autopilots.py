@@ -18,7 +18,7 @@ from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
 
 from tcpipe.formats.logs.autopilot_records import read_records
-from tcpipe.formats.logs.log_container import find_autopilot
+from tcpipe.formats.logs.log_file import find_autopilot
 
 MOST_SHARE = {"ulog": 0.8, "dataflash": 0.1}
 PEERS = {"ulog": "pyulog", "dataflash": "pymavlink"}

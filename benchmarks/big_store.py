@@ -53,7 +53,7 @@ def store_of(directory: Path, samples: int) -> Store:
     if not Path(store.root).exists():
         open_store(store.root, create=True)
         with store.new_map("site") as path:
-            shutil.copytree(Store(maps).map_path("site"), path)
+            shutil.copytree(Store(maps).map_files("site")[0], path)
         for number in range(-(-samples // RUN_ROWS)):
             _add_run(store, number, min(RUN_ROWS, samples - number * RUN_ROWS))
     return store
@@ -78,7 +78,7 @@ def meander(bounds_m: tuple[float, float, float, float], count: int, *, seed: in
 
 
 def _add_run(store: Store, number: int, rows: int) -> None:
-    grid = open_map(store.map_path("site")).grid
+    grid = open_map(store.map_files("site")[0]).grid
     points = meander(grid.bounds_m, rows, seed=number)
     lon, lat = Transformer.from_crs(grid.crs, 4326, always_xy=True).transform(*points.T)
     azimuth_deg, _, chord_m = Geod(ellps="WGS84").inv(lon[:-1], lat[:-1], lon[1:], lat[1:])

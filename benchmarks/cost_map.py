@@ -18,12 +18,11 @@ from statistics import median
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from made_models import CARD, made_model
+from made_models import made_model
 from map_worlds import World
 
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.model_card import TrainingRange
 from tcpipe.learning.models import Model, load_model
 from tcpipe.planning.cost_grid import make_survey
@@ -46,7 +45,7 @@ def prepared(directory: Path, side_m: float, width: int) -> tuple[MapFile, Model
     build_map(directory / "site.zarr", name="site", **layers)
     ranges = {"slope_rad": (-1.5, 1.5), "cross_slope_rad": (-1.5, 1.5), "relief_m": (0.0, 9.0)}
     seen = TrainingRange(dict.fromkeys((4, 5, 6, 7), 100), (4, 5, 6, 7), ranges)
-    made_model(directory / "model", training_range=seen, architecture=Architecture(40, 3, 2, width), scale=CARD.scale)
+    made_model(directory / "model", training_range=seen, width=width)
     return open_map(directory / "site.zarr"), load_model(directory / "model")
 
 

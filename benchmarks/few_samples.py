@@ -20,13 +20,13 @@ from tcpipe.errors import TcpipeError
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.predictor import KINDS, Job, Samples, find_kind, predict_samples
-from tcpipe.learning.training import Variant, make_samples, make_training_task
+from tcpipe.learning.training import Variant, make_samples
 
 
 def make_subset(data: Dataset, name: str, count: int, seed: int) -> Samples:
     """Return so many training samples for a kind."""
     kind, config = find_kind(name), FitConfig(model=name, seed=seed)
-    samples = make_samples(make_training_task(data, 0, Variant(channels=kind.channels)), config, data, kind)
+    samples = make_samples(data, config, Variant(), kind)
     rows = np.sort(np.random.default_rng(seed).permutation(len(samples))[:count])
     return samples.take(rows)
 
@@ -35,13 +35,13 @@ def measure(data: Dataset, name: str, count: int, seed: int) -> dict[str, tuple[
     """Return RMSE of E [J] and T [s] by split."""
     samples, kind = make_subset(data, name, count, seed), find_kind(name)
     with tempfile.TemporaryDirectory() as directory:
-        job = Job(name, "", Path(directory, "state"))
+        job = Job(name, Path(directory, "state"))
         predictor = kind.fit_folds(samples, job).predictor if kind.stops_by_fold else kind.fit(samples)
     found = {}
     for split in (split for split in ("test", "unseen") if len(data[split])):
         part = data[split].take(np.isfinite(data[split].labels).all(axis=1)).with_channels(*samples.inputs.channels)
         held = replace(samples, split=part)
-        power, velocity = predict_samples(predictor, held).T
+        power, velocity = predict_samples(predictor, held).mean.T
         said = compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), 1.0)
         true = compute_costs(*held.labels.T, 1.0)
         found[split] = tuple(float(np.sqrt(np.mean((said[of] - true[of]) ** 2))) for of in ("E", "T"))

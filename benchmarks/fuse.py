@@ -191,7 +191,7 @@ def print_paired(seconds: float) -> None:
         command = compiled_eigen(Path(directory), seconds)
         for _ in range(REPEATS):
             run = {
-                "15-state filter": ukf15_us(short)[0],
+                "15-state filterpy": ukf15_us(short)[0],
                 "error-state forward + smoother": drive.us(),
             }
             if command is not None:
@@ -212,7 +212,7 @@ def _ratios(found: dict[str, list[float]]) -> None:
     if core not in found:
         print("no g++ or no Eigen (libeigen3-dev): not compared with C++")
         return
-    for name in ("15-state filter", "error-state forward + smoother"):
+    for name in ("15-state filterpy", "error-state forward + smoother"):
         ratio = statistics.median(a / b for a, b in zip(found[name], found[core], strict=True))
         print(f"{name} / {core}: {ratio:.2f}")
 

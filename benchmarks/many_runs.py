@@ -33,6 +33,7 @@ from tcpipe.pipeline.dataset.inputs import remove_duplicates
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import Recipe
@@ -148,7 +149,10 @@ def main() -> None:
     for again in ("first", "again"):
         summary = timed(f"nothing to ingest, {again}", lambda: ingest([logs], store=store.root, recipe=Recipe()))
         assert {result.status for result in summary.results} == {"unchanged"}
-        found = timed(f"status, {again}", lambda: find_status([logs], store=store.root, recipe=Recipe()))
+        found = timed(
+            f"status, {again}",
+            lambda: find_status(IngestOptions([logs], store=store.root, recipe=Recipe(), min_age_s=600.0)),
+        )
         assert found.counts == {"done": count}, found.counts
         chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
         assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) >= count

@@ -80,7 +80,7 @@ def measure(dataset: Path, out: Path, kind: str, more: tuple[str, ...]) -> str:
     )
     train(dataset, out, config=config)
     model, held = load_model(out), data["test"]
-    said = model.predict(held.with_layout(model.card.layout).patches, read_extra_features(held))
+    said = model.predict(held.with_layout(model.card.layout).patches, read_extra_features(held)).mean
     told, true = (compute_costs(*of.astype(float).T, 1.0) for of in (said, held.labels))
     energy, time = (float(np.sqrt(np.mean((told[name] - true[name]) ** 2))) for name in ("E", "T"))
     return (

@@ -15,24 +15,26 @@ import numpy as np
 import torch
 
 from tcpipe.dataset import open_dataset
-from tcpipe.learning.architecture import Architecture, compute_loss_factors
+from tcpipe.learning.fitting import FitConfig, compute_loss_factors
 from tcpipe.learning.network import Trainer, make_resnet18
-from tcpipe.learning.training import Variant, make_training_task
+from tcpipe.learning.network_model import NetworkModel
+from tcpipe.learning.training import Variant, make_samples
 
 STEPS, BATCH = 10, 64
 WANTED = 0.9
 
 
 def main() -> None:
-    task = make_training_task(open_dataset(sys.argv[1]), 0, Variant())
+    samples = make_samples(open_dataset(sys.argv[1]), FitConfig(), Variant(), NetworkModel)
+    fit = samples.split.take(samples.folds != 0)
     width = int(sys.argv[2]) if len(sys.argv) > 2 else 64
-    batches = task.fit.batches(BATCH, shuffle=True, mirror=True, drop_last=True)
+    batches = fit.batches(BATCH, shuffle=True, mirror=True, drop_last=True)
     list(batches)  # reads the split, loads the kernels
-    shape = Architecture(task.fit.view.stored.files.patch_px, task.fit.view.form.depth, 2, width)
-    trainer = Trainer(make_resnet18(shape, seed=0, start=(0.4, 0.8)), compute_loss_factors("nrmse", (1.0, 1.0)))
-    bare = make_resnet18(shape, seed=0, start=(0.4, 0.8)).train().to(memory_format=torch.contiguous_format)
+    sizes, px = (samples.inputs.depth, 2, width), samples.inputs.patch_px
+    trainer = Trainer(make_resnet18(*sizes, seed=0, start=(0.4, 0.8)), compute_loss_factors("nrmse", (1.0, 1.0)))
+    bare = make_resnet18(*sizes, seed=0, start=(0.4, 0.8)).train().to(memory_format=torch.contiguous_format)
     optimizer = torch.optim.Adam(bare.parameters(), 1e-4)
-    images, wanted = torch.rand(BATCH, shape.depth, shape.patch_px, shape.patch_px), torch.rand(BATCH, 2)
+    images, wanted = torch.rand(BATCH, sizes[0], px, px), torch.rand(BATCH, 2)
     spent: dict[str, list[float]] = {"feeding": [], "training": [], "predicting": [], "bare training": []}
     endless = batches.forever()
     for _ in range(STEPS):

@@ -5,17 +5,19 @@ A function imports what it needs when it is called: a model of physics needs no 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast, overload
+from typing import TYPE_CHECKING
 
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
 
 if TYPE_CHECKING:
+    from tcpipe.cost.adaptation import Run
+    from tcpipe.formats.maps.map_files import MapFile
     from tcpipe.learning.evaluation_files import AdaptationResult, EvaluationResult
+    from tcpipe.learning.models import Model
     from tcpipe.learning.training import TrainResult
     from tcpipe.planning.drives import DrivesResult
     from tcpipe.planning.path_files import PathResult, PlanResult
@@ -58,36 +60,6 @@ def run_train(options: TrainOptions) -> TrainResult:
 train = as_function(TrainOptions, run_train)
 
 
-class Evaluate(Protocol):
-    """The function `evaluate`: what it returns depends on ``drives``."""
-
-    @overload
-    def __call__(
-        self,
-        model: str | Path,
-        dataset: str | Path,
-        out: str | Path = "evaluation",
-        *,
-        noise_draws: int = 5,
-        baselines: bool = True,
-        retrain_ablation: bool = False,
-        seed: int = 0,
-        predictor: str | None = None,
-    ) -> EvaluationResult: ...
-    @overload
-    def __call__(
-        self,
-        model: str | Path,
-        dataset: str | Path,
-        out: str | Path = "evaluation",
-        *,
-        drives: Sequence[str | Path],
-        map_name: str | None = None,
-        store: str | Path = "tcpipe-store",
-        predictor: str | None = None,
-    ) -> DrivesResult: ...
-
-
 def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | AdaptationResult:
     """Measure a model on a dataset's test samples and unseen area, or on whole drives, and write the evaluation to ``out``.
 
@@ -95,34 +67,25 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
     is out of its range, ``out`` holds something else, or a drive is not in the store; `ModelError`, `DatasetError`, `MapError` or
     `StoreError` where an input cannot be used.
     """
-    model, dataset, out = options.model, options.dataset, options.out
+    model, dataset, out, store = options.model, options.dataset, options.out, options.store
+    if options.drives:
+        from tcpipe.learning.models import load_model
+        from tcpipe.planning.path_files import choose_map
+
+        loaded, source = load_model(model, options.predictor), choose_map(store, options.map_name)
     if options.adapt is not None:
         from tcpipe.learning.evaluation_files import evaluate_adaptation
-        from tcpipe.learning.models import load_model
-        from tcpipe.planning.drives import collect_run, find_drive
-        from tcpipe.planning.path_files import choose_map
-        from tcpipe.store import open_store
 
-        runs = None
-        if options.drives:
-            loaded, source, store = (
-                load_model(model, options.predictor),
-                choose_map(options.store, options.map_name),
-                open_store(options.store),
-            )
-            runs = [collect_run(loaded, source, find_drive(store, str(log))) for log in options.drives]
+        runs = [_collect_run(loaded, source, store, log) for log in options.drives] if options.drives else None
         return evaluate_adaptation(model, dataset, out, options.adapt, runs=runs, predictor=options.predictor)
     if options.drives:
         from tcpipe.dataset import open_dataset
-        from tcpipe.learning.models import load_model
         from tcpipe.learning.predictions import check_origin
         from tcpipe.planning.drives import evaluate_drives
-        from tcpipe.planning.path_files import choose_map
 
-        loaded, data = load_model(model, options.predictor), open_dataset(dataset)
+        data = open_dataset(dataset)
         check_origin(loaded.card, data, str(model))
-        source = choose_map(options.store, options.map_name)
-        return evaluate_drives(loaded, data, source, [*map(str, options.drives)], store=options.store, out=out)
+        return evaluate_drives(loaded, data, source, [*map(str, options.drives)], store=store, out=out)
     from tcpipe.learning.evaluation_facts import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
     from tcpipe.recipe.checking import from_values
@@ -133,7 +96,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
     )
 
 
-evaluate = cast("Evaluate", as_function(EvaluateOptions, run_evaluate))
+evaluate = as_function(EvaluateOptions, run_evaluate)
 
 
 def run_predict_path(options: PredictPathOptions) -> PathResult:
@@ -150,13 +113,15 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     asked = choose_model(
         options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
     )
-    known = None
-    if options.adapt is not None:
-        from tcpipe.planning.drives import collect_run, find_drive
-        from tcpipe.store import open_store
-
-        known = collect_run(asked, source, find_drive(open_store(options.store), str(options.adapt)))
+    known = None if options.adapt is None else _collect_run(asked, source, options.store, options.adapt)
     return run(asked, source, Path(options.path), None if options.out is None else Path(options.out), adapted_by=known)
+
+
+def _collect_run(model: Model, source: MapFile, store: str | Path, log: str | Path) -> Run:
+    from tcpipe.planning.drives import collect_run, find_drive
+    from tcpipe.store import open_store
+
+    return collect_run(model, source, find_drive(open_store(store), str(log)))
 
 
 predict_path = as_function(PredictPathOptions, run_predict_path)

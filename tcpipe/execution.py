@@ -17,8 +17,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import astuple, dataclass, field, replace
-from functools import partial
+from dataclasses import astuple, dataclass, field
 from itertools import chain, islice
 from multiprocessing.connection import Connection
 from operator import itemgetter
@@ -281,9 +280,6 @@ def _run_elsewhere(
     running = dict[Job[_Answer[R]], int]()
     with _open_workers(cluster) as workers:
         caller = _Caller((os.uname().nodename, os.getpid()), logger.getEffectiveLevel(), __version__)
-        if client := workers.client:
-            caller = replace(caller, topic=f"tcpipe-{client.id}")
-            client.subscribe_topic(caller.topic, lambda event: logger.log(*event[1]))
         try:
             while True:
                 for index, task in islice(todo, workers.at_once - len(running)):
@@ -396,17 +392,16 @@ def _make_cluster_error(worker: str, version: str, *, wanted: str) -> UsageError
 
 @dataclass(frozen=True, slots=True)
 class _Caller:
-    """Whose task it is: its process and version, from which level on it forwards what is logged, and by which topic of Dask."""
+    """Whose task it is: its process and version, and from which level on it forwards what is logged."""
 
     process: tuple[str, int]
     level: int
     version: str
-    topic: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Answer(Generic[R]):
-    """What a task gave, the CPU seconds that it took, and what it logged, where that could not be forwarded at once."""
+    """What a task gave, the CPU seconds that it took, and what it logged."""
 
     result: R
     cpu_s: float = 0.0
@@ -420,12 +415,7 @@ def _run_on_worker(function: Callable[[T], R], task: T, caller: _Caller) -> _Ans
     if caller.process == (os.uname().nodename, os.getpid()):
         return _Answer(function(task))
     said, began_s, before = list[Said](), time.process_time(), (logger.handlers, logger.level)
-    send: Callable[[Said], None] = said.append
-    if caller.topic is not None:
-        from distributed import get_worker  # noqa: PLC0415  most calls stay on this machine
-
-        send = partial(get_worker().log_event, caller.topic)
-    logger.handlers = [_LogForwarder(send)]  # a forked process has the caller's
+    logger.handlers = [_LogForwarder(said.append)]  # a forked process has the caller's
     logger.setLevel(caller.level)
     try:
         result = function(task)

@@ -49,7 +49,6 @@ from tcpipe.formats.run_documents import (
     StreamInfo,
     Tags,
     find_highest_numbers,
-    is_outdated,
     mark_store,
     name_document,
     name_folder,
@@ -125,10 +124,6 @@ class Store:
         """Return where a map lies, and its files; `StoreError` where there is none, or its document is not as it was written."""
         return read_as_at(self.place.below("maps"), name_document(name, self.map_number(name)), MapDocument)
 
-    def map_path(self, name: str) -> Path:
-        """Return where a map lies on this machine; of one in a bucket only its descriptions do."""
-        return self.map_files(name)[0]
-
     def map_files(self, name: str) -> tuple[Path, FetchedShards | None]:
         """Return where a map lies on this machine, and where its tiles are read if they lie in a bucket: what `open_map` takes."""
         return self.map_at(self.map_document(name))
@@ -139,18 +134,11 @@ class Store:
         root, fetched = fetch_files(place, document.checksums, by_range=lambda name: not name.endswith(described))
         return root / document.zarr, fetched
 
-    def map_picture(self, name: str) -> Path:
-        """Return where the quick look of a map lies on this machine."""
-        document = self.map_document(name)
-        return self.place.below("maps").local(document.picture, document.checksums[document.picture])
-
     @contextmanager
     def new_map(self, name: str, *, after: int = 0) -> Iterator[Path]:
         """Yield where a map is to be written, and beside it a picture ``.png``; in the end it is this store's, under ``after`` + 1.
 
-        Raises
-        ------
-        StoreError : it cannot be written, or another process has added a map of that name meanwhile, which stays.
+        `StoreError`: another process has added a map of that name meanwhile, which stays.
         """
         maps = self.place.below("maps")
         with maps.workshop() as directory:
@@ -408,15 +396,11 @@ def is_store(path: Path | str) -> bool:
     if is_url(path) and not is_bucket(path):
         return False
     place = open_place(path)
-    if place.read(MARK) is not None:  # not its size: only what is asked for with a body is refused with a reason
-        with suppress(StoreError):
-            _refuse_earlier(place, read_layout(place))
-        return True
-    if is_outdated(place):
-        raise UsageError(
-            f"{place.where()}: is a store of data model 1, which this version does not read, or an incomplete copy (no {MARK})"
-        )
-    return False
+    if place.read(MARK) is None:  # not its size: only what is asked for with a body is refused with a reason
+        return False
+    with suppress(StoreError):
+        _refuse_earlier(place, read_layout(place))
+    return True
 
 
 def _refuse_earlier(place: Place, version: str | None) -> None:
@@ -428,9 +412,7 @@ def _refuse_earlier(place: Place, version: str | None) -> None:
 def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     """Return the store and the finished ingestions of a run's directory, or the one of a recipe's; None for any other path.
 
-    Raises
-    ------
-    StoreError : it is a run's, but holds no finished run of this data-model version.
+    `StoreError`: it holds no finished run of this data-model version.
     """
     inside = find_store_above(path)
     if inside is None:
@@ -456,13 +438,7 @@ def find_store_above(path: Path | str) -> tuple[Store, str, str | None] | None:
 
 
 def open_store(root: str | Path, *, create: bool = False) -> Store:
-    """Return the store at a path or URL.
-
-    Raises
-    ------
-    UsageError : it is missing (unless ``create``), a file, or of an earlier layout.
-    StoreError : it cannot be reached or made, or is of a data model that this version does not know.
-    """
+    """Return the store at a path or URL."""
     if is_url(root) and not is_bucket(root):
         raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.evaluation_facts import (
     BaselineResult,
     EvaluateConfig,
@@ -18,14 +17,16 @@ from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import ModelCard, TrainedOn, Training, TrainingRange
 from tcpipe.learning.models import write_model
+from tcpipe.learning.predictor import Inputs
 from tcpipe.terrain.classes import PAPER_CLASSES
 
+INPUTS = Inputs(
+    channels=("ortho", "terrain", "height"), patch_px=40, planes=("ortho", "terrain", "height"), patch_m=1.0,
+    class_count=PAPER_CLASSES.count, extra_features=(), outputs=("power_watt", "velocity_mps"), scale=(400.0, 1.0),
+)  # fmt: skip
+
 CARD = ModelCard(
-    architecture=Architecture(patch_px=40, depth=3, outputs=2, width=16),
-    channels=("ortho", "terrain", "height"),
-    outputs=("power_watt", "velocity_mps"),
-    scale=(400.0, 1.0),
-    patch_m=1.0,
+    inputs=INPUTS,
     chord_m=1.0,
     max_arc_to_chord=1.02,
     label_velocity="ground",
@@ -41,12 +42,14 @@ CARD = ModelCard(
 )
 
 
-def made_model(directory: Path, *, seed: int = 0, rows: int = 60, **changes) -> Path:
-    """Write a model folder; ``changes`` replace fields of its card."""
+def made_model(directory: Path, *, seed: int = 0, rows: int = 60, width: int = 16, **changes) -> Path:
+    """Write a model folder; ``changes`` replace fields of its card, or of its inputs."""
     from tcpipe.learning.network import make_resnet18  # needs torch
 
-    card = replace(CARD, **changes)
-    network = make_resnet18(card.architecture, seed=seed, start=(0.4, 0.85)[: card.architecture.outputs])
+    of_inputs = {name: changes.pop(name) for name in list(changes) if hasattr(INPUTS, name)}
+    card = replace(CARD, inputs=replace(INPUTS, **of_inputs), **changes)
+    outputs = len(card.inputs.outputs)
+    network = make_resnet18(card.inputs.depth, outputs, width, seed=seed, start=(0.4, 0.85)[:outputs])
     rng = np.random.default_rng(seed)
     power, velocity = rng.uniform(100.0, 250.0, rows), rng.uniform(0.7, 0.95, rows)
     residuals = pa.table(

@@ -1,9 +1,14 @@
 """A cost model whose truth is known in closed form: it reads slope and class off the patch and answers by a formula."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from types import SimpleNamespace
 
 import numpy as np
 
+from tcpipe.cost.prediction_errors import fit_errors
+from tcpipe.dataset.tensor import TensorLayout
+from tcpipe.learning.model_card import TrainingRange
+from tcpipe.learning.predictor import Prediction
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
@@ -47,7 +52,7 @@ def made_residuals(count=400, sigma=0.1, shared=0.0, seed=0, runs=8):
 
 @dataclass(frozen=True)
 class PhysicsModel:
-    """Implements `tcpipe.planning.cost_model.CostModel`."""
+    """Has what planning takes of a `tcpipe.learning.models.Model`; its card is itself, with flat fields."""
 
     name: str = "physics"
     checksum: str = "0" * 64
@@ -70,8 +75,20 @@ class PhysicsModel:
     takes_turns: bool = False
 
     @property
-    def layers(self):
-        return make_paper_layers(PAPER_LAYERS, self.classes)
+    def card(self):
+        layout = TensorLayout(self.channels, make_paper_layers(PAPER_LAYERS, self.classes), self.patch_px)
+        seen = TrainingRange(self.class_counts, self.pixel_classes, self.training_range)
+        own = {of.name: getattr(self, of.name) for of in fields(PhysicsModel)}
+        return SimpleNamespace(
+            **own | {"inputs": self, "layout": layout, "class_table": self.classes, "training_range": seen}
+        )
+
+    @property
+    def errors(self):
+        return fit_errors(self.residuals)
+
+    def ask(self, patches, features=None):
+        return Prediction.without_covariance(self.predict(patches, features))
 
     def predict(self, patches, beside=None):  # noqa: ARG002  it is told nothing that it wants
         height = patches[..., self.channels.index("height")].astype(np.float64)

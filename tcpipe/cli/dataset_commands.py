@@ -177,7 +177,7 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
 @add_path_or_store(SEALED)
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
-    """Read the dataset, run, map, model or cost map at PATH, or the store, again: compare counts, checksums, schemas.
+    """Read the dataset, run, map, model or cost map at PATH, or the store, again: compare checksums and counts.
 
     Exit code 1: a file has changed, is missing or contradicts another.
     """

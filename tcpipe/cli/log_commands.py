@@ -69,20 +69,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     if dry_run:
         from tcpipe.pipeline.status import find_status
 
-        planned = find_status(
-            options.logs,
-            store=options.store,
-            recipe=ruling,
-            robot=options.robot,
-            as_one=options.as_one,
-            shard=options.shard,
-            min_age_s=options.min_age_s,
-            message_definitions=Path(options.message_definitions) if options.message_definitions else None,
-            force=options.force,
-            retry_failed=options.retry_failed,
-            jobs=options.jobs,
-            create=True,
-        )
+        planned = find_status(options, create=True)
         print_result(replace(planned, history=()), as_json=as_json)
         return 0
     with show_progress("ingest", quiet=quiet, as_json=as_json) as shown:
@@ -240,7 +227,8 @@ def status(
         store, paths = paths[0], paths[1:]
     elif paths and not is_url(store) and not Path(store).exists():
         raise UsageError(f"{paths[0]}: no store here and none at {store}; name one with --store")
-    found = run(paths, store=store, recipe=resolve_recipe_with_source(recipe)[0], robot=robot, min_age_s=min_age_s)
+    ruling = resolve_recipe_with_source(recipe)[0]
+    found = run(IngestOptions(paths, store=store, recipe=ruling, robot=robot, min_age_s=min_age_s))
     if as_json:
         print_json(found)
         return found.exit_code

@@ -16,7 +16,7 @@ from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, Predic
 if TYPE_CHECKING:
     from tcpipe.experiment.reproduction import Size
     from tcpipe.formats.maps.map_files import MapFile
-    from tcpipe.planning.cost_model import CostModel
+    from tcpipe.learning.models import Model
 
 
 @click.command()
@@ -160,7 +160,7 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     print_result(result, as_json=as_json)
 
 
-def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[CostModel, MapFile]:
+def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, MapFile]:
     """Return the model and the map, wherever this is called."""
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map

@@ -9,10 +9,9 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import click
 
@@ -22,7 +21,6 @@ from tcpipe.progress import STEP, Step, step_of
 if TYPE_CHECKING:
     import rich.progress
     from rich.console import Console
-    from rich.progress import TaskID
 
     from tcpipe.recipe import Recipe
 
@@ -64,28 +62,16 @@ def _open_terminal(*, as_json: bool) -> Console | None:
     return console if console.is_terminal and not console.is_dumb_terminal else None
 
 
-_SHARES = {"hashing": (0.0, 0.03), "reading": (0.03, 0.2), "fusing": (0.2, 0.95), "cutting and labelling": (0.95, 1.0)}
-"""Where in the time that a log takes its stages begin and end, as a share; roughly, cameras shift it."""
-_MOST_ROWS = 8
 _LONGEST_NAME = 40
 
 
-@dataclass(slots=True)
-class _Row:
-    """A log under way: its bar, None where there are too many, and the share that is done."""
-
-    bar: TaskID | None
-    share: float = 0.0
-
-
 class Progress:
-    """Lines on stderr; on a terminal ``console`` a bar of all logs and one of each log under way, until the end."""
+    """Lines on stderr; on a terminal ``console`` a bar of all logs, with what the last one that did something does, until the end."""
 
     def __init__(self, what: str, *, quiet: bool, console: Console | None) -> None:
         self._what = what
         self._quiet = quiet
         self._stages: dict[str, str] = {}
-        self._rows: dict[str, _Row] = {}
         self._sizes: Mapping[str, int] = {}
         self._waiting, self._done, self._begun_s = 0, 0, time.monotonic()
         self._bars: rich.progress.Progress | None = None
@@ -152,48 +138,31 @@ class Progress:
     def step(self, step: Step) -> None:
         """Show how far a log is; without bars a line at each of its stages."""
         if self._bars is not None and step.task:
-            self._draw_step(self._bars, step)
+            name = clean_line(step.task.rsplit("/", 1)[-1])[-_LONGEST_NAME:]
+            size = f" {_format_megabytes(step.done)} of {_format_megabytes(step.total)} MB" if step.total else ""
+            self._draw(self._bars, f"; {name}: {step.stage}{size}")
         elif self._bars is not None and step.total:
             self.count(step.done, step.total, step.stage)
         elif self._bars is None and step.task and self._stages.get(step.task) != step.stage:
             self._stages[step.task] = step.stage
             self.line(f"{step.task}: {step.stage}")
 
-    def _draw_step(self, bars: rich.progress.Progress, step: Step) -> None:
-        row = self._rows.get(step.task)
-        if row is None:
-            has_room = sum(other.bar is not None for other in self._rows.values()) < _MOST_ROWS
-            name = clean_line(step.task.rsplit("/", 1)[-1])[-_LONGEST_NAME:]
-            row = self._rows[step.task] = _Row(bars.add_task(f"  {name}", total=1.0, said="") if has_room else None)
-        start, end = _SHARES.get(step.stage, (row.share, row.share))
-        row.share = max(row.share, start + (end - start) * step.done / max(step.total, 1))
-        if row.bar is not None:
-            size = f" {_format_megabytes(step.done)} of {_format_megabytes(step.total)} MB" if step.total else ""
-            bars.update(row.bar, completed=row.share, said=step.stage + size)
-        self._draw_rate(bars)
-
     def end(self, task: str, *, worked: bool) -> None:
         """Count a log that is done; one that needed no work does not count for the rate."""
-        if self._bars is None:
-            return
-        row, size = self._rows.pop(task, None), self._sizes.get(task, 0)
-        if row is not None and row.bar is not None:
-            self._bars.remove_task(row.bar)
-        self._waiting -= size
-        self._done += size if worked else 0
-        self._bars.advance(self._all)
-        self._draw_rate(self._bars)
+        if self._bars is not None:
+            size = self._sizes.get(task, 0)
+            self._waiting -= size
+            self._done += size if worked else 0
+            self._bars.advance(self._all)
+            self._draw(self._bars)
 
-    def _draw_rate(self, bars: rich.progress.Progress) -> None:
+    def _draw(self, bars: rich.progress.Progress, more: str = "") -> None:
         """Show how many logs are done, how fast, and how long the others will take at that."""
-        under_way = sum(self._sizes.get(task, 0) * row.share for task, row in self._rows.items())
-        done, took_s = self._done + under_way, time.monotonic() - self._begun_s
-        text = f"{round(bars.tasks[0].completed)}/{len(self._sizes)}"
-        if done and took_s > 0:
-            left = divmod(round((self._waiting - under_way) / done * took_s), 60)
-            text += f", {_format_megabytes(done / took_s)} MB/s, {left[0]}:{left[1]:02d} left"
-        hidden = sum(row.bar is None for row in self._rows.values())
-        bars.update(self._all, said=text + (f", {hidden} more under way" if hidden else ""))
+        text, took_s = f"{round(bars.tasks[0].completed)}/{len(self._sizes)}", time.monotonic() - self._begun_s
+        if self._done and took_s > 0:
+            left = divmod(round(self._waiting / self._done * took_s), 60)
+            text += f", {_format_megabytes(self._done / took_s)} MB/s, {left[0]}:{left[1]:02d} left"
+        bars.update(self._all, said=text + more)
 
 
 def _format_megabytes(size_bytes: float) -> str:
@@ -267,14 +236,14 @@ def print_result(result: object, *, as_json: bool) -> None:
         print_lines(result)
 
 
-def print_json(value: Any) -> None:
+def print_json(value: object) -> None:
     """Print one JSON object on stdout, with unprintable characters as JSON escapes."""
     from tcpipe.formats.json_files import to_json
 
     click.echo(_format_value(to_json(value)), nl=False)
 
 
-def print_json_line(value: Any) -> None:
+def print_json_line(value: object) -> None:
     """Print one JSON object on one line of stdout, as `print_json` does."""
     from tcpipe.formats.json_files import to_json_line
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from hashlib import sha256
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,10 +63,13 @@ class Metres:
     """Over each, uphill positive."""
     turn_rad: Floats
     """Over each, both ways counted."""
+    stated_std: Floats | None = None
+    """Of the prediction, by the model itself; None: as usual."""
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        return Metres(*(getattr(self, of.name)[rows] for of in fields(self)))
+        values: dict[str, Any] = {of.name: getattr(self, of.name) for of in fields(self)}
+        return Metres(**{name: None if of is None else of[rows] for name, of in values.items()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +84,8 @@ class Adapted:
 
 def predict(errors: Errors, there: Metres) -> Adapted:
     """Return what a model says of metres as it is."""
-    low, high = errors.compute_intervals(there.predicted, there.class_id)
-    return Adapted(there.predicted, low, high, errors.compute_sum(there.predicted, there.class_id))
+    low, high = errors.compute_intervals(there.predicted, there.class_id, there.stated_std)
+    return Adapted(there.predicted, low, high, errors.compute_sum(there.predicted, there.class_id, there.stated_std))
 
 
 def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
@@ -101,7 +105,7 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
         _make_design(there, *usual),
         known.measured - known.predicted,
     )
-    spread, spread_there = (errors.compute_std(of.predicted, of.class_id) for of in (known, there))
+    spread, spread_there = (errors.compute_std(of.predicted, of.class_id, of.stated_std) for of in (known, there))
     neighbour, apart_m = _find_neighbour(errors), np.abs(known.distance_m[:, None] - known.distance_m)
     beside = np.eye(len(residual)) + neighbour * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
     freedom, evidences, values, variances, sums = _FREEDOM + len(residual), [], [], [], []

@@ -6,7 +6,10 @@ Estimated are, in this order:
   b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
   (James and Stein's positive part; Efron and Morris, JASA 70, 1975), and as far as no single fold of the cross-validation makes it.
   Predictions are multiplied by it, so that they are centred.
-* the **spread** of one metre, a + c |prediction|, with a factor of the class that few samples hardly move from 1.
+* the **spread** of one metre, a + c |prediction| + e s, with a factor of the class that few samples hardly move from 1. Here s is the
+  standard deviation that the model itself states of the metre, 0 where it states none: it counts as far as held-out errors follow it.
+  Errors of a single fold vary from fold to fold (by 31 % of networks): spreads are then as much wider as Student's t of 5 degrees of
+  freedom, whose scale is as uncertain.
 * the **correlation** of two metres of one run by their distance, from the products of errors over their spread. A segment's end is the
   next one's beginning, so that of neighbours may be negative; beyond, it never rises, and distances with few pairs are taken together.
 * the **variance of a run's own error**: how much more the means of runs differ than the correlated errors of their metres explain; few
@@ -111,6 +114,7 @@ class Errors:
     low, high : 5 % and 95 % quantiles of the errors over their spread.
     bias_std : standard error of the class's bias, of the prediction, shape (256,).
     common_share : standard deviation of the labels' common error, of the prediction; 0 where the labels do not state it.
+    stated_share, usual_stated : what a spread has of the standard deviation that the model states, and its mean over held-out samples.
     lag_m, correlation : of two metres so far apart on one run, from each lag to the next.
     of_run : the last of them, each run's own, raised for the small number of runs.
     runs, samples : that were held out.
@@ -128,21 +132,30 @@ class Errors:
     runs: int
     samples: int
     common_share: float = 0.0
+    stated_share: float = 0.0
+    usual_stated: float = 0.0
 
-    def compute_std(self, predicted: Floats, class_id: NDArray[np.integer]) -> Floats:
-        """Return the standard deviation of each prediction, shape (N,)."""
-        return np.asarray((self.floor + self.share * np.abs(predicted)) * self.of_class[class_id])
+    def compute_std(
+        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+    ) -> Floats:
+        """Return the standard deviation of each prediction, shape (N,); ``stated`` by the model, None: as usual."""
+        own = self.stated_share * (self.usual_stated if stated is None else stated)
+        return np.asarray((self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id])
 
-    def compute_intervals(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
+    def compute_intervals(
+        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+    ) -> tuple[Floats, Floats]:
         """Return the interval of each piece, shape (N,) each."""
-        spread = self.compute_std(predicted, class_id)
+        spread = self.compute_std(predicted, class_id, stated)
         return predicted + self.low * spread, predicted + self.high * spread
 
-    def compute_sum(self, predicted: Floats, class_id: NDArray[np.integer]) -> SumDistribution:
+    def compute_sum(
+        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+    ) -> SumDistribution:
         """Return the distribution of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
         known = np.isfinite(predicted)
         values = np.where(known, predicted, 0.0)
-        spread = np.where(known, self.compute_std(values, class_id), 0.0)
+        spread = np.where(known, self.compute_std(values, class_id, stated), 0.0)
         middle, alone = float(values.sum()), float((spread**2).sum())
         if not alone:
             return SumDistribution(middle, 0.0, 0.0)
@@ -197,7 +210,7 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
-    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule.
+    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, and what the model stated (`make_residuals`).
     """
     held = _Held.collect(residuals)
     if held is None:
@@ -209,11 +222,45 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     nothing = np.zeros(_CLASSES)
     return {
         name: replace(
-            _fit_class_errors(of, held.true[name], held, std.get(name, nothing)),
+            _fit_class_errors(of, held.true[name], held, std.get(name, nothing), held.stated[name]),
             common_share=_find_common_share(residuals, name),
         )
         for name, of in predicted.items()
     }
+
+
+def estimate_correlation(residuals: Residuals) -> float:
+    """Return the correlation of the errors of power and velocity of held-out samples; 0 of too few."""
+    held = _Held.collect(residuals)
+    if held is None:
+        return 0.0
+    power, velocity = (held.true[name] - held.predicted[name] for name in ("power", "velocity"))
+    both = float(np.sqrt(power.var() * velocity.var()))
+    return float(np.mean((power - power.mean()) * (velocity - velocity.mean()))) / both if both else 0.0
+
+
+_STATED = "power_predicted_std_watt", "velocity_predicted_std_mps", "power_velocity_predicted_covariance"
+
+
+def make_residuals(labels: Floats, mean: Floats, covariance: Floats) -> dict[str, Floats]:
+    """Return columns of labels and predictions of power and velocity, shape (N, 2); of covariances, (N, 2, 2), where they are not 0."""
+    columns = {
+        "power_watt": labels[:, 0], "velocity_mps": labels[:, 1],
+        "power_predicted_watt": mean[:, 0], "velocity_predicted_mps": mean[:, 1],
+    }  # fmt: skip
+    stated = np.sqrt(covariance[:, 0, 0]), np.sqrt(covariance[:, 1, 1]), covariance[:, 0, 1]
+    return columns | (dict(zip(_STATED, stated, strict=True)) if covariance.any() else {})
+
+
+def propagate_stated(mean: Floats, covariance: Floats) -> dict[str, Floats]:
+    """Return standard deviations of power, velocity, and of time and energy of a metre, to first order in the covariances stated."""
+    (power, velocity), (of_power, both), (_, of_velocity) = mean.T, *covariance.transpose(1, 2, 0)
+    energy = of_power - 2.0 * both * power / velocity + of_velocity * (power / velocity) ** 2
+    variances = {
+        "power": of_power, "velocity": of_velocity,
+        "duration": of_velocity / velocity**4, "energy": np.maximum(energy, 0.0) / velocity**2,
+    }  # fmt: skip
+    return {name: np.sqrt(of) for name, of in variances.items()}
 
 
 _COMMON = {"duration": "duration_common_std_s", "energy": "energy_common_std_joule"}
@@ -241,6 +288,9 @@ class _Held:
     """Along its run."""
     fold: Ints
     """That was held out with it."""
+    is_one_fold: bool
+    stated: Mapping[str, Floats]
+    """Standard deviations by the model; 0 where it states none."""
 
     @classmethod
     def collect(cls, residuals: Residuals) -> _Held | None:
@@ -265,7 +315,13 @@ class _Held:
         )
         class_id = np.nan_to_num(residuals["terrain_class"][rows].astype(np.float64)).astype(np.int64)
         fold = residuals["fold"][rows].astype(np.int64) if "fold" in residuals else np.zeros(rows.size, np.int64)
-        return cls(true, predicted, class_id, of_run, way_m, fold)
+        is_one_fold = "fold" in residuals and np.unique(fold).size == 1
+        covariance = np.zeros((rows.size, 2, 2))
+        if set(_STATED) <= residuals.keys():
+            of_power, of_velocity, both = (residuals[name][rows].astype(np.float64) for name in _STATED)
+            covariance = np.array([[of_power**2, both], [both, of_velocity**2]]).transpose(2, 0, 1)
+        mean = np.column_stack([predicted["power"], predicted["velocity"]])
+        return cls(true, predicted, class_id, of_run, way_m, fold, is_one_fold, propagate_stated(mean, covariance))
 
 
 def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
@@ -319,11 +375,15 @@ def _estimate_ratio(predicted: Floats, true: Floats, block: Ints) -> tuple[float
     return found, float(np.sqrt((of_block**2).sum() * several / (several - 1.0))) / whole
 
 
-def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors:
+_FEWEST_FREEDOM = 5.0
+"""Of the spread of errors of one fold."""
+
+
+def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats, stated: Floats) -> Errors:
     error = true - predicted
-    design = np.column_stack([np.ones_like(predicted), np.abs(predicted)])
-    (floor, share), _ = nnls(design, np.abs(error))
-    plain = np.maximum(design @ [floor, share], 1e-12)
+    design = np.column_stack([np.ones_like(predicted), np.abs(predicted), stated])
+    shares, _ = nnls(design, np.abs(error))
+    plain = np.maximum(design @ shares, 1e-12)
     scale = max(float(np.sqrt(np.mean((error / plain) ** 2))), 1e-9)
     standard, of_class = error / (scale * plain), np.ones(_CLASSES)
     for number in np.unique(held.class_id).tolist():
@@ -333,9 +393,11 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
     low, high = np.quantile(standard, (_TAIL, 1.0 - _TAIL)).tolist()
     lag_m, correlation = _estimate_correlation(standard, held)
     runs = int(np.unique(held.run).size)
+    wider = float(stdtrit(_FEWEST_FREEDOM, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH if held.is_one_fold else 1.0
+    floor, share, stated_share = (float(of) * scale * wider for of in shares)
     found = Errors(
-        float(floor) * scale, float(share) * scale, of_class, min(low, 0.0), max(high, 0.0), bias_std,
-        lag_m, correlation, 0.0, runs, standard.size,
+        floor, share, of_class, min(low, 0.0), max(high, 0.0), bias_std, lag_m, correlation, 0.0, runs, standard.size,
+        stated_share=stated_share, usual_stated=float(stated.mean()),
     )  # fmt: skip
     return replace(
         found, of_run=_estimate_run_variance(found, error, scale * plain * of_class[held.class_id], held.run)

@@ -220,7 +220,7 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
 def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, result: Reproduction) -> Evaluation:
     here, dataset = place / f"seed-{seed}", place / "dataset"
     with _measure_time(result, "train"):
-        train(dataset, here / "model", config=replace(plan.fitting, seed=seed), disposable=True)
+        train(dataset, here / "model", config=replace(plan.fitting, seed=seed))
     with _measure_time(result, "evaluate"):
         known = partial(compute_true_costs, remove_hidden_variation(made.world), made.drives[0].robot)
         config = replace(plan.evaluating, seed=seed)

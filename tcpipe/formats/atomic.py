@@ -48,12 +48,7 @@ _RENAME_EXCHANGE = 2
 
 @contextmanager
 def write_atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path; on success it is synced and renamed to ``path``, on failure removed.
-
-    Raises
-    ------
-    StoreError : the place cannot be written.
-    """
+    """Yield a temporary path; on success it is synced and renamed to ``path``, on failure removed."""
     with _convert_os_errors(path), _make_parents(path) as place, _make_locked_holder(place) as holder:
         temporary = holder / place.name
         temporary.touch()
@@ -66,12 +61,7 @@ def write_atomic_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def write_atomic_directory(path: Path) -> Iterator[Path]:
-    """Yield a temporary directory; on success it takes the place of ``path`` (an old one goes), on failure it is removed.
-
-    Raises
-    ------
-    StoreError : the place cannot be written.
-    """
+    """Yield a temporary directory; on success it takes the place of ``path`` (an old one goes), on failure it is removed."""
     with _convert_os_errors(path), _make_parents(path) as place, _make_locked_holder(place) as holder:
         temporary = holder / place.name
         temporary.mkdir()

@@ -26,12 +26,7 @@ _OTHER_CREDENTIALS = (
 
 
 def read_aws_profile(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the settings of the profile ``AWS_PROFILE``, else ``default``, that the environment does not give, by obstore's names.
-
-    Raises
-    ------
-    ValueError : there is no profile of that name, or it has no keys (single sign-on, a role, a program that gives them).
-    """
+    """Return the settings of the profile ``AWS_PROFILE``, else ``default``, that the environment does not give, by obstore's names."""
     wanted = environment.get("AWS_PROFILE")
     name, home = wanted or "default", Path(environment.get("HOME", "~")).expanduser() / ".aws"
     credentials = Path(environment.get("AWS_SHARED_CREDENTIALS_FILE", home / "credentials")).expanduser()

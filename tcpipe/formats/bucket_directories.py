@@ -14,8 +14,8 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import NamedTuple
 import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory
+from tcpipe.formats.atomic import make_lasting_scratch
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
 from tcpipe.formats.commits import State
@@ -114,36 +114,8 @@ class FetchedShards:
 
 
 def fetch_directory(path: str | Path) -> Path:
-    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs.
-
-    Raises
-    ------
-    UsageError : there is no card at the URL.
-    StoreError : it cannot be read, or a file is not as the card says.
-    """
+    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs."""
     return Path(path) if not is_url(path) else _fetch_copy(str(path).rstrip("/"), lambda _: True)[0]
-
-
-@contextmanager
-def fetch_unproved(url: str) -> Iterator[Path]:
-    """Yield a copy of what a card in a bucket lists, as it lies there now: nothing is taken from the cache, and nothing proved.
-
-    Raises
-    ------
-    UsageError : there is no card at the URL.
-    StoreError : it cannot be read.
-    """
-    card = require_card(url)
-    with make_scratch_directory() as held:
-        root = _make_subdirectory(held, url)
-
-        def bring(name: str) -> None:
-            if (data := card.place.read(name)) is not None:
-                (root / name).parent.mkdir(parents=True, exist_ok=True)
-                (root / name).write_bytes(data)
-
-        card.place.map(bring, [*_read_checksums(card), card.name, *_UNLISTED])
-        yield root
 
 
 def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:

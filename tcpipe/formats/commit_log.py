@@ -164,13 +164,8 @@ def read_commit(log: Place, number: int) -> ReadCommit:
 def put_commit(store: Place, state: State, stamp: Stamp, kind: Kind, make: Callable[[State], Entries]) -> State:
     """Write the next commit, and return the state after it, which holds what others committed meanwhile.
 
-    Parameters
-    ----------
-    make : returns what to add to a state; called again where another call was faster. Nothing is written where that is nothing.
-
-    Raises
-    ------
-    StoreError : the log cannot be read or written.
+    ``make`` returns what to add to a state; it is called again where another call was faster, and nothing is written where that is
+    nothing.
     """
     log = store.below(LOG)
     while True:

@@ -25,12 +25,7 @@ DOCUMENTS = {"run": RunJson, "manifest": Manifest, "dataset": DatasetCard}
 
 
 def make_contracts(answers: Mapping[str, type]) -> dict[str, str]:
-    """Return file name → JSON Schema text, for every table (one row as an object), the recipe, and every document and answer.
-
-    Parameters
-    ----------
-    answers : the dataclasses of what commands print and of the documents of the upper floors, by the name of their schema.
-    """
+    """Return file name → JSON Schema text, for every table (one row as an object), the recipe, and every document and answer."""
     tables = (*STREAMS.values(), MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
     schemas = {table.name: _make_table_schema(table) for table in tables} | {"recipe": _make_recipe_schema()}
     documents = {**DOCUMENTS, **answers}

@@ -53,16 +53,7 @@ class CovariateTable:
     def join(self, stamp_ns: NDArray[np.int64], *, max_age_s: float) -> tuple[pa.Table, NDArray[np.bool_]]:
         """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
 
-        Parameters
-        ----------
-        stamp_ns : times of the samples [ns, UTC], in any order, shape (N,).
-        max_age_s : a row older than that is not taken [s].
-
-        Returns
-        -------
-        pyarrow.Table : N rows; columns are called as the file, without its ending, and the column. Null where no row reaches, or it has no
-            value.
-        ndarray : shape (N,).
+        ``stamp_ns`` may be in any order; columns are called as the file, without its ending, and the column.
         """
         wanted = pl.DataFrame({_STAMP: stamp_ns}).with_row_index(_ROW).sort(_STAMP)
         there = self.rows.with_columns(pl.col(_STAMP).alias(_FOUND))
@@ -88,15 +79,7 @@ class CovariateTable:
 def read_covariates(path: Path, *, time_column: str | None = None, time_unit: TimeUnit = "auto") -> CovariateTable:
     """Read a table of covariates.
 
-    Parameters
-    ----------
-    path : CSV or Parquet, by its ending.
-    time_column : None takes the only one that has its name.
-    time_unit : of stamps that are numbers; text is ISO 8601, and UTC where it names no zone.
-
-    Raises
-    ------
-    DatasetError : it cannot be read, tells no time, or two of its rows are of one time and differ.
+    Without ``time_column`` the only one that has its name; text is ISO 8601, and UTC where it names no zone.
     """
     try:
         if path.suffix.lower() == ".parquet":

@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
-from tcpipe.formats.integrity import read_sealed
-from tcpipe.formats.json_files import parse_typed
+from tcpipe.formats.integrity import verify_document
+from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decode_chunk, open_sharded
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS, READ_VERSIONS
@@ -154,12 +154,7 @@ def make_zarr_writers(
 ) -> list[Drawer]:
     """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written to ``out``.
 
-    Parameters
-    ----------
-    pixels : the patches of all rows.
-    sample_ids : gives the ids of the rows from one up to another.
-    compression : what the layers are encoded with.
-    threads : chunks of a shard encoded side by side; the bytes do not depend on it.
+    ``sample_ids`` gives the ids of the rows from one up to another; ``threads`` does not change the bytes.
     """
     n, px = len(pixels.slots), pixels.patch_px
     shard = _choose_shard_rows(n)
@@ -227,11 +222,7 @@ def make_parquet_writers(
 ) -> list[Drawer]:
     """Return ``data/<split>-*.parquet``, to be written to ``out``: the columns of the samples and each layer as a plain fixed-size list.
 
-    Parameters
-    ----------
-    pixels : the patches of all rows.
-    samples : gives, for some rows, what gives these rows of the samples table.
-    split : split of every row, shape (N,).
+    ``samples`` gives, for some rows, what gives these rows of the samples table.
     """
     drawers = list[Drawer]()
     for name in SPLITS:
@@ -260,9 +251,7 @@ def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array
 def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     """Return the card of the dataset in ``directory``, of any data model.
 
-    Raises
-    ------
-    DatasetError : there is none; or it is of this data model and not as it was written, unless that is not to be ``proved``.
+    One of this data model is ``proved`` against its seal.
     """
     if not directory.exists():
         raise UsageError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
@@ -271,21 +260,27 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     if not (directory / CARD).is_file():
         raise UsageError(f"{directory}: not a dataset: it has no {CARD}")
     with _convert_errors():
-        found = read_sealed(directory / CARD, ours=lambda found: proved and _is_current(found))
+        data = read_document(directory / CARD)
+    return parse_card(data, directory / CARD, proved=proved)
+
+
+def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> DatasetCard:
+    """Return the card in the bytes of a file; as `read_card`."""
+    with _convert_errors():
+        found = verify_document(data, where, ours=lambda found: proved and _is_current(found))
     if found.get("kind") != KIND:
-        raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
+        raise DatasetError(f"{where}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
     if not _is_current(found) or "verdict" not in found:  # before data model 3.0 its findings were sentences
         found.pop("findings", None)
     try:
-        return parse_typed(found, DatasetCard, directory / CARD)
+        return parse_typed(found, DatasetCard, where)
     except (StoreError, RecipeError) as error:
-        problems = (
-            error.problems if _is_current(found) else (_describe_outdated(directory, found.get("data_model_version")),)
-        )
+        directory, version = str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")
+        problems = error.problems if _is_current(found) else (_describe_outdated(directory, version),)
         raise DatasetError(*problems) from None
 
 
-def _describe_outdated(directory: Path, version: object) -> str:
+def _describe_outdated(directory: Path | str, version: object) -> str:
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
     return f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}"
 
@@ -298,10 +293,6 @@ def read_current_card(directory: Path) -> DatasetCard:
     """Return the card of a dataset of this data model, whose samples and descriptions of patches are as they were written.
 
     Patches carry checksums of their own, which are proved when they are read.
-
-    Raises
-    ------
-    DatasetError : there is none, it is of another data model, or not as it was written.
     """
     card = read_card(directory)
     if card.data_model_version not in READ_VERSIONS:
@@ -419,10 +410,6 @@ def open_patches(
 
     Where that is to be ``proved``, shards are held against the card: on this machine at once, in a bucket each before it is first read.
     A digest is found once and remembered, so that to open the dataset again costs a look at each file.
-
-    Raises
-    ------
-    DatasetError : they are gone, or not what the card says, as where a folder was copied in part over another build.
     """
     px, samples = card.patch_px, card.samples
     layers = sort_layers(read_layers(card.layers, card.classes, directory / CARD))
@@ -467,27 +454,6 @@ def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int,
     ]
     starts = np.concatenate([[0], np.cumsum([rows for *_, rows in groups])]).astype(np.int64)
     return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
-
-
-def has_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
-    """Tell whether the ids beside the patches of a Zarr dataset are these; `StoreError` if they cannot be read.
-
-    They are compared as Zarr encodes them (vlen-utf8: a count, and each text after its length), so that no more is decoded than that.
-    """
-    place = directory / PATCHES / "sample_id"
-    for number, first in enumerate(range(0, len(ids), SHARD_ROWS)):
-        here = list(ids[first : first + SHARD_ROWS])
-        texts = [name.encode() for name in here + [""] * (SHARD_ROWS - len(here))]
-        wanted = SHARD_ROWS.to_bytes(4, "little") + b"".join(len(text).to_bytes(4, "little") + text for text in texts)
-        path = place / "c" / str(number)
-        try:
-            if decode_chunk(place, path.read_bytes(), len(wanted)) != wanted:
-                return False
-        except FileNotFoundError:
-            raise StoreError(f"{path}: is missing") from None
-        except (OSError, ValueError, RuntimeError) as error:
-            raise StoreError(f"{path}: does not contain the ids of the samples ({error})") from None
-    return True
 
 
 def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDArray[np.int64]:

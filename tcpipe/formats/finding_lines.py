@@ -153,22 +153,15 @@ def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
     ordered = sort_findings(findings)
     found = [of for of in ordered if of.severity != "note"]
-    return _format_lines(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
+    return list_findings(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
 
 
 def list_findings(findings: Iterable[Finding]) -> list[str]:
-    """Return every finding as a line, the worst first, notes too."""
-    return _format_lines(sort_findings(findings))
-
-
-def _format_lines(findings: Iterable[Finding]) -> list[str]:
-    """Return each finding as a line, with the recipe that fits in no line below it."""
+    """Return every finding as a line, the worst first, notes too, with the recipe that fits in no line below it."""
     lines = []
-    for finding in findings:
-        lines += [
-            f"{finding.severity}: {format_finding(finding)}",
-            *(f"    {line}" for line in format_remedy_blocks([finding])),
-        ]
+    for finding in sort_findings(findings):
+        lines += [f"{finding.severity}: {format_finding(finding)}"]
+        lines += [f"    {line}" for line in format_remedy_blocks([finding])]
     return lines
 
 
@@ -294,18 +287,15 @@ def format_mixed_groups(
     groups: Sequence[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
 ) -> list[str]:
     """Return the same of groups of different things, each with the arguments of `format_group`."""
-    found = sorted((of for of in groups if of[0].severity != "note"), key=lambda of: rank_severity(of[0].severity))
-    return _group_lines(found[:most]) + _count_rest(len(found) - most, len(groups) - len(found), more)
+    found = [of for of in groups if of[0].severity != "note"]
+    ordered = sorted(found, key=lambda of: rank_severity(of[0].severity))[:most]
+    return list_mixed_groups(ordered) + _count_rest(len(found) - most, len(groups) - len(found), more)
 
 
 def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
     """Return every group as a line, the worst first, notes too."""
-    return _group_lines(sorted(groups, key=lambda of: rank_severity(of[0].severity)))
-
-
-def _group_lines(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
     lines = []
-    for group, total, what in groups:
+    for group, total, what in sorted(groups, key=lambda of: rank_severity(of[0].severity)):
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines

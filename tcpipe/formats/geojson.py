@@ -11,6 +11,7 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely import GeometryType
 from shapely.geometry.base import BaseGeometry
 from shapely.validation import explain_validity
 
@@ -30,9 +31,6 @@ MAX_BYTES = 50_000_000
 MAX_VALUES = 1_500_000
 """Lists and objects of a file, nearly all of them positions."""
 
-_MAX_DEPTH = 8
-"""Collections in one another."""
-
 _SIMPLER = "; simplify it: ogr2ogr -simplify 0.000001 out.geojson in.geojson"
 _SHOWN_CHARACTERS = 200
 _SHOWN = 5
@@ -45,10 +43,7 @@ def read_regions(path: Path) -> Regions:
     Inside (``train_test``) is the union of the polygons, unless features carry the property ``split``: ``train_test``,
     ``unseen`` or ``exclude``. No other property is interpreted. ``exclude`` may lie over the other two and carves out of them.
 
-    Raises
-    ------
-    RegionError : not GeoJSON, no polygon, empty or self-crossing geometry, coordinates that are no lon/lat, an unknown ``split``,
-        train_test and unseen over the same ground, no train_test region: all problems at once.
+    One `RegionError` lists all problems.
     """
     polygons: dict[str, list[BaseGeometry]] = {kind: [] for kind in KINDS}
     features, problems = read_polygons(path)
@@ -107,12 +102,7 @@ class FeatureCollection:
 
 
 def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
-    """Read the polygon features of a file in their order, and one line for every unsound geometry.
-
-    Raises
-    ------
-    RegionError : not GeoJSON, or in another CRS.
-    """
+    """Read the polygon features of a file in their order, and one line for every unsound geometry."""
     features: list[PolygonFeature] = []
     problems: list[str] = []
     for where, properties, geometry in _iterate_features(path):
@@ -179,60 +169,39 @@ def _iterate_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Jso
         yield where, properties if isinstance(properties, dict) else {}, feature.get("geometry")
 
 
-def _iterate_polygons(where: str, geometry: Json, problems: list[str], *, depth: int = 0) -> Iterator[BaseGeometry]:
+def _iterate_polygons(where: str, geometry: Json, problems: list[str]) -> Iterator[BaseGeometry]:
     """Yield the sound polygons of one geometry object; add a line to ``problems`` for every unsound one."""
-    told = geometry if isinstance(geometry, dict) else {}
-    name = told.get("type")
-    if geometry is None or (told == geometry and not told.get("coordinates", told.get("geometries"))):
-        problems.append(f"{where}: its geometry is empty; draw it or remove the feature")
-    elif name == "GeometryCollection":
-        parts = told.get("geometries")
-        if depth == _MAX_DEPTH or not isinstance(parts, list):
-            problems.append(
-                f"{where}: a GeometryCollection without a list of geometries, or more than {_MAX_DEPTH} in one another"
-            )
-            return
-        for part in parts:
-            yield from _iterate_polygons(where, part, problems, depth=depth + 1)
-    elif name not in ("Polygon", "MultiPolygon"):
-        problems.append(f"{where}: geometry is {shorten_value(name)}, expected Polygon or MultiPolygon")
-    else:
-        coordinates = told.get("coordinates")
-        parts = coordinates if name == "MultiPolygon" else [coordinates]
-        for rings in parts if isinstance(parts, list) else [None]:
-            found = _read_polygon(rings)
-            if isinstance(found, str):
-                problems.append(f"{where}: {found}")
-            else:
-                yield found
-
-
-def _read_polygon(rings: Json) -> BaseGeometry | str:
-    """Return the polygon, or what is wrong with it."""
-    if not isinstance(rings, list) or not rings:
-        return "its geometry is empty; draw it or remove the feature"
     try:
-        lonlat = [np.array([position[:2] for position in ring], dtype=np.float64) for ring in rings]
-    except (TypeError, ValueError, KeyError, OverflowError):
-        return "its coordinates are not rings of [lon, lat] positions"
-    for ring in lonlat:
-        problem = _find_ring_problem(ring)
-        if problem:
-            return problem
-    polygon = shapely.Polygon(lonlat[0], lonlat[1:])
-    if not shapely.is_valid(polygon):
-        return f"not a sound polygon: {explain_validity(polygon)} (lon lat); redraw it without crossing itself"
-    return polygon
+        parts = _read_geometry(geometry)
+    except ValueError as error:
+        problems.append(f"{where}: {error}")
+        return
+    while (shapely.get_type_id(parts) >= GeometryType.MULTIPOLYGON).any():
+        parts = shapely.get_parts(parts)
+    for part in parts:
+        if part.geom_type != "Polygon":
+            problems.append(f"{where}: geometry is {part.geom_type!r}, expected Polygon or MultiPolygon")
+        elif problem := _find_lonlat_problem(shapely.get_coordinates(part)):
+            problems.append(f"{where}: {problem}")
+        elif not shapely.is_valid(part):
+            reason = explain_validity(part)
+            problems.append(f"{where}: not a sound polygon: {reason} (lon lat); redraw it without crossing itself")
+        else:
+            yield part
 
 
-def _find_ring_problem(lonlat: NDArray[np.float64]) -> str | None:
-    if lonlat.ndim != 2 or lonlat.shape[1:] != (2,) or not np.isfinite(lonlat).all():
-        return "its coordinates are not rings of finite [lon, lat] positions"
-    if problem := _find_lonlat_problem(lonlat):
-        return problem
-    if len(lonlat) < 4 or (lonlat[0] != lonlat[-1]).any():
-        return f"a ring of {len(lonlat)} positions is not closed; a ring has at least 4 and ends where it begins"
-    return None
+def _read_geometry(geometry: Json) -> NDArray[np.object_]:
+    """Return a geometry object in two dimensions, shape (1,); `ValueError` says what is wrong with it."""
+    try:
+        shape = None if geometry is None else shapely.from_geojson(json.dumps(geometry))
+    except shapely.GEOSException as error:
+        reason = str(error).partition(": ")[2].rpartition("] ")[2].rstrip("'")
+        raise ValueError(
+            f"its geometry cannot be read ({reason}); expected [lon, lat] positions, and closed rings"
+        ) from None
+    if shape is None or shape.is_empty:
+        raise ValueError("its geometry is empty; draw it or remove the feature")
+    return np.array([shapely.force_2d(shape)])
 
 
 def _find_disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
@@ -273,12 +242,7 @@ class LineFeature(Generic[P]):
 
 
 def read_line(path: Path) -> NDArray[np.float64]:
-    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2.
-
-    Raises
-    ------
-    PathError : not GeoJSON, in another CRS, no line or several, a line of one point, coordinates that are no lon/lat.
-    """
+    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2."""
     try:
         features = list(_iterate_features(path))
     except RegionError as error:
@@ -288,25 +252,15 @@ def read_line(path: Path) -> NDArray[np.float64]:
     if len(features) > 1:
         raise PathError(f"{path}: has {len(features)} features, expected one LineString; a path is one line")
     where, _, geometry = features[0]
-    name = geometry.get("type") if isinstance(geometry, dict) else None
-    coordinates = geometry.get("coordinates") if isinstance(geometry, dict) else None
-    if name == "MultiLineString" and isinstance(coordinates, list) and len(coordinates) == 1:
-        name, coordinates = "LineString", coordinates[0]
-    if name != "LineString":
-        raise PathError(f"{where}: geometry is {shorten_value(name)}, expected one LineString")
-    return _read_positions(where, coordinates)
-
-
-def _read_positions(where: str, coordinates: Json) -> NDArray[np.float64]:
-    if not isinstance(coordinates, list) or not coordinates:
-        raise PathError(f"{where}: its line has no points; expected at least two")
     try:
-        lonlat = np.array([position[:2] for position in coordinates], dtype=np.float64)
-    except (TypeError, ValueError, KeyError, OverflowError):
-        raise PathError(f"{where}: its coordinates are not [lon, lat] positions") from None
-    if lonlat.ndim != 2 or lonlat.shape[1] != 2 or not np.isfinite(lonlat).all():
-        raise PathError(f"{where}: its coordinates are not finite [lon, lat] positions")
-    if len(lonlat) < 2 or (lonlat == lonlat[0]).all():
+        (line, *more) = shapely.get_parts(_read_geometry(geometry))
+    except ValueError as error:
+        raise PathError(f"{where}: {error}") from None
+    if more or line.geom_type != "LineString":
+        name = "several lines or other parts" if more else repr(line.geom_type)
+        raise PathError(f"{where}: geometry is {name}, expected one LineString")
+    lonlat: NDArray[np.float64] = shapely.get_coordinates(line)
+    if (lonlat == lonlat[0]).all():
         raise PathError(f"{where}: its line is one point; expected a path from one point to another")
     check_lonlat(where, lonlat)
     return lonlat

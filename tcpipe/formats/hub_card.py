@@ -1,6 +1,6 @@
 """Descriptions of a dataset for hubs: README.md for the Hugging Face Hub, croissant.json (Croissant 1.1 metadata, MLCommons).
 
-By the README, ``datasets.load_dataset`` finds configurations, splits and columns. Its YAML head is
+By the README, ``datasets.load_dataset`` finds configurations and splits. Its YAML head is
 https://github.com/huggingface/hub-docs/blob/main/datasetcard.md?plain=1.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pyarrow as pa
@@ -26,44 +26,25 @@ _LICENCES = {
 }  # fmt: skip
 """Those of which the Hub knows the name; others are told by theirs."""
 _SIZES = {10**3: "n<1K", 10**4: "1K<n<10K", 10**5: "10K<n<100K", 10**6: "100K<n<1M", 10**7: "1M<n<10M"}
-_DTYPES = {"double": "float64", "float": "float32", "halffloat": "float16"}
 _SHOWN_LAYERS = 12
 
 
-def format_hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, picture: str) -> str:
-    """Return the document: a YAML head (as JSON, which is YAML) and what a reader wants to know.
-
-    Parameters
-    ----------
-    card : the dataset's, with the checksums of its files so far.
-    samples : schema of its table of samples.
-    samples_file, picture : where that table and an overview lie in the dataset.
-    """
+def format_hub_card(card: DatasetCard, *, samples_file: str, picture: str) -> str:
+    """Return the document: a YAML head (as JSON, which is YAML) and what a reader wants to know."""
     text = "\n".join(_iterate_lines(card, picture))
-    head = _make_head(card, samples, samples_file)
+    head = _make_head(card, samples_file)
     yaml = "".join(f"{key}: {json.dumps(value, ensure_ascii=True)}\n" for key, value in head.items())
     return f"---\n{yaml}---\n\n{text}\n"
 
 
-def _make_head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict[str, Json]:
-    columns = [_describe_feature(field.name, field.type) for field in samples]
-    table: Json = {"config_name": "samples", "data_files": [{"split": "full", "path": samples_file}]}
-    configs: list[Json] = [table]
-    infos: list[Json] = [
-        {"config_name": "samples", "features": columns, "splits": [_split(card, "full", card.samples, [samples_file])]}
-    ]
+def _make_head(card: DatasetCard, samples_file: str) -> dict[str, Json]:
+    configs: list[Json] = [{"config_name": "samples", "data_files": [{"split": "full", "path": samples_file}]}]
     if card.shards:
         files: dict[str, list[str]] = {}
         for shard in card.shards:
             files.setdefault(shard.split, []).append(shard.path)
         data: list[Json] = [{"split": split, "path": list(paths)} for split, paths in files.items()]
         configs.insert(0, {"config_name": "patches", "default": True, "data_files": data})
-        of_layers: list[Json] = [
-            {"name": name, "list": layer.stored.name, "length": math.prod(layer.patch_shape(card.patch_px))}
-            for name, layer in read_layers(card.layers, card.classes, Path()).items()
-        ]
-        splits: list[Json] = [_split(card, split, card.splits[split], paths) for split, paths in files.items()]
-        infos.insert(0, {"config_name": "patches", "features": [*columns, *of_layers], "splits": splits})
     known = card.licence.lower() if card.licence.lower() in _LICENCES else "other" if card.licence else "unknown"
     return {
         "pretty_name": card.name,
@@ -73,28 +54,7 @@ def _make_head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict
         "task_categories": ["tabular-regression", "robotics"],
         "tags": ["robotics", "terrain", "traversability", "energy", "geospatial", "tcpipe", "croissant"],
         "configs": configs,
-        "dataset_info": infos,
     }
-
-
-def _split(card: DatasetCard, name: str, samples: int, files: Sequence[str]) -> Json:
-    return {"name": name, "num_examples": samples, "num_bytes": sum(card.checksums[file].size_bytes for file in files)}
-
-
-def _describe_feature(name: str, dtype: pa.DataType) -> Json:
-    if pa.types.is_fixed_size_list(dtype):
-        return {"name": name, "list": _name_of(dtype.value_type), "length": dtype.list_size}
-    return (
-        {"name": name, "list": _name_of(dtype.value_type)}
-        if pa.types.is_list(dtype)
-        else {"name": name, "dtype": _name_of(dtype)}
-    )
-
-
-def _name_of(dtype: pa.DataType) -> str:
-    if pa.types.is_dictionary(dtype):
-        return _name_of(dtype.value_type)
-    return _DTYPES.get(str(dtype), str(dtype))
 
 
 def _escape_markdown(value: str) -> str:
@@ -177,7 +137,7 @@ def _format_bibtex(card: DatasetCard) -> Iterator[str]:
     yield f"  title = {{{braced(card.name)}}},"
     if card.creator:
         yield f"  author = {{{braced(card.creator)}}},"
-    yield f"  note = {{{card.samples} samples, version {card.data_model_version}.0+{card.inputs[:12]}}},"
+    yield f"  note = {{{card.samples} samples, version {_format_version(card)}}},"
     yield "}"
 
 
@@ -213,74 +173,44 @@ _ENCODING_BY_SUFFIX = {
 
 
 def format_croissant(
-    *,
-    name: str,
-    description: str,
-    licence: str,
-    creator: str,
-    attributions: Sequence[str],
-    files: Mapping[str, Checksum],
-    samples_file: str,
-    samples: pa.Schema,
-    version: str,
-    shards: str | None = None,
-    layers: Mapping[str, tuple[int, str]] | None = None,
+    card: DatasetCard, samples: pa.Schema, files: Mapping[str, Checksum], *, samples_file: str, shards: str
 ) -> str:
-    """Return the document as text.
+    """Return the document as JSON-LD.
 
-    Parameters
-    ----------
-    name, description, licence, creator : as the recipe says; an empty one is left out.
-    attributions : licences of others' data that it contains.
-    files : size [byte] and sha256 (hex) of every file by its path inside the dataset.
-    samples_file : which of them holds the samples.
-    samples : its Arrow schema; the fields' metadata give their meanings.
-    version : of the dataset.
-    shards, layers : pattern of the Parquet files that hold the patches, and of each layer how many values a patch has and of which kind
-        (numpy's letter); None where patches are no Parquet.
-
-    Returns
-    -------
-    JSON-LD.
+    ``samples`` is the schema of the table of samples, whose fields' metadata give their meanings; ``shards`` the pattern of Parquet files
+    that hold the patches, where they are Parquet.
     """
-    samples_source = {"fileObject": {"@id": samples_file}}
-    records = [
-        _describe_records("samples", "One record a sample, in the order of the patches.", samples, samples_source)
-    ]
+    source = {"fileObject": {"@id": samples_file}}
+    records = [_describe_records("samples", "One record a sample, in the order of the patches.", samples, source)]
     sets = []
-    if shards is not None and layers is not None:
-        sets.append(
-            {
-                "@type": "cr:FileSet",
-                "@id": "shards",
-                "name": "shards",
-                "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"],
-                "includes": shards,
-            }
-        )
-        columns = pa.schema(
-            [
-                samples.field("sample_id"),
-                samples.field("split"),
-                *(_patch_field(layer, *values) for layer, values in layers.items()),
-            ]
-        )
+    if card.shards:
+        kind = {"name": "shards", "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"], "includes": shards}
+        sets.append({"@type": "cr:FileSet", "@id": "shards", **kind})
+        layers = read_layers(card.layers, card.classes, Path())
+        patches = [
+            _patch_field(of.name, math.prod(of.patch_shape(card.patch_px)), of.stored.kind) for of in layers.values()
+        ]
+        columns = pa.schema([samples.field("sample_id"), samples.field("split"), *patches])
         about = "One record a sample with its patch, split by split: rows of the patch one after another."
         records.append(_describe_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))
     document = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.1",
-        "name": name,
-        "description": description,
-        "license": licence,
-        "creator": {"@type": "sc:Person", "name": creator} if creator else None,
-        "creditText": "; ".join(attributions),
-        "version": version,
+        "name": card.name,
+        "description": card.description,
+        "license": card.licence,
+        "creator": {"@type": "sc:Person", "name": card.creator} if card.creator else None,
+        "creditText": "; ".join(card.attributions),
+        "version": _format_version(card),
         "distribution": [*(_describe_file_object(path, files[path]) for path in sorted(files)), *sets],
         "recordSet": records,
     }
     return to_json({key: value for key, value in document.items() if value})
+
+
+def _format_version(card: DatasetCard) -> str:
+    return f"{card.data_model_version}.0+{card.inputs[:12]}"
 
 
 def _describe_file_object(path: str, file: Checksum) -> Json:

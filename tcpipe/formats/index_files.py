@@ -160,13 +160,7 @@ _CELLS: Mapping[str, Callable[[RunFacts], object]] = {
 def write_index(
     place: Place, rows: Rows, digest: str, *, before: Rows | None = None, digest_before: str | None = None
 ) -> None:
-    """Write ``runs.parquet``; where that cannot be, the next commit writes it.
-
-    Parameters
-    ----------
-    rows, digest : the rows of a state of the log, by run and recipe, and its digest.
-    before, digest_before : the same of an earlier state: of its table only the rows that have changed are made anew.
-    """
+    """Write ``runs.parquet``; where that cannot be, the next commit writes it."""
     before = before or {}
     table = None if digest_before is None else _read_index(place, digest_before)
     changed = [key for key, row in rows.items() if table is None or before.get(key) is not row]

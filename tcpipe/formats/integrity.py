@@ -1,15 +1,14 @@
 """Seals: what lets `tcpipe verify` find one changed byte in files that no list of checksums can name (ADR-28).
 
-A JSON document holds the sha256 of the rest of itself, a page that of all before its last line; a PNG brings its own checksums. What
-a sealed document lists, by path, size and sha256, is proved by it in turn.
+A JSON document holds the sha256 of the rest of itself, a page that of all before its last line. What a sealed
+document lists, by path, size and sha256, is proved by it in turn.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -22,9 +21,6 @@ T = TypeVar("T")
 SEAL = "document_sha256"
 """Key of a sealed document that holds the sha256 (hex) of its canonical JSON without this key."""
 
-MOST_PAGE_BYTES = 256 << 20
-"""A sealed page or picture is at most so large [byte]."""
-
 CHECKSUMS = "checksums.json"
 """In a directory whose files cannot be listed elsewhere: a sealed document with the key ``checksums``."""
 
@@ -35,7 +31,6 @@ ALL_CHANGES = "; 'tcpipe verify {}' lists all changed files"
 """What a line about one of them ends with."""
 
 _PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +62,7 @@ def seal_document(value: object) -> dict[str, Json]:
 def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True) -> dict[str, Json]:
     """Read a JSON object that `write_sealed` wrote, and prove it.
 
-    Parameters
-    ----------
-    path : the document.
-    ours : tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
-        refuse.
-
-    Raises
-    ------
-    StoreError : it cannot be read, or is not as it was written.
+    What is not ``ours``, by kind and version, is returned unproved, for the caller to refuse.
     """
     return verify_document(read_document(path), path, ours=ours)
 
@@ -118,22 +105,12 @@ def describe_broken(path: Path | str) -> str:
     return f"{path}: has changed since it was written: its checksum differs"
 
 
-def find_broken_seal(path: Path) -> str | None:
-    """Return in one line why a sealed file (``.json``, ``.html``) or a ``.png`` is not as it was written, None if it is."""
-    try:
-        if path.stat().st_size > MOST_PAGE_BYTES:
-            return f"{path}: is larger than {MOST_PAGE_BYTES >> 20} MB, which no page or picture is"
-        return find_broken_seal_in(path.read_bytes(), path)
-    except OSError as error:
-        return f"{path}: cannot be read ({error.strerror})"
-
-
-def find_broken_seal_in(data: bytes | None, where: Path | str) -> str | None:
-    """Return the same of the bytes of a file that lies at ``where``; None: it is not there."""
+def find_broken_seal(data: bytes | None, where: Path | str) -> str | None:
+    """Return in one line why a sealed file (``.json``, ``.html``) at ``where`` is not as it was written; None if it is."""
     if data is None:
         return f"{where}: is missing"
-    whole = {".html": _is_whole_page, ".png": _is_whole_png}.get(Path(where).suffix, _is_whole_document)
-    return None if whole(data) else describe_broken(where)
+    is_whole = _is_whole_page(data) if Path(where).suffix == ".html" else _is_whole_document(data)
+    return None if is_whole else describe_broken(where)
 
 
 def find_wrong_checksum(where: Path | str, found: Checksum | None, wanted: Checksum | None) -> str | None:
@@ -160,21 +137,6 @@ def compute_checksums(directory: Path) -> dict[str, Checksum]:
     return {path.relative_to(directory).as_posix(): compute_checksum(path) for path in files}
 
 
-def read_seal(directory: Path) -> str:
-    """Return what tells the content of a directory with a ``checksums.json`` from any other; `StoreError` if that cannot be read."""
-    return str(read_sealed(directory / CHECKSUMS).get(SEAL))
-
-
-def read_picture_text(path: Path, key: str) -> str | None:
-    """Return a text that a PNG carries under a key (RFC 2083, section 4.2.3), None if it has none."""
-    try:
-        chunks = list(_iterate_png_chunks(path.read_bytes()))
-    except OSError:
-        return None
-    texts = (data.partition(b"\0") for kind, data, _ in chunks if kind == b"tEXt")
-    return next((text.decode("latin-1") for name, _, text in texts if name == key.encode("latin-1")), None)
-
-
 def _is_whole_document(data: bytes) -> bool:
     seal = _SEAL_LINE.search(data)
     if seal is None:
@@ -190,22 +152,3 @@ def _is_whole_document(data: bytes) -> bool:
 def _is_whole_page(data: bytes) -> bool:
     end = data.rstrip(b"\n").rfind(b"\n") + 1
     return data[end:] == _PAGE_SEAL.format(hashlib.sha256(data[:end]).hexdigest()).encode()
-
-
-def _is_whole_png(data: bytes) -> bool:
-    """Tell whether every chunk is as its CRC says, and the last is IEND."""
-    kind, end = b"", 0
-    for kind, content, end in _iterate_png_chunks(data):
-        if zlib.crc32(kind + content) != int.from_bytes(data[end - 4 : end], "big"):
-            return False
-    return kind == b"IEND" and end == len(data)
-
-
-def _iterate_png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes, int]]:
-    """Yield type, data and end of every chunk of a PNG (RFC 2083, section 3.2: length, type, data, CRC of type and data)."""
-    at, kind = len(_PNG_START), b""
-    while data.startswith(_PNG_START) and kind != b"IEND" and at + 12 <= len(data):
-        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
-        kind = data[at + 4 : at + 8]
-        yield kind, data[at + 8 : end - 4], end
-        at = end

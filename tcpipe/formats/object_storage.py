@@ -109,12 +109,7 @@ class StoredObject:
     tag: str | None
 
     def ranges(self, spans: Sequence[tuple[int, int]]) -> list[memoryview]:
-        """Return what lies from each start to its stop, some at once.
-
-        Raises
-        ------
-        LogError : it cannot be had, also after some attempts, or the object is another than it was.
-        """
+        """Return what lies from each start to its stop, some at once."""
         return run_side_by_side(self._range, spans)
 
     def copy(self, to: Path) -> None:
@@ -171,9 +166,7 @@ def is_bucket(text: str | Path) -> bool:
 def split_url(url: str, *, one_object: bool = False) -> tuple[str, str]:
     """Return a URL as it is shown and stored, and its query: only the server of a presigned URL gets that.
 
-    Raises
-    ------
-    UsageError : it holds a user name or password, or a query that is not one of an ``http(s)://`` URL of ``one_object``.
+    A user name or password, and the query of anything but one ``http(s)`` object, is a `UsageError`.
     """
     scheme, slashes, rest = url.partition("://")
     shown, query = split_secrets(scheme, rest)
@@ -211,15 +204,9 @@ def lay_out_objects(
 
     Yields where it lies, and by path the objects for which there are stand-ins of their size that hold nothing; others are copied.
 
-    Parameters
-    ----------
-    url : an object (``s3://bucket/drives/run.mcap``), or a prefix (``s3://bucket/drives/bag_directory``).
-    wanted : whether an object of this name is laid out where a prefix was given.
-    by_range : endings of the names of what is not copied.
+    Objects whose names end as in ``by_range`` get stand-ins of their size that hold nothing; all others that are ``wanted`` are copied.
 
-    Raises
-    ------
-    LogError : there is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the path.
+    What goes wrong inside the block is told with the URL instead of the path.
     """
     shown, query = split_url(url, one_object=True)
     with make_scratch_directory() as directory:
@@ -235,12 +222,7 @@ def lay_out_objects(
 
 
 def make_stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
-    """Lay out what lies at or below a URL as files of the right names, sizes and times that hold nothing and take no room.
-
-    Raises
-    ------
-    LogError : there is no such object, or the store cannot be read.
-    """
+    """Lay out what lies at or below a URL as files of the right names, sizes and times that hold nothing and take no room."""
     shown, query = split_url(url, one_object=True)
     _lay_out_stand_ins(shown, query, directory, wanted)
     return _place_of(shown, directory)

@@ -267,9 +267,7 @@ def read_row_count(path: Path) -> int:
 def read_range(path: Path, column: str) -> tuple[int, int]:
     """Return the lowest and the highest value of a column of whole numbers, from the statistics in the footer.
 
-    Raises
-    ------
-    StoreError : the file cannot be read, or has no such statistics.
+    `StoreError` where the file has none.
     """
     with _convert_damage(path):
         about = pq.read_metadata(path)
@@ -295,12 +293,7 @@ def add_geo_metadata(
 ) -> pa.Table:
     """Return a table whose metadata says what its column ``geometry`` holds.
 
-    Parameters
-    ----------
-    table : with the column.
-    kind : of all its geometries.
-    points_deg : longitude and latitude of all their points, shape (N, 2), NaN where not known.
-    crs : geographic CRS of the coordinates, of which longitude is the first whatever the CRS says.
+    ``points_deg`` are longitude and latitude of all points, shape (N, 2), NaN where not known; longitude is first whatever ``crs`` says.
     """
     known = points_deg[np.isfinite(points_deg).all(axis=1)]
     column: dict[str, Any] = {"encoding": "WKB", "geometry_types": [kind]}

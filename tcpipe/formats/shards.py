@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import google_crc32c
 import numcodecs
@@ -31,6 +31,9 @@ from numpy.typing import NDArray
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import parse_typed, read_json
 
+if TYPE_CHECKING:
+    from tcpipe.formats.bucket_directories import FetchedShards
+
 DESCRIPTION = "zarr.json"
 """What an array or a group is, in its directory."""
 
@@ -39,19 +42,6 @@ _ABSENT = 2**64 - 1
 """Offset of a chunk that is all fill value."""
 
 _BLOSC_SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
-
-
-class ShardFetcher(Protocol):
-    """Shards that lie elsewhere, by the path that they would have here."""
-
-    def size(self, path: Path) -> int:
-        """Return the size of a shard [byte]; `FileNotFoundError` where there is none."""
-
-    def read(self, path: Path, offset: int, size: int) -> bytes:
-        """Return a piece of a shard that ends with its checksum."""
-
-    def prefetch(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
-        """Have pieces (shard, offset, size) brought here, which are read soon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +58,7 @@ class ShardedArray:
     """A shard without a file is all fill value, as in Zarr; otherwise it is damage."""
     codec: Any
     """What encodes and decodes a chunk, beneath its checksum."""
-    fetched: ShardFetcher | None = None
+    fetched: FetchedShards | None = None
     """Where the shards are; None: on this machine."""
     _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
 
@@ -225,7 +215,7 @@ def open_sharded(
     dtype: np.dtype[Any],
     fill: float,
     sparse: bool = False,
-    fetched: ShardFetcher | None = None,
+    fetched: FetchedShards | None = None,
 ) -> ShardedArray:
     """Return the array in ``path``, once its description, ``zarr.json``, says that it has the form that is wanted.
 
@@ -262,26 +252,6 @@ def open_sharded(
             raise StoreError(f"{where}: {key} is {reprlib.repr(described.get(key))}, expected {value}")
     codec = _make_codec(compression, where)
     return ShardedArray(path, shape, chunk_shape, shard_shape, dtype, fill, sparse, codec, fetched)
-
-
-def decode_chunk(path: Path, data: bytes, size: int) -> bytes:
-    """Return the bytes of a chunk that is a file of its own, which its array's description in ``path`` says how to decode.
-
-    Parameters
-    ----------
-    path : directory of the array.
-    data : the file's bytes, the last of which are its checksum.
-    size : how many bytes the chunk holds; no more are made.
-
-    Raises
-    ------
-    StoreError : the description names no compression that is known.
-    ValueError : the chunk is damaged, or holds more or fewer bytes.
-    """
-    codec = _make_codec(_find_compression(read_json(path / DESCRIPTION)), path / DESCRIPTION)
-    out = np.empty(size, np.uint8)
-    _decode(codec, _read_checked(lambda _, __: data, len(data), 0), out)
-    return out.tobytes()
 
 
 def _find_compression(described: Mapping[str, Any]) -> Any:

@@ -142,10 +142,7 @@ class Ingestions:
 def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunFacts, Lost | None, FilesState]]:
     """Yield each row with the first of its files that is gone or has another size, and with the state of its files.
 
-    Parameters
-    ----------
-    place : ``runs/``. On disk each file is looked at; in a bucket there is one request for every thousand objects below it.
-    rows : ingestions as the log has them.
+    ``place`` is ``runs/``. On disk each file is looked at; in a bucket there is one request for every thousand objects below it.
     """
     rows = list(rows)
     find = make_file_finder(place, rows)
@@ -260,10 +257,7 @@ def lend_streams(place: Place, streams: Streams, stored: Mapping[str, Checksum])
 
     In a bucket they are held: each time they would be fetched.
 
-    Parameters
-    ----------
-    place : of the run.
-    stored : the files of L1 in it.
+    ``stored`` has the files of L1 in the ``place`` of the run.
     """
     if place.path is None:
         return streams

@@ -28,9 +28,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
 def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     """Return what `write_arrays` wrote; no array is read before every header agrees with the file's size.
 
-    Raises
-    ------
-    ModelError : the file is cut short, damaged, or none of its kind.
+    `ModelError` where it is damaged or none of its kind.
     """
     if path.is_file() and not zipfile.is_zipfile(path):
         raise ModelError(f"{path}: cut short or damaged (no end of an archive in it)")

@@ -46,15 +46,7 @@ def add_array(
 ) -> zarr.Array[Any]:
     """Add an empty array to a group.
 
-    Parameters
-    ----------
-    group, name : where it goes.
-    shape, dtype : its extent and type.
-    chunks, shards : elements per chunk, and per shard (a multiple of the chunks; None: one file a chunk).
-    dimensions : a name for each dimension, as xarray wants.
-    fill_value : what unwritten elements read as.
-    attributes : CF and other attributes.
-    compression, level : what its chunks are encoded with.
+    ``chunks`` and ``shards`` are elements per chunk and per shard (a multiple of the chunks; None: one file a chunk).
     """
     width = np.dtype(dtype).itemsize
     shuffle: Literal["bitshuffle", "noshuffle"] = "bitshuffle" if width > 1 else "noshuffle"

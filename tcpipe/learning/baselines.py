@@ -11,18 +11,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Residuals
+from tcpipe.cost.prediction_errors import Residuals, make_residuals
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import available_features, read_extra_features
 from tcpipe.errors import DatasetError, ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult
-from tcpipe.learning.fitting import FitConfig, ModelKind, Task
+from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.metrics import (
     ALL,
     FEWEST_GROUPS,
     LEAST,
-    Array,
     Errors,
     Spread,
     compare_errors,
@@ -31,8 +30,8 @@ from tcpipe.learning.metrics import (
 )
 from tcpipe.learning.models import Model
 from tcpipe.learning.physics_model import Form
-from tcpipe.learning.predictions import Measured, Predicted, make_residuals, predict_costs, predict_spreads
-from tcpipe.learning.predictor import AUTOMATIC, Job, Predictor, Samples, find_kind, predict_samples
+from tcpipe.learning.predictions import Measured, Predicted, predict_costs, predict_spreads
+from tcpipe.learning.predictor import AUTOMATIC, Job, Prediction, Predictor, Samples, find_kind, predict_samples
 from tcpipe.learning.training import Variant, make_samples
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -72,7 +71,7 @@ def compare_baselines(
         class_ids = read_extra_features(part.split).class_id
         for name, (samples, predictor, residuals) in fitted.items():
             there = replace(samples, split=part.split.with_channels(*samples.inputs.channels))
-            theirs = Predicted.centre(residuals, predict_samples(predictor, there), class_ids, ours.chord_m)
+            theirs = Predicted.centre(residuals, predict_samples(predictor, there), class_ids, ours.card.chord_m)
             found += compare_with_baseline(name, split, part, said[split], theirs, block_m=block_m, seed=seed)
     return found, lacking
 
@@ -94,25 +93,26 @@ def _fit_baselines(
     for kind, name in ((kind, name) for kind, name in BASELINE_OF_KIND.items() if name in wanted):
         try:
             samples, predictor, said = _fit_baseline(find_kind(kind), train, data)
-            found[name] = samples, predictor, make_residuals(train, said)
+            columns = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class", "fold")}
+            found[name] = samples, predictor, columns | make_residuals(samples.labels, said.mean, said.covariance)
         except ModelError as error:
             names = {"error": error.problems[0]}
             lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
     return found, lacking
 
 
-def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[Samples, Predictor, Array]:
+def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[Samples, Predictor, Prediction]:
     """Return a fitted kind, and what the other folds say of each sample; NaN where these are too few, which centres nothing."""
     turn = tuple(of.name for of in available_features(read_extra_features(train)) if of.name == "turn_radpm")
     if kind.features is None:  # trees take the turn, but not the commanded speed
         kind = type(kind.__name__, (kind,), {"features": turn})
     split = train.with_channels(*kind.channels) if kind.channels else train
-    samples = make_samples(Task(split, split, split, split.label_columns), FitConfig(), data, kind)
+    samples = make_samples(data, FitConfig(), Variant(), kind, split)
     try:
-        fitted = kind.fit_folds(samples, Job("", "", Path()))
+        fitted = kind.fit_folds(samples, Job("", Path()))
     except ModelError:
-        return samples, kind.fit(samples), np.full(samples.labels.shape, np.nan)
-    return samples, fitted.predictor, fitted.held_out.astype(np.float64)
+        return samples, kind.fit(samples), Prediction.without_covariance(np.full(samples.labels.shape, np.nan))
+    return samples, fitted.predictor, fitted.held_out
 
 
 def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
@@ -219,16 +219,16 @@ def make_energy_table(
         if "height" in data.card.layers:
             of_height = Variant(channels=("height",), energy_only=True)
             networks[PER_CLASS] = _train_by_class(ours, trained, "wei_isler_class", of_height)
-            grass = {entry.id for entry in ours.classes.classes if entry.name == "grass"} & networks[PER_CLASS].keys()
+            grass = {entry.id for entry in ours.card.class_table.classes if entry.name == "grass"} & networks[
+                PER_CLASS
+            ].keys()
             networks[GRASS_ONLY] = {class_id: networks[PER_CLASS][class_id] for class_id in grass}
     known = set.intersection(*(set(of) for name, of in networks.items() if name != GRASS_ONLY)) if networks else set()
     errors, results = dict[str, dict[str, Errors]](), list[BaselineResult]()
     for split, part in sets.items():
         rows = np.flatnonzero(np.isin(part.class_ids, list(known)) | (not known))
         same, mine = part.take(rows), said[split].take(rows)
-        errors.setdefault(OURS, {})[split] = _compute_error(
-            mine, same, predict_spreads(ours, mine.costs, same.class_ids)
-        )
+        errors.setdefault(OURS, {})[split] = _compute_error(mine, same, predict_spreads(ours, mine, same.class_ids))
         for name, by_class in networks.items():
             if not by_class or not known or not len(rows):
                 continue
@@ -258,7 +258,7 @@ def _predict_by_class(networks: Mapping[int, Model], found: Measured, *, of_all:
         if len(here):
             said = predict_costs(network, found.split.take(here))
             costs[here], uncentred[here] = said.costs["E"], said.uncentred["E"]
-    return Predicted({"E": costs}, {"E": uncentred})
+    return Predicted({"E": costs}, {"E": uncentred}, {"E": np.zeros(len(costs))})
 
 
 def _compute_error(said: Predicted, found: Measured, spreads: Mapping[str, Spread] | None = None) -> Errors:

@@ -41,12 +41,13 @@ from tcpipe.learning.evaluation_facts import (
 )
 from tcpipe.learning.metrics import (
     ALL,
+    LEAST,
     Array,
-    Costs,
     Errors,
     Spread,
     average_draws,
     compute_costs,
+    compute_errors,
     compute_errors_by_class,
     label_floor,
 )
@@ -60,8 +61,8 @@ from tcpipe.learning.predictions import (
     predict_costs,
     predict_spreads,
 )
-from tcpipe.learning.predictor import find_kind
-from tcpipe.learning.training import Variant, compute_dataset_checksum, make_training_task, train
+from tcpipe.learning.predictor import Prediction, find_kind
+from tcpipe.learning.training import Variant, compute_dataset_checksum, select_train, train
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding, read_threshold
@@ -110,29 +111,29 @@ def evaluate(
     ModelError, DatasetError : the model is none or does not fit the dataset, or there is nothing to evaluate on.
     """
     ours = load_model(model, predictor)
-    data = open_dataset(dataset, label=ours.label_energy)
+    data = open_dataset(dataset, label=ours.card.label_energy)
     check_fit(ours.card, data, str(model))
     training = ours.card.training
     fitting, fitted = replace(training.config, model=training.kind), training.samples["fitted"]
-    names = {entry.id: entry.name for entry in ours.classes.classes}
+    names = {entry.id: entry.name for entry in ours.card.class_table.classes}
     sets = {name: found for name in SPLITS if len((found := collect_measured(data[name], names)).split)}
     if not sets:
         raise DatasetError(
             f"{data.path}: no labelled samples in test nor unseen: nothing to evaluate on; build it with a --split"
         )
     said = {name: predict_costs(ours, found.split) for name, found in sets.items()}
-    spreads = {name: predict_spreads(ours, said[name].costs, found.class_ids) for name, found in sets.items()}
+    spreads = {name: predict_spreads(ours, said[name], found.class_ids) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
 
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
-        few = len(make_training_task(data, fitting.fold, variant).fit)
+        few = int((select_train(data, variant).column("fold") != fitting.fold).sum())
         longer = np.ceil(fitted / fitting.batch_size) / np.ceil(
             few / fitting.batch_size
         )  # as many steps, not as many epochs
         rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
-        train(dataset, place, config=rules, variant=variant, disposable=True, predictor=predictor)
+        train(dataset, place, config=rules, variant=variant, predictor=predictor)
         return load_model(place, predictor)
 
     ablation = list(_iterate_ablation(ours, sets, config, trained))
@@ -149,10 +150,10 @@ def evaluate(
         ablation=tuple(ablation),
         energy=energy,
         networks=tuple(networks),
-        time=_time(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.robot, data)),
+        time=_time(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
         baselines=tuple(baselines),
         blocks=compute_block_errors(ours, names),
-        repeatability=_estimate_repeatability(data.card, ENERGIES[ours.label_energy]),
+        repeatability=_estimate_repeatability(data.card, ENERGIES[ours.card.label_energy]),
     )
     findings = (*lacking, *_find_mismatches(ours, data, sets, energy), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
@@ -196,13 +197,13 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: 
     """Yield table III, row by row: the trained network with layers replaced by noise, and networks that never had them."""
     for number, letters in enumerate(_list_input_sets(ours)):
         left = tuple(LETTERS[letter] for letter in letters)
-        noise = [channel for channel in ours.channels if channel not in left]
+        noise = [channel for channel in ours.card.inputs.channels if channel not in left]
         logger.info("ablation: {%s}", ",".join(letters))
         by_split = {}
         for at, (name, found) in enumerate(sets.items()):
             draws = [
                 _compute_errors(
-                    predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)).costs,
+                    predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)),
                     found,
                     ours,
                 )
@@ -213,23 +214,22 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: 
         if config.retrain_ablation and noise:
             anew = trained("ablation_" + "".join(letters), Variant(channels=left))
             by_split = {
-                name: _compute_errors(predict_costs(anew, found.split).costs, found, anew)
-                for name, found in sets.items()
+                name: _compute_errors(predict_costs(anew, found.split), found, anew) for name, found in sets.items()
             }
             yield AblationRow(letters, "retrained", **by_split)
 
 
 def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:
     """Return the paper's input sets, as far as the model has their layers."""
-    has = {letter for letter, layer in LETTERS.items() if layer in ours.channels}
+    has = {letter for letter, layer in LETTERS.items() if layer in ours.card.inputs.channels}
     found = [tuple(letter for letter in letters if letter in has) for letters in INPUT_SETS]
     return list(dict.fromkeys(letters for letters in found if letters))
 
 
-def _compute_errors(said: Costs, found: Measured, by: Model | None = None) -> dict[str, Errors]:
-    """Return the errors of all classes, and how well a model told them; ``by`` None tells none."""
-    spreads = None if by is None else predict_spreads(by, said, found.class_ids)
-    by_class = compute_errors_by_class(said, found.costs, found.class_ids, found.names, spreads)
+def _compute_errors(said: Predicted, found: Measured, by: Model) -> dict[str, Errors]:
+    """Return the errors of all classes, and how well a model told them."""
+    spreads = predict_spreads(by, said, found.class_ids)
+    by_class = compute_errors_by_class(said.costs, found.costs, found.class_ids, found.names, spreads)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
 
 
@@ -241,12 +241,14 @@ def _find_fastest_mps(robot: str, data: Dataset) -> float | None:
 
 def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's maximum speed."""
-    found = {OURS: {name: _compute_errors(said[name].costs, part, ours)["T"] for name, part in sets.items()}}
+    found = {OURS: {name: _compute_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:
-        expected = {
-            name: {"T": np.full(len(part.split), ours.chord_m / max_velocity_mps)} for name, part in sets.items()
+        found[EXPECTED] = {
+            name: compute_errors(
+                np.full(len(part.split), ours.card.chord_m / max_velocity_mps), part.costs["T"], LEAST["T"]
+            )
+            for name, part in sets.items()
         }
-        found[EXPECTED] = {name: _compute_errors(expected[name], part)["T"] for name, part in sets.items()}
     return found
 
 
@@ -260,7 +262,7 @@ def _find_mismatches(
     for name, found in sets.items():
         subject, total = Subject("split", name), len(data[name])
         for class_id, called in found.names.items():
-            if class_id not in {NODATA_ID, *ours.class_counts}:
+            if class_id not in {NODATA_ID, *ours.card.training_range.class_counts}:
                 count = int((found.class_ids == class_id).sum())
                 unseen = Subject("class", called)
                 yield make_finding("class-not-in-training", unseen, names={"split": name}, sample_count=count)
@@ -295,15 +297,17 @@ def compute_block_errors(model: Model, names: Mapping[int, str]) -> ErrorsByClas
     found: Mapping[str, NDArray[np.generic]] = model.residuals
     if "power_predicted_watt" not in found or not len(found["power_predicted_watt"]):
         return None
-    power, velocity, said_power, said_velocity = (
+    power, velocity, *said = (
         found[name].astype(np.float64)
         for name in ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
     )
     class_ids = np.nan_to_num(found["terrain_class"].astype(np.float64)).astype(np.int64)
-    centred = Predicted.centre(model.residuals, np.column_stack([said_power, said_velocity]), class_ids, model.chord_m)
+    centred = Predicted.centre(
+        model.residuals, Prediction.without_covariance(np.column_stack(said)), class_ids, model.card.chord_m
+    )
     known = {**_UNKNOWN, **names}
     own = {number: known.get(number, str(number)) for number in np.unique(class_ids).tolist()}
-    return compute_errors_by_class(centred.costs, compute_costs(power, velocity, model.chord_m), class_ids, own)
+    return compute_errors_by_class(centred.costs, compute_costs(power, velocity, model.card.chord_m), class_ids, own)
 
 
 _QUANTITIES = {"energy": "E", "time": "T"}

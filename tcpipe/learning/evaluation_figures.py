@@ -139,7 +139,7 @@ def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any
         alt=f"{up.capitalize()} over {across}, a point a sample; the tables below list the figures by class.",
         axes=("slope along travel [°]", "predicted less measured") if across == "slope" else (across, up),
         height_px=380,
-        tools="tap,box_select,pan,wheel_zoom,box_zoom,reset,save",
+        tools="box_select,pan,wheel_zoom,box_zoom,reset,save",
         drag="box_select",
         tooltips=[
             ("measured", "@measured{0.00}"),

@@ -10,7 +10,6 @@ import numpy as np
 
 from tcpipe import __version__
 from tcpipe.cost.adaptation import AdaptedErrors, Run, compare_adaptations, format_adaptations
-from tcpipe.cost.prediction_errors import fit_errors
 from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError, clean_lines
@@ -207,8 +206,8 @@ def evaluate_adaptation(
     if not known_m or not all(0.0 <= metres < np.inf for metres in known_m):
         raise UsageError(f"adapt: {known_m} are no metres of a run; expected some, as 0, 10, 50")
     ours = load_model(model, predictor)
-    data = open_dataset(dataset, label=ours.label_energy)
-    errors = fit_errors(ours.residuals)
+    data = open_dataset(dataset, label=ours.card.label_energy)
+    errors = ours.errors
     if errors is None:
         raise ModelError(
             f"{model}: has too few held-out samples to state errors, which an adaptation weighs; train on more"
@@ -224,7 +223,7 @@ def evaluate_adaptation(
             f"{dataset}: no run has {max(known_m):g} m of labelled samples and more to predict, the longest has {longest_m:.0f} m; "
             "give smaller values to --adapt"
         )
-    place, robots = Path(out), (ours.robot, ", ".join(data.card.robots))
+    place, robots = Path(out), (ours.card.robot, ", ".join(data.card.robots))
     place.mkdir(parents=True, exist_ok=True)
     values = AdaptationFacts(
         model=ours.name, dataset=data.card.name, robots=robots, known_m=tuple(sorted(set(known_m))), errors=found

@@ -1,17 +1,23 @@
-"""How models are trained: options, samples and labels."""
+"""How models are trained: options, and the loss of networks (the paper's equation 4).
+
+``nrmse``
+    sqrt(((ŵ - w*) / max w*)² + ((v̂ - v*) / max v*)²): both errors without dimension, the normalised error that the paper names.
+``paper_eq4``
+    sqrt((ŵ - w*)² / max w* + (v̂ - v*)² / max v*): the equation as printed; power outweighs velocity about 270 : 1.
+
+Both are means over samples, with the maxima of train; the functions here take labels and predictions divided by these maxima.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.dataset import Split
 from tcpipe.dataset.energies import EnergyName
-from tcpipe.learning.architecture import Loss
 from tcpipe.recipe import TrainConfig
 from tcpipe.tables.bounds import Bounds
 
@@ -19,6 +25,8 @@ Floats = NDArray[np.float32]
 
 ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "residual", "resnet18", "onnx", "own"]
 """Curves of class and slope, physics, a curve and boosted trees or a small network, the paper's network, a graph, or own code."""
+
+Loss = Literal["nrmse", "paper_eq4"]
 
 Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 """What every generator of random numbers takes."""
@@ -47,18 +55,6 @@ class FitConfig(TrainConfig):
     """Digest of the user's own code."""
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """Samples to fit and to stop by, and what is learned of them."""
-
-    train: Split
-    """``fit`` and ``held`` together."""
-    fit: Split
-    held: Split
-    outputs: tuple[str, ...]
-    """The split's label columns, or its energy alone."""
-
-
 @dataclass(slots=True)
 class TrainingTimes:
     """Where the time of training went [s], of this process."""
@@ -74,6 +70,15 @@ class TrainingTimes:
         return self.feeding_s / self.total_s if self.total_s else 0.0
 
 
-def collect_labels(split: Split, outputs: Sequence[str]) -> Floats:
-    """Return what a network is to predict of a split's samples, float32, shape (N, outputs)."""
-    return split.column(outputs[0]).astype(np.float32)[:, None] if len(outputs) == 1 else split.labels
+_SMALLEST = 1e-12
+"""Under the root, so that a perfect sample has a slope."""
+
+
+def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
+    """Return the factor of each output's squared error over its maximum, shape (outputs,)."""
+    return np.array(scale, np.float32) if loss == "paper_eq4" else np.ones(len(scale), np.float32)
+
+
+def mean_loss(predicted: Any, labels: Any, factors: Any, weights: Any) -> Any:
+    """Return the loss of predictions, arrays or torch's tensors of shape (N, outputs), but for ``factors``, (outputs,)."""
+    return ((((predicted - labels) ** 2 * factors * weights).sum(1) + _SMALLEST) ** 0.5).mean()

@@ -12,13 +12,11 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from tcpipe.dataset.energies import ENERGIES, EnergyName
-from tcpipe.dataset.extra_features import ExtraFeature
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
 from tcpipe.errors import clean_line
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_facts import Description, read_layers
-from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.predictor import Inputs, find_kind
 from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
@@ -27,7 +25,7 @@ from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
 
 KIND = "tcpipe model"
 
-SCHEMA_VERSION, EARLIER_SCHEMA_VERSION = 3, 2
+SCHEMA_VERSION = 3
 """Of model.json and the files beside it."""
 
 
@@ -79,17 +77,9 @@ class ModelCard:
 
     kind: str = KIND
     schema_version: int = SCHEMA_VERSION
-    architecture: Architecture
-    channels: tuple[str, ...]
+    inputs: Inputs
     layers: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
     """Of its channels, those that are not the paper's, as its dataset describes them."""
-    outputs: tuple[str, ...]
-    """Columns that it predicts, in order: w, v (or E for a baseline)."""
-    extra_features: tuple[ExtraFeature, ...] = ()
-    """What it takes beside a patch."""
-    scale: tuple[float, ...]
-    """Largest label of train in each output's unit: what the network gives is multiplied by it."""
-    patch_m: float
     chord_m: float
     """d: T = d / v."""
     max_arc_to_chord: float
@@ -111,19 +101,16 @@ class ModelCard:
     """Of the files beside it, by name."""
 
     @cached_property
+    def class_table(self) -> ClassTable:
+        """Return the class table that the terrain channel is scaled by."""
+        return ClassTable(self.classes)
+
+    @cached_property
     def layout(self) -> TensorLayout:
         """Return how its tensors are formed: by the ranges of the dataset that it was trained on."""
-        paper = make_paper_layers(PAPER_LAYERS, ClassTable(self.classes))
+        paper = make_paper_layers(PAPER_LAYERS, self.class_table)
         known = {**paper, **read_layers(self.layers, self.classes, Path("model.json"))}
-        return make_tensor_layout(self.channels, known, self.architecture.patch_px)
-
-    @property
-    def inputs(self) -> Inputs:
-        """Return what its predictor takes and gives."""
-        return Inputs(
-            self.channels, self.architecture.patch_px, self.layout.planes, self.patch_m, ClassTable(self.classes).count,
-            self.extra_features, self.outputs, self.scale,
-        )  # fmt: skip
+        return make_tensor_layout(self.inputs.channels, known, self.inputs.patch_px)
 
 
 def is_current(found: Mapping[str, Json]) -> bool:
@@ -167,10 +154,10 @@ def format_readme(card: ModelCard) -> str:
     )
     dataset = replace(card.dataset, name=_escape_markdown(card.dataset.name))
     return Environment(autoescape=False, undefined=StrictUndefined, keep_trailing_newline=True).from_string(_README).render(  # noqa: S701  Markdown
-        outputs=", ".join(card.outputs), chord=f"{card.chord_m:g}", px=card.architecture.patch_px,
-        depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
+        outputs=", ".join(card.inputs.outputs), chord=f"{card.chord_m:g}", px=card.inputs.patch_px,
+        depth=len(card.inputs.planes), channels=", ".join(card.inputs.channels), patch=f"{card.inputs.patch_m:g}",
         velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
-        extra_features=", ".join(f"{of.name} (usually {of.usual:.3g})" for of in card.extra_features),
+        extra_features=", ".join(f"{of.name} (usually {of.usual:.3g})" for of in card.inputs.extra_features),
         includes="; ".join(map(_escape_markdown, card.label_includes)), robot=card.robot,
         config=card.training.config, about=find_kind(card.training.kind).about, told=card.training,
         dataset=dataset, classes=", ".join(counts),

@@ -11,7 +11,7 @@ from tcpipe.tables.options import MAP, MODEL, PREDICTOR, RECIPE, SEED, STORE, Op
 
 if TYPE_CHECKING:
     from tcpipe.dataset.energies import EnergyName
-    from tcpipe.learning.architecture import Loss
+    from tcpipe.learning.fitting import Loss
     from tcpipe.recipe import Recipe
 
 

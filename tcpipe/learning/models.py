@@ -21,24 +21,21 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.cost.prediction_errors import Errors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.integrity import compute_checksums, read_sealed, seal_document, write_sealed
-from tcpipe.formats.json_files import Json, digest, parse_typed
+from tcpipe.formats.json_files import digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
-from tcpipe.learning.model_card import EARLIER_SCHEMA_VERSION, KIND, SCHEMA_VERSION, ModelCard, is_current
+from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.own_models import OwnKind, load_own_kind, report_errors
-from tcpipe.learning.predictor import Predictor, find_kind, predict_outputs
-from tcpipe.tables.facts import PhysicsFit
-from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
-from tcpipe.terrain.classes import ClassTable
-from tcpipe.terrain.layers import Layer
+from tcpipe.learning.predictor import Prediction, Predictor, ask_predictor, find_kind
 
 logger = logging.getLogger("tcpipe")
 
@@ -87,97 +84,51 @@ class Model:
     @property
     def takes_turns(self) -> bool:
         """Whether it is told how far a metre turns, and its predictions hold what that costs."""
-        return any(of.name == "turn_radpm" for of in self.card.extra_features)
+        return any(of.name == "turn_radpm" for of in self.card.inputs.extra_features)
 
-    @property
-    def classes(self) -> ClassTable:
-        """The class table that the terrain channel is scaled by."""
-        return ClassTable(self.card.classes)
+    @cached_property
+    def errors(self) -> dict[str, Errors] | None:
+        """What held-out samples show of its errors; None of too few."""
+        return fit_errors(self.residuals)
 
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Channels of a patch, in order."""
-        return self.card.channels
+    def ask(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
+        """Return what the predictor says of patches in [0, 1], shape (N, px, px, depth), and the covariances that it states.
 
-    @property
-    def layers(self) -> Mapping[str, Layer]:
-        """Layers by name, scaled as those of the dataset that it was trained on."""
-        return self.card.layout.known
-
-    @property
-    def patch_m(self) -> float:
-        """Side of a patch [m]."""
-        return self.card.patch_m
-
-    @property
-    def patch_px(self) -> int:
-        """Side of a patch in pixels."""
-        return self.card.architecture.patch_px
-
-    @property
-    def chord_m(self) -> float:
-        """Length of ground that a patch's cost is of [m]."""
-        return self.card.chord_m
-
-    @property
-    def max_arc_to_chord(self) -> float:
-        """Arc over chord of the most curved segment that could train it."""
-        return self.card.max_arc_to_chord
-
-    @property
-    def label_velocity(self) -> str:
-        """``ground`` or ``fused``: which velocity it predicts."""
-        return self.card.label_velocity
-
-    @property
-    def label_energy(self) -> str:
-        """``total`` or ``net``: which power and energy it predicts."""
-        return self.card.label_energy
-
-    @property
-    def robot(self) -> str:
-        """Whose cost it predicts."""
-        return self.card.robot
-
-    @property
-    def physics(self) -> PhysicsFit | None:
-        """What standing, drivetrain, rolling, grade and turning cost the robot."""
-        return self.card.physics
-
-    @property
-    def class_counts(self) -> Mapping[int, int]:
-        """Training samples by terrain class."""
-        return self.card.training_range.class_counts
-
-    @property
-    def pixel_classes(self) -> tuple[int, ...]:
-        """Classes of which any pixel occurs in training."""
-        return self.card.training_range.pixel_classes
-
-    @property
-    def training_range(self) -> Mapping[str, tuple[float, float]]:
-        """Smallest and largest slope_rad, cross_slope_rad, relief_m in training."""
-        return self.card.training_range.ranges
-
-    def predict(self, patches: Floats, extra_features: ExtraFeatures | None = None) -> Floats:
-        """Return power [W] and velocity [m/s], shape (N, 2), of patches in [0, 1], shape (N, px, px, depth).
-
-        ``extra_features`` are those of the N segments (`tcpipe.dataset.extra_features.read_extra_features` of a split).
+        ``features`` are those of the N segments (`tcpipe.dataset.extra_features.read_extra_features` of a split).
         Physics needs them; other models take what they were trained with, and their usual values where it is not given.
         """
-        wanted = (self.patch_px, self.patch_px, self.card.architecture.depth)
+        inputs = self.card.inputs
+        wanted = (inputs.patch_px, inputs.patch_px, len(inputs.planes))
         if patches.shape[1:] != wanted:
             raise ModelError(
-                f"{self.name}: patches of shape {patches.shape[1:]}, expected {wanted}: {', '.join(self.channels)}"
+                f"{self.name}: patches of shape {patches.shape[1:]}, expected {wanted}: {', '.join(inputs.channels)}"
             )
-        features = fill_unknown(self.card.extra_features, extra_features or empty_extra_features(len(patches)))
+        known = fill_unknown(inputs.extra_features, features or empty_extra_features(len(patches)))
         with report_errors(self.own):
-            out = predict_outputs(self.predictor, patches, features, self.card.outputs).astype(np.float32)
-        names = [name.removeprefix("fused_") for name in self.card.outputs]
+            said = ask_predictor(self.predictor, patches, known, inputs.outputs)
+        names = [name.removeprefix("fused_") for name in inputs.outputs]
         if "velocity_mps" in names:
             column = names.index("velocity_mps")
-            out[:, column] = np.maximum(out[:, column], np.float32(LEAST_VELOCITY_MPS))
-        return out
+            said.mean[:, column] = np.maximum(said.mean[:, column], LEAST_VELOCITY_MPS)
+        return said
+
+    def predict(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
+        """Return power [W] and velocity [m/s] of patches as `ask`, with the covariances of their errors on new ground.
+
+        They rest on held-out predictions: what the model states is scaled by these, and stands beside what they show in any case.
+        """
+        said, errors = self.ask(patches, features), self.errors
+        if errors is None or said.mean.shape[1] != 2:
+            return said
+        class_id = np.zeros(len(patches), np.int64) if features is None else features.class_id
+        stated = np.sqrt(np.diagonal(said.covariance, axis1=1, axis2=2)).T
+        std = np.stack([
+            errors[name].compute_std(value, class_id, of)
+            for name, value, of in zip(("power", "velocity"), said.mean.T, stated, strict=True)
+        ])  # fmt: skip
+        covariance = std.T[:, :, None] * std.T[:, None, :]
+        covariance[:, [0, 1], [1, 0]] *= estimate_correlation(self.residuals)
+        return Prediction(said.mean, covariance)
 
 
 def write_model(
@@ -247,7 +198,7 @@ def choose_model(
 
 def set_speed(model: Model, speed_mps: float) -> Model:
     """Return the model asked for a commanded speed [m/s] instead of the usual one; `UsageError` if it knows no such speed."""
-    command = next((of for of in model.card.extra_features if of.name == "command_mps"), None)
+    command = next((of for of in model.card.inputs.extra_features if of.name == "command_mps"), None)
     if command is None:
         raise UsageError(
             f"{model.name}: has no input for the commanded speed; remove --speed, or train it with --extra-features"
@@ -257,10 +208,11 @@ def set_speed(model: Model, speed_mps: float) -> Model:
         raise UsageError(
             f"--speed {speed_mps:g}: {model.name} was trained at commanded speeds of {low:.3g} to {high:.3g} m/s; give one of these"
         )
-    extra_features = tuple(replace(of, usual=speed_mps) if of is command else of for of in model.card.extra_features)
-    return replace(
-        model, card=replace(model.card, extra_features=extra_features), checksum=digest([model.checksum, speed_mps])
+    extra_features = tuple(
+        replace(of, usual=speed_mps) if of is command else of for of in model.card.inputs.extra_features
     )
+    card = replace(model.card, inputs=replace(model.card.inputs, extra_features=extra_features))
+    return replace(model, card=card, checksum=digest([model.checksum, speed_mps]))
 
 
 def set_physics(model: Model, dataset: str | Path) -> Model:
@@ -268,11 +220,11 @@ def set_physics(model: Model, dataset: str | Path) -> Model:
     if model.takes_turns:
         raise UsageError(f"{model.name}: already includes the cost of turns; remove --physics-from")
     card = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])
-    if model.robot not in card.physics:
+    if model.card.robot not in card.physics:
         raise ModelError(
-            f"{dataset}: its card has no physics of robot {model.robot}; only of {', '.join(card.physics) or 'none'}"
+            f"{dataset}: its card has no physics of robot {model.card.robot}; only of {', '.join(card.physics) or 'none'}"
         )
-    own = replace(model.card, physics=card.physics[model.robot])
+    own = replace(model.card, physics=card.physics[model.card.robot])
     return replace(model, card=own, checksum=digest([model.checksum, own.physics]))
 
 
@@ -284,10 +236,9 @@ def read_model_card(place: Path) -> ModelCard:
     if not where.is_file():
         raise UsageError(f"{place}: not a model: it has no {CARD}")
     try:
-        found = read_sealed(where, ours=lambda of: is_current(of) or of.get("schema_version") == EARLIER_SCHEMA_VERSION)
+        found = read_sealed(where, ours=is_current)
         if found.get("kind") != KIND:
             raise ModelError(f"{where}: not the card of a tcpipe model (kind is {found.get('kind')!r})")
-        found = _bring_card(found)
         if not is_current(found):
             version = found.get("schema_version")
             raise ModelError(
@@ -297,18 +248,6 @@ def read_model_card(place: Path) -> ModelCard:
     except StoreError as error:
         reason = error.problems[0].removesuffix("; remove it and run the command again")
         raise ModelError(f"{reason}; remove the folder and train the model again") from None
-
-
-def _bring_card(found: Mapping[str, Json]) -> dict[str, Json]:
-    """Return a card of tcpipe 0.8 as this version writes it, and others as they are."""
-    if found.get("schema_version") != EARLIER_SCHEMA_VERSION:
-        return dict(found)
-    card = rename_keys(found, EARLIER_MODEL_KEYS)
-    config = card["training"]["config"]
-    config |= {name: EARLIER_CHOICES.get(config[name], config[name]) for name in ("model", "label")}
-    card["training"]["kind"] = config["model"]
-    energy = EARLIER_CHOICES.get(card["label_energy"], card["label_energy"])
-    return {**card, "schema_version": SCHEMA_VERSION, "label_energy": energy}
 
 
 def compute_card_checksum(card: ModelCard) -> str:

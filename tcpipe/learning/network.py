@@ -12,6 +12,7 @@ import io
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,9 @@ from torch import nn
 from torch.nn import functional
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.architecture import Architecture, mean_loss
+from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.formats.weights import check_arrays
+from tcpipe.learning.fitting import mean_loss
 from tcpipe.recipe import TrainConfig
 
 Floats = NDArray[np.float32]
@@ -67,19 +70,53 @@ class BasicBlock(nn.Module):
         return functional.relu(self.second(functional.relu(self.first(images))) + self.shortcut(images))
 
 
-class ResNet18(nn.Module):
-    """Patches, float32 (N, depth, px, px), to outputs, (N, outputs)."""
+class Network(nn.Module):
+    """A network of patches with a head, whose weights are arrays by name."""
 
-    def __init__(self, shape: Architecture) -> None:
+    head: nn.Linear
+
+    def predict(self, patches: Floats) -> Floats:
+        """Return outputs of patches of shape (N, px, px, depth), some at a time, shape (N, outputs)."""
+        self.eval()
+        out = np.empty((len(patches), self.head.out_features), np.float32)
+        with torch.inference_mode():
+            for first in range(0, len(patches), _TOGETHER):
+                part = slice(first, first + _TOGETHER)
+                out[part] = self(move_to_device(patches[part])).numpy(force=True)
+        return out
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
+        return {name: value.numpy(force=True).copy() for name, value in self._list_weights().items()}
+
+    def load(self, arrays: Arrays) -> None:
+        """Put weights in, on the device that there is; `ModelError` if they are another network's."""
+        forms = {name: ("float32", tuple(value.shape)) for name, value in self._list_weights().items()}
+        check_arrays(arrays, forms)
+        self.to_empty(device=find_device())
+        self.to(memory_format=torch.channels_last)
+        for name, value in self._list_weights().items():
+            value.copy_(torch.from_numpy(np.ascontiguousarray(arrays[name])))
+
+    def _list_weights(self) -> dict[str, Any]:
+        """Return a view of every weight, without the count of batches that no fixed share asks for."""
+        own = {name: of for name, of in self.state_dict().items() if not name.endswith("num_batches_tracked")}
+        return {_make_weight_name(name): _reorder_axes(value) for name, value in own.items()}
+
+
+class ResNet18(Network):
+    """Patches, float32 (N, depth, px, px), to outputs, (N, outputs); ``width`` filters in the first stage, 64 of ResNet-18."""
+
+    def __init__(self, depth: int, outputs: int, width: int) -> None:
         super().__init__()
-        self.stem = Normed(shape.depth + shape.extra_features, shape.width, 7, 2)
-        depth = shape.width
+        self.stem = Normed(depth, width, 7, 2)
+        depth = width
         for stage in range(4):
             for block in range(2):
-                filters, stride = shape.width << stage, 2 if stage and not block else 1
+                filters, stride = width << stage, 2 if stage and not block else 1
                 self.add_module(f"stage{stage + 1}_block{block + 1}", BasicBlock(depth, filters, stride))
                 depth = filters
-        self.head = nn.Linear(depth, shape.outputs)
+        self.head = nn.Linear(depth, outputs)
 
     def forward(self, images: Any) -> Any:
         """Return the outputs."""
@@ -89,52 +126,10 @@ class ResNet18(nn.Module):
             values = block(values) if name.startswith("stage") else values
         return self.head(values.mean((2, 3)))
 
-    def predict(self, patches: Floats) -> Floats:
-        """Return outputs of patches of shape (N, px, px, depth), shape (N, outputs)."""
-        return _predict(self, patches)
 
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
-        return {
-            _make_weight_name(name): _reorder_axes(value).numpy(force=True).copy()
-            for name, value in self._weights().items()
-        }
-
-    def set_arrays(self, arrays: Arrays) -> None:
-        """Put weights in; `ModelError` if they are another network's."""
-        there = self._weights()
-        shapes = {_make_weight_name(name): tuple(_reorder_axes(value).shape) for name, value in there.items()}
-        if {name: value.shape for name, value in arrays.items()} != shapes:
-            raise ModelError("contains the weights of another network; remove it and train the model again")
-        for name, value in there.items():
-            _reorder_axes(value).copy_(torch.from_numpy(np.ascontiguousarray(arrays[_make_weight_name(name)])))
-
-    def _weights(self) -> dict[str, Any]:
-        """Return every weight by torch's name, without the count of batches that no fixed share asks for."""
-        return {name: value for name, value in self.state_dict().items() if not name.endswith("num_batches_tracked")}
-
-
-def _predict(network: Any, patches: Floats) -> Floats:
-    """Return outputs of patches of shape (N, px, px, depth), some at a time, shape (N, outputs)."""
-    network.eval()
-    out = np.empty((len(patches), network.head.out_features), np.float32)
-    with torch.inference_mode():
-        for first in range(0, len(patches), _TOGETHER):
-            part = slice(first, first + _TOGETHER)
-            out[part] = network(move_to_device(patches[part])).numpy(force=True)
-    return out
-
-
-def make_resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> ResNet18:
-    """Return the untrained network on the GPU that there is, else the CPU; the same seed gives the same weights.
-
-    Parameters
-    ----------
-    shape : sizes.
-    seed : of the weights.
-    start : what it predicts on average before training: the head's biases.
-    """
-    network, drawn = ResNet18(shape), torch.Generator().manual_seed(seed)
+def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Sequence[float]) -> ResNet18:
+    """Return the untrained network on the device that there is; ``start`` is what it predicts on average: the head's biases."""
+    network, drawn = ResNet18(depth, outputs, width), torch.Generator().manual_seed(seed)
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d):
             deviation = math.sqrt(2.0 / layer.weight[0].numel()) / _CUT_DEVIATION
@@ -142,6 +137,14 @@ def make_resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> 
     nn.init.normal_(network.head.weight, 0.0, 0.01, generator=drawn)
     network.head.bias.data[:] = torch.tensor(list(start))
     made: ResNet18 = network.to(find_device(), memory_format=torch.channels_last)
+    return made
+
+
+def load_network(network: type[Network], *sizes: int, arrays: Arrays) -> Network:
+    """Return a network of these sizes with its weights; `ModelError` if they are another's, before memory is taken."""
+    with torch.device("meta"):
+        made = network(*sizes)
+    made.load(arrays)
     return made
 
 
@@ -205,30 +208,23 @@ def _reorder_axes(value: Any) -> Any:
 _FILTERS = 16, 32, 32
 
 
-class SmallNetwork(nn.Module):
+class SmallNetwork(Network):
     """Three convolutions with stride 2 and a mean over the patch: patches (N, depth, px, px) to outputs, (N, outputs)."""
 
-    def __init__(self, depth: int, outputs: int, *, seed: int) -> None:
+    def __init__(self, depth: int, outputs: int) -> None:
         super().__init__()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            layers: list[nn.Module] = []
-            for filters in _FILTERS:
-                layers += [nn.Conv2d(depth, filters, 3, 2, 1), nn.GroupNorm(4, filters), nn.ReLU()]
-                depth = filters
-            self.layers = nn.Sequential(*layers)
-            self.head = nn.Linear(depth, outputs)
+        layers: list[nn.Module] = []
+        for filters in _FILTERS:
+            layers += [nn.Conv2d(depth, filters, 3, 2, 1), nn.GroupNorm(4, filters), nn.ReLU()]
+            depth = filters
+        self.layers = nn.Sequential(*layers)
+        self.head = nn.Linear(depth, outputs)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
-        self.to(find_device(), memory_format=torch.channels_last)
 
     def forward(self, images: Any) -> Any:
         """Return the outputs."""
         return self.head(self.layers(images).mean((2, 3)))
-
-    def predict(self, patches: Floats) -> Floats:
-        """Return outputs of patches of shape (N, px, px, depth), shape (N, outputs)."""
-        return _predict(self, patches)
 
     def fit(self, batches: Iterator[tuple[Floats, Floats, Floats]], steps: int, config: TrainConfig) -> None:
         """Fit outputs to labels by weighted least squares, in so many steps of a batch of patches, labels and weights."""
@@ -244,13 +240,13 @@ class SmallNetwork(nn.Module):
             optimizer.step()
             schedule.step()
 
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of every weight by torch's name."""
-        return {name: value.numpy(force=True).copy() for name, value in self.state_dict().items()}
-
-    def set_arrays(self, arrays: Arrays) -> None:
-        """Put weights in."""
-        self.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in arrays.items()})
+    @classmethod
+    def make(cls, depth: int, outputs: int, *, seed: int) -> SmallNetwork:
+        """Return an untrained network; the same seed gives the same weights."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            made: SmallNetwork = cls(depth, outputs).to(find_device(), memory_format=torch.channels_last)
+        return made
 
 
 _EPSILON = 1e-7
@@ -263,13 +259,30 @@ class Trainer:
     def __init__(self, network: ResNet18, factors: Floats) -> None:
         self.network = network
         self._factors = torch.from_numpy(factors).to(find_device())
-        self._optimizer = torch.optim.Adam(network.parameters(), eps=_EPSILON)
-        for weight in network.parameters():  # as its first step makes it: a state has the same arrays before and after
-            self._optimizer.state[weight] = {
-                "step": torch.tensor(0.0),
-                "exp_avg": torch.zeros_like(weight),
-                "exp_avg_sq": torch.zeros_like(weight),
-            }
+        self.optimizer = torch.optim.Adam(network.parameters(), eps=_EPSILON)
+
+    def write_state(self, path: Path, parts: Mapping[str, Any]) -> None:
+        """Write weights, the optimiser's memory and other parts of a training, whole or not at all."""
+        state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), **parts}
+        with write_atomic_file(path) as temporary:
+            torch.save(state, temporary)
+
+    def read_state(self, path: Path) -> dict[str, Any]:
+        """Go on from what `write_state` wrote, and return the other parts; `ModelError` where it is damaged."""
+        try:
+            state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+            self.network.load_state_dict(state.pop("network"))
+            self.optimizer.load_state_dict(state.pop("optimizer"))
+        except Exception as error:  # noqa: BLE001  those of torch, pickle and zipfile have no common base
+            reason = str(error).partition("\n")[0]
+            raise ModelError(
+                f"{path}: cut short or damaged ({reason}); remove it, or start again with --no-resume"
+            ) from None
+        return state
+
+    def copy_weights(self) -> dict[str, Any]:
+        """Return a copy of every weight by torch's name."""
+        return {name: value.clone() for name, value in self.network.state_dict().items()}
 
     def step(self, patches: Floats, labels: Floats, weights: Floats, learning_rate: float) -> float:
         """Train on a batch, patches (N, px, px, depth), labels and weights (N, outputs); return its mean loss."""
@@ -277,28 +290,11 @@ class Trainer:
             len(patches) == 1
         ):  # of a single pixel torch has no deviation; twice the same sample has the same mean and gradient
             patches, labels, weights = (np.repeat(values, 2, axis=0) for values in (patches, labels, weights))
-        self._optimizer.param_groups[0]["lr"] = learning_rate
+        self.optimizer.param_groups[0]["lr"] = learning_rate
         self.network.train()
         wanted, weigh = (torch.from_numpy(values).to(find_device()) for values in (labels, weights))
         loss = mean_loss(self.network(move_to_device(patches)), wanted, self._factors, weigh)
-        self._optimizer.zero_grad()
+        self.optimizer.zero_grad()
         loss.backward()
-        self._optimizer.step()
+        self.optimizer.step()
         return float(loss.detach())
-
-    def copy_optimizer_state(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of the step and the two moments of every weight."""
-        return {name: value.numpy(force=True).copy() for name, value in self._list_state()}
-
-    def load_optimizer_state(self, arrays: Arrays) -> None:
-        """Restore what `copy_optimizer_state` returned; `ModelError` if it is of another network."""
-        there = dict(self._list_state())
-        if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in there.items()}:
-            raise ModelError("contains the weights of another network; remove it and train the model again")
-        for name, value in there.items():
-            value.copy_(torch.from_numpy(np.array(arrays[name])))
-
-    def _list_state(self) -> Iterator[tuple[str, Any]]:
-        for name, weight in self.network.named_parameters():
-            for part, value in self._optimizer.state[weight].items():
-                yield f"{name}/{part}", value

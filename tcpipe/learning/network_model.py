@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,17 @@ from tcpipe.dataset.extra_features import (
     standardize_features,
 )
 from tcpipe.errors import ModelError
-from tcpipe.formats.weights import check_arrays, read_arrays, write_arrays
-from tcpipe.learning.architecture import Architecture, check_trainable, compute_loss_factors, list_weight_forms
-from tcpipe.learning.fitting import FitConfig, TrainingTimes
-from tcpipe.learning.predictor import Fitted, Inputs, Job, Predictor, Samples, compute_held_loss, predict_samples
+from tcpipe.learning.fitting import FitConfig, TrainingTimes, compute_loss_factors
+from tcpipe.learning.predictor import (
+    Fitted,
+    Inputs,
+    Job,
+    Prediction,
+    Predictor,
+    Samples,
+    compute_held_loss,
+    predict_samples,
+)
 
 if TYPE_CHECKING:
     from tcpipe.learning.network import ResNet18, Trainer
@@ -34,7 +41,9 @@ Floats = NDArray[np.float32]
 
 logger = logging.getLogger("tcpipe")
 
-_STATE = "state"
+BLOCK, _MOST_WIDTH, _MOST_INPUTS = 16, 512, 1024
+"""Channels that CPU convolutions hold together: of fewer, oneDNN, by which PyTorch convolves there, writes beyond its memory in the
+gradient of a 1 × 1 convolution with a stride (its issue 6035); seen to crash with 4 and 8 filters."""
 
 _SLOWER = 0.1
 """Factor of the learning rate when the loss stops falling."""
@@ -46,12 +55,25 @@ _LAST = 0.8
 """Share of the maximum of epochs after which the rate is smaller in any case."""
 
 
+def require_torch() -> None:
+    """Raise `ModelError` if torch is not installed."""
+    if find_spec("torch") is None:
+        raise ModelError("torch not installed, required to train or use a network: pip install 'tcpipe[train]'")
+
+
+def check_trainable(depth: int, outputs: int, width: int) -> None:
+    """Raise `ModelError` if torch is not installed or the sizes are not possible."""
+    require_torch()
+    if width % BLOCK or not BLOCK <= width <= _MOST_WIDTH:
+        raise ModelError(f"a network of width {width}: expected a multiple of {BLOCK}, from {BLOCK} to {_MOST_WIDTH}")
+    if not (0 < depth <= _MOST_INPUTS and 0 < outputs <= _MOST_INPUTS):
+        raise ModelError(f"a network of {depth} channels and {outputs} outputs: expected 1 to {_MOST_INPUTS} of each")
+
+
 @dataclass(slots=True)
 class TrainingProgress:
     """Losses so far; ``best_epoch`` counts from 1, as does ``epoch``."""
 
-    key: str
-    """Of dataset and options: a checkpoint of others is not gone on from."""
     epoch: int = 0
     best_epoch: int = 0
     best_loss: float = float("inf")
@@ -59,39 +81,26 @@ class TrainingProgress:
     """Epoch, loss, loss of the held-out fold."""
 
 
-def write_checkpoint(
-    path: Path, progress: TrainingProgress, parts: Mapping[str, Mapping[str, NDArray[np.generic]]]
-) -> None:
-    """Write where training stands and its weights, whole or not at all."""
-    state = np.frombuffer(json.dumps(asdict(progress)).encode(), np.uint8)  # keeps what is infinite or not a number
-    arrays = {f"{part}/{name}": array for part, named in parts.items() for name, array in named.items()}
-    write_arrays(path, {_STATE: state, **arrays})
+@dataclass(slots=True)
+class _State:
+    """All that a killed training continues from."""
 
+    trainer: Trainer
+    progress: TrainingProgress
+    best: dict[str, Any]
+    """Weights of the best epoch."""
+    held_out: NDArray[np.float64]
+    """Predictions of samples that were held out, shape (N, outputs); NaN where there is none yet."""
 
-def read_checkpoint(path: Path, key: str) -> tuple[TrainingProgress, dict[str, Arrays]]:
-    """Return what `write_checkpoint` wrote. `ModelError`: it is cut short, or of another dataset or other options."""
-    try:
-        arrays = read_arrays(path)
-        progress = _read_progress(json.loads(arrays.pop(_STATE).tobytes()))
-    except (ModelError, KeyError, TypeError, ValueError) as error:
-        reason = error.problems[0].removeprefix(f"{path}: ") if isinstance(error, ModelError) else "not a checkpoint"
-        raise ModelError(f"{path}: {reason}; remove it, or start again with --no-resume") from None
-    if progress.key != key:
-        raise ModelError(f"{path}: of another dataset or other options; remove it, or start again with --no-resume")
-    parts: dict[str, dict[str, NDArray[np.generic]]] = {}
-    for name, array in arrays.items():
-        part, _, rest = name.partition("/")
-        parts.setdefault(part, {})[rest] = array
-    return progress, dict(parts)
+    def write(self, path: Path) -> None:
+        parts = {"progress": asdict(self.progress), "best": self.best, "held_out": self.held_out.tolist()}
+        self.trainer.write_state(path, parts)
 
-
-def _read_progress(found: Any) -> TrainingProgress:
-    """Return what was saved of a `TrainingProgress`; ValueError, TypeError or KeyError where it is none."""
-    history = [(int(epoch), float(loss), float(held)) for epoch, loss, held in found["history"]]
-    made = TrainingProgress(**{**found, "best_loss": float(found["best_loss"]), "history": history})
-    if [row[0] for row in history] != list(range(1, made.epoch + 1)) or made.best_epoch not in range(made.epoch + 1):
-        raise ValueError(made)
-    return made
+    def read(self, path: Path) -> None:
+        """Go on from what `write` wrote; `ModelError` where it is damaged."""
+        parts = self.trainer.read_state(path)
+        self.progress, self.best = TrainingProgress(**parts["progress"]), parts["best"]
+        self.held_out = np.array(parts["held_out"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +110,7 @@ class NetworkModel(Predictor):
     network: ResNet18
     inputs: Inputs
 
-    about: ClassVar[str] = (
-        "ResNet-18, stopped by one fold of train; its intervals rest on its errors on that fold, slightly too small, "
-        "or with train.cross_fit on those of networks without each fold"
-    )
+    about: ClassVar[str] = "ResNet-18, stopped by one fold of train"
     optimizer: ClassVar[str] = "Adam"
     stops_by_fold: ClassVar[bool] = True
 
@@ -120,15 +126,11 @@ class NetworkModel(Predictor):
     @classmethod
     def from_arrays(cls, arrays: Arrays, inputs: Inputs) -> NetworkModel:
         """Return the network with these weights; its width is that of the first ones."""
-        stem = arrays.get("stem_convolution/kernel", np.empty(0))
-        shape = make_architecture(inputs, stem.shape[-1])
-        check_arrays(arrays, list_weight_forms(shape))
-        check_trainable(shape)
-        from tcpipe.learning.network import make_resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
+        sizes = inputs.depth, len(inputs.outputs), arrays.get("stem_convolution/kernel", np.empty(0)).shape[-1]
+        check_trainable(*sizes)
+        from tcpipe.learning.network import ResNet18, load_network  # noqa: PLC0415  torch takes seconds and half a gigabyte
 
-        network = make_resnet18(shape, seed=0, start=[0.0] * shape.outputs)
-        network.set_arrays(arrays)
-        return cls(network, inputs)
+        return cls(cast("ResNet18", load_network(ResNet18, *sizes, arrays=arrays)), inputs)
 
     @classmethod
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
@@ -139,66 +141,64 @@ class NetworkModel(Predictor):
         config, is_held = samples.config, samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
         trainer, device = _make_trainer(fit)
-        model = cls(trainer.network, samples.inputs)
-        best: Arrays = trainer.network.arrays()
+        model, times = cls(trainer.network, samples.inputs), TrainingTimes()
+        state = _State(trainer, TrainingProgress(), trainer.copy_weights(), np.full(samples.labels.shape, np.nan))
         logger.info("%s: %d samples to fit, %d to stop by, on %s", job.name, len(fit), len(held), device)
-        progress = TrainingProgress(job.key)
         if job.checkpoint.exists():
-            progress, parts = read_checkpoint(job.checkpoint, job.key)
-            _restore(trainer, parts, job.checkpoint)
-            best = parts["best"]
-            logger.info("%s: resumes after epoch %d", job.name, progress.epoch)
+            state.read(job.checkpoint)
+            logger.info("%s: resumes after epoch %d", job.name, state.progress.epoch)
         else:  # a place that cannot be written is found now, not after an epoch
-            write_checkpoint(job.checkpoint, progress, _state(trainer, best))
-        times = TrainingTimes()
+            state.write(job.checkpoint)
+        progress = state.progress
         while progress.epoch < config.epochs and progress.epoch - progress.best_epoch < config.patience:
             loss = _train_epoch(trainer, fit, progress, times)
-            held_loss = compute_held_loss(held, predict_samples(model, held))
+            held_loss = compute_held_loss(held, predict_samples(model, held).mean)
             progress.epoch += 1
             progress.history.append((progress.epoch, loss, held_loss))
             if held_loss < progress.best_loss:
-                progress.best_loss, progress.best_epoch, best = held_loss, progress.epoch, trainer.network.arrays()
+                progress.best_loss, progress.best_epoch = held_loss, progress.epoch
+                state.best = trainer.copy_weights()
             if progress.epoch % max(_STEPS_BETWEEN * config.batch_size // len(fit), 1) == 0:
-                write_checkpoint(job.checkpoint, progress, _state(trainer, best))
+                state.write(job.checkpoint)
             _log_epoch(job.name, progress, config, times)
-        trainer.network.set_arrays(best)
-        held_out = np.full(samples.labels.shape, np.nan)
-        held_out[is_held] = predict_samples(model, held)
-        for fold in np.setdiff1d(np.unique(samples.folds), [config.fold]) if config.cross_fit else ():
+        trainer.network.load_state_dict(state.best)
+        held_out = state.held_out
+        held_out[is_held] = predict_samples(model, held).mean
+        for fold in np.unique(samples.folds) if config.cross_fit else ():
             rows = samples.folds == fold
-            logger.info("%s: a network without fold %d, for intervals", job.name, fold)
-            held_out[rows] = predict_samples(
-                cls._fit_best_epochs(samples.take(~rows), progress, times), samples.take(rows)
-            )
-        return Fitted(model, held_out, progress.epoch, progress.best_epoch, progress.history, times, device)
+            if np.isnan(held_out[rows]).any():
+                logger.info("%s: a network without fold %d, for intervals", job.name, fold)
+                other = cls._fit_best_epochs(samples.take(~rows), progress, times)
+                held_out[rows] = predict_samples(other, samples.take(rows)).mean
+                state.write(job.checkpoint)
+        return Fitted(
+            model,
+            Prediction.without_covariance(held_out),
+            progress.epoch,
+            progress.best_epoch,
+            progress.history,
+            times,
+            device,
+        )
 
     @classmethod
     def _fit_best_epochs(cls, fit: Samples, like: TrainingProgress, times: TrainingTimes) -> NetworkModel:
         """Return a network of other samples after as many epochs as were best, at the same rates."""
         trainer, _ = _make_trainer(fit)
         for epoch in range(like.best_epoch):
-            _train_epoch(trainer, fit, TrainingProgress(like.key, epoch=epoch, history=like.history[:epoch]), times)
+            _train_epoch(trainer, fit, TrainingProgress(epoch=epoch, history=like.history[:epoch]), times)
         return cls(trainer.network, fit.inputs)
-
-
-def make_architecture(inputs: Inputs, width: int) -> Architecture:
-    """Return the sizes of a network with these inputs and outputs."""
-    return Architecture(inputs.patch_px, len(inputs.planes), len(inputs.outputs), width, len(inputs.extra_features))
 
 
 def _make_trainer(fit: Samples) -> tuple[Trainer, str]:
     """Return an untrained network with its optimiser, and what it runs on."""
     config, scale = fit.config, fit.inputs.scale
     start = fit.labels.astype(np.float32).mean(axis=0) / scale
-    shape = make_architecture(fit.inputs, config.width)
-    check_trainable(shape)
-    from tcpipe.learning.network import (  # noqa: PLC0415  torch takes seconds and half a gigabyte
-        Trainer,
-        find_device_name,
-        make_resnet18,
-    )
+    sizes = fit.inputs.depth, len(fit.inputs.outputs), config.width
+    check_trainable(*sizes)
+    from tcpipe.learning.network import Trainer, find_device_name, make_resnet18  # noqa: PLC0415
 
-    network = make_resnet18(shape, seed=config.seed, start=start.tolist())
+    network = make_resnet18(*sizes, seed=config.seed, start=start.tolist())
     return Trainer(network, compute_loss_factors(config.loss, scale)), find_device_name()
 
 
@@ -245,23 +245,6 @@ def _train_epoch(trainer: Trainer, fit: Samples, progress: TrainingProgress, tim
             f"training diverged in epoch {progress.epoch + 1} (the loss is {total}); try a smaller --learning-rate"
         )
     return total / max(count, 1)
-
-
-def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
-    """Return all arrays of a checkpoint."""
-    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.copy_optimizer_state()}
-
-
-def _restore(trainer: Trainer, parts: dict[str, Arrays], checkpoint: Path) -> None:
-    """Put weights, the best ones for a look, and the optimiser's memory back."""
-    if parts.keys() != {"now", "best", "optimizer"}:
-        raise ModelError(f"{checkpoint}: not a checkpoint; remove it, or start again with --no-resume")
-    try:
-        for part in ("best", "now"):
-            trainer.network.set_arrays(parts[part])
-        trainer.load_optimizer_state(parts["optimizer"])
-    except ModelError as error:
-        raise ModelError(f"{checkpoint}: {error.problems[0]}") from None
 
 
 def _log_epoch(name: str, progress: TrainingProgress, config: FitConfig, times: TrainingTimes) -> None:

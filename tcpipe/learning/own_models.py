@@ -107,7 +107,8 @@ def _make_kind(found: Any, source: str) -> type[Predictor]:
     if inspect.isclass(found) and hasattr(found, "predict"):
         return found if Predictor in found.__mro__ else type(found.__name__, (found, Predictor), {})
     if callable(found):
-        return type("Function", (Predictor,), {"predict": lambda _, patches, features: found(patches, features)})
+        methods = {"predict": lambda _, patches, features: found(patches, features)}
+        return type(getattr(found, "__name__", "function"), (Predictor,), methods)
     raise UsageError(f"--predictor {source}: neither a class with a method predict nor a function")
 
 
@@ -117,6 +118,10 @@ def report_errors(own: OwnKind | str | None) -> Iterator[None]:
     source = own.source if isinstance(own, OwnKind) else own
     try:
         yield
+    except ModelError as error:
+        if source is None:
+            raise
+        raise ModelError(*(f"--predictor {source}: {problem}" for problem in error.problems)) from None
     except TcpipeError:
         raise
     except Exception as error:

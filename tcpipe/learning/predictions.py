@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from tcpipe.cost.adaptation import Metres, Run
-from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, propagate_stated
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import ModelError
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, QUANTITIES, UNITS, Array, Spread, compute_costs
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
+from tcpipe.learning.predictor import Prediction
 from tcpipe.learning.training import compute_dataset_checksum, read_class_table
 from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.columns import Column, to_floats
@@ -87,24 +88,33 @@ class Predicted:
     costs: Mapping[str, Array]
     """Centred by class: what every figure is of unless it says otherwise."""
     uncentred: Mapping[str, Array]
+    stated: Mapping[str, Array]
+    """Standard deviations by the predictor; 0 where it states none."""
 
     @classmethod
-    def centre(cls, residuals: Residuals, outputs: Array, class_ids: NDArray[np.int64], chord_m: float) -> Predicted:
-        """Return both of predictions, shape (N, outputs), by the predictor's own held-out samples."""
-        return cls(*(_convert_outputs(of, outputs, class_ids, chord_m) for of in (residuals, None)))
+    def centre(cls, residuals: Residuals, said: Prediction, class_ids: NDArray[np.int64], chord_m: float) -> Predicted:
+        """Return costs of predictions by the predictor's own held-out samples; of energy alone, as of a power at 1 m/s."""
+        is_energy = said.mean.shape[1] == 1
+        power, velocity = said.mean[:, 0], np.ones(len(said.mean))
+        names = ("E",) if is_energy else QUANTITIES
+        if is_energy:
+            residuals, chord_m = _of_energy_alone(residuals), 1.0
+        else:
+            velocity = np.maximum(said.mean[:, 1], LEAST_VELOCITY_MPS)
+        centred = fit_bias_correction(residuals).apply(power, velocity, class_ids)
+        costs, uncentred = (
+            compute_costs(w, np.maximum(v, LEAST_VELOCITY_MPS), chord_m) for w, v in (centred, (power, velocity))
+        )
+        stated = {"E": np.zeros(len(power))}
+        if not is_energy:
+            of_metre = propagate_stated(np.column_stack([power, velocity]), said.covariance)
+            stated = {name: of_metre[CALLED[name]] * (chord_m if name in "TE" else 1.0) for name in names}
+        return cls(*({name: of[name] for name in names} for of in (costs, uncentred, stated)))
 
     def take(self, rows: NDArray[np.int64]) -> Predicted:
         """Return some of the samples."""
-        return Predicted(*({name: values[rows] for name, values in of.items()} for of in (self.costs, self.uncentred)))
-
-
-def make_residuals(train: Split, said: Array) -> Residuals:
-    """Return labels and held-out predictions of power and velocity, shape (N, 2), in the columns that a model keeps."""
-    labels = train.labels.astype(np.float64)
-    columns = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class", "fold")}
-    for number, (quantity, unit) in enumerate((("power", "watt"), ("velocity", "mps"))):
-        columns |= {f"{quantity}_{unit}": labels[:, number], f"{quantity}_predicted_{unit}": said[:, number]}
-    return columns
+        parts = (getattr(self, of.name) for of in fields(self))
+        return Predicted(*({name: values[rows] for name, values in of.items()} for of in parts))
 
 
 def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)) -> Predicted:
@@ -118,62 +128,44 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
     noise : channels that are replaced by noise, uniform in [0, 1], each pixel on its own (section V-C).
     seed : of that noise.
     """
-    outputs = _predict_outputs(model, split, noise, np.random.default_rng(list(seed)))
-    is_class_shown = "terrain" in model.channels and "terrain" not in noise
-    class_ids = read_extra_features(split).class_id if is_class_shown else np.zeros(len(split), np.int64)
-    return Predicted.centre(model.residuals, outputs, class_ids, model.chord_m)
-
-
-def _predict_outputs(model: Model, split: Split, noise: Sequence[str], rng: np.random.Generator) -> Array:
-    chosen, planes = split.with_layout(model.card.layout), model.card.layout.planes
-    replaced = [place for place, plane in enumerate(planes) if plane.partition("[")[0] in noise]
-    parts = [np.empty((0, len(model.card.outputs)), np.float32)]
-    extra_features, first = read_extra_features(split), 0
-    while first < len(chosen):
-        patches = chosen.batch(np.arange(first, min(first + model.card.layout.batch_rows, len(chosen))))[0].copy()
+    rng, layout = np.random.default_rng(list(seed)), model.card.layout
+    replaced = [place for place, plane in enumerate(layout.planes) if plane.partition("[")[0] in noise]
+    chosen, features = split.with_layout(layout), read_extra_features(split)
+    parts = [Prediction.without_covariance(np.empty((0, len(model.card.inputs.outputs))))]
+    for first in range(0, len(chosen), layout.batch_rows):
+        rows = np.arange(first, min(first + layout.batch_rows, len(chosen)))
+        patches = chosen.batch(rows)[0].copy()
         for channel in replaced:
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
-        parts.append(model.predict(patches, extra_features.take(slice(first, first + len(patches)))))
-        first += len(patches)
-    return np.concatenate(parts).astype(np.float64)
-
-
-def _convert_outputs(
-    residuals: Residuals | None, outputs: Array, class_ids: NDArray[np.int64], chord_m: float
-) -> dict[str, Array]:
-    """Return costs of what a predictor gives; centred where there are residuals to do so."""
-    if outputs.shape[1] == 1:
-        of_energy = None if residuals is None else _of_energy_alone(residuals)
-        at_one_mps = np.column_stack([outputs[:, 0], np.ones(len(outputs))])
-        return {"E": _convert_outputs(of_energy, at_one_mps, class_ids, 1.0)["E"]}
-    power, velocity = outputs.T
-    if residuals is not None:
-        power, velocity = fit_bias_correction(residuals).apply(power, velocity, class_ids)
-    return compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), chord_m)
+        parts.append(model.ask(patches, features.take(rows)))
+    is_class_shown = "terrain" in model.card.inputs.channels and "terrain" not in noise
+    class_ids = features.class_id if is_class_shown else np.zeros(len(split), np.int64)
+    return Predicted.centre(model.residuals, Prediction.concatenate(parts), class_ids, model.card.chord_m)
 
 
 def _of_energy_alone(residuals: Residuals) -> Residuals:
     """Return the residuals of a model of energy as those of a power at 1 m/s."""
-    names = {name: name.replace("_predicted", "") for name in residuals if "energy_predicted" in name}
-    if not names:
+    if "energy_predicted_joule" not in residuals:
         return {}
-    ((predicted, label),) = names.items()
-    ones = np.ones(len(residuals[label]))
-    known = {"power_watt": residuals[label], "power_predicted_watt": residuals[predicted]}
-    return {**residuals, **known, "velocity_mps": ones, "velocity_predicted_mps": ones}
+    label, said = residuals["energy_joule"], residuals["energy_predicted_joule"]
+    ones = np.ones(len(label))
+    known = {"power_watt": label, "power_predicted_watt": said, "velocity_mps": ones, "velocity_predicted_mps": ones}
+    return {**residuals, **known}
 
 
-def predict_spreads(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.int64]) -> dict[str, Spread]:
-    """Return what a model states of the errors of its costs, by quantity; nothing if it has too few held-out samples."""
-    stated = fit_errors(model.residuals)
-    if stated is None:
+def predict_spreads(model: Model, said: Predicted, class_ids: NDArray[np.int64]) -> dict[str, Spread]:
+    """Return what is known of the errors of a model's costs, by quantity; nothing if it has too few held-out samples."""
+    if model.errors is None:
         return {}
-    scale = {"w": 1.0, "v": 1.0, "T": model.chord_m, "E": model.chord_m}  # of a metre's errors
     found = {}
-    for quantity, costs_of in said.items():
-        errors, d = stated[CALLED[quantity]], scale[quantity]
-        low, high = errors.compute_intervals(costs_of / d, class_ids)
-        found[quantity] = Spread(d * errors.compute_std(costs_of / d, class_ids), d * low, d * high)
+    for quantity, costs in said.costs.items():
+        errors, d = (
+            model.errors[CALLED[quantity]],
+            model.card.chord_m if quantity in "TE" else 1.0,
+        )  # of a metre's errors
+        ground = costs / d, class_ids, said.stated[quantity] / d
+        low, high = errors.compute_intervals(*ground)
+        found[quantity] = Spread(d * errors.compute_std(*ground), d * low, d * high)
     return found
 
 
@@ -193,8 +185,8 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
         f"classes: in the model {clause}" for clause in ClassTable(card.classes).differences(read_class_table(told))
     ]
     same = (
-        ("patch_px", card.architecture.patch_px, told.patch_px),
-        ("patch_m", card.patch_m, told.patch_m),
+        ("patch_px", card.inputs.patch_px, told.patch_px),
+        ("patch_m", card.inputs.patch_m, told.patch_m),
         ("segment.chord_m", card.chord_m, told.recipe.segment.chord_m),
         ("label.velocity", card.label_velocity, told.label.velocity),
         *(() if any_robot else (("robot", card.robot, ", ".join(told.robots)),)),
@@ -202,8 +194,10 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
-    if len(card.outputs) != len(told.label.columns):
-        problems.append(f"it predicts only {', '.join(card.outputs)}, expected {' and '.join(told.label.columns)}")
+    if len(card.inputs.outputs) != len(told.label.columns):
+        problems.append(
+            f"it predicts only {', '.join(card.inputs.outputs)}, expected {' and '.join(told.label.columns)}"
+        )
     absent = [name for name in card.layout.layers if name not in told.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:

@@ -6,14 +6,15 @@ class; only ``predict`` is needed, ``fit`` to be trained, and ``to_arrays`` with
     class MeanOfClass:
         @classmethod
         def fit(cls, samples): ...                     # Samples: patches, features, labels, weights, folds
-        def predict(self, patches, features): ...      # power [W] and velocity [m/s], shape (N, 2)
+        def predict(self, patches, features): ...      # power [W] and velocity [m/s], shape (N, 2), or (these, covariances (N, 2, 2))
         def to_arrays(self): ...                       # dict of numpy arrays
         @classmethod
         def from_arrays(cls, arrays, inputs): ...      # Inputs: channels, size of a patch, classes
 
 ``patches`` are float32 (N, px, px, channels) in [0, 1], travel to the right; ``features`` (`tcpipe.dataset.extra_features.ExtraFeatures`)
 has slope, terrain class, turn and commanded speed of each. Intervals come from predictions of samples that a model was not fitted to:
-``fit`` is called for the other folds of each fold, unless the class has ``fit_folds``.
+``fit`` is called for the other folds of each fold, unless the class has ``fit_folds``. Their errors are the covariance of a model that
+states none, and scale that of one that does (`tcpipe.cost.prediction_errors`): one rule for all.
 """
 
 from __future__ import annotations
@@ -32,8 +33,7 @@ from numpy.typing import NDArray
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
 from tcpipe.errors import ModelError
-from tcpipe.learning.architecture import compute_loss_factors, mean_loss
-from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, collect_labels
+from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, compute_loss_factors, mean_loss
 
 Patches: TypeAlias = NDArray[np.float32]
 Floats: TypeAlias = NDArray[np.float64]
@@ -59,6 +59,35 @@ class Inputs:
     """Columns: power and velocity, or energy alone."""
     scale: tuple[float, ...]
     """Largest label of each output in train."""
+
+    @property
+    def depth(self) -> int:
+        """Return how many planes a network takes: those of a patch, and one of each extra feature."""
+        return len(self.planes) + len(self.extra_features)
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Outputs of N metres of ground, power [W] and velocity [m/s] or energy [J], and the covariances of their errors."""
+
+    mean: Floats
+    """Shape (N, outputs)."""
+    covariance: Floats
+    """Shape (N, outputs, outputs); 0 where a model states none."""
+
+    @classmethod
+    def without_covariance(cls, mean: Labels) -> Prediction:
+        """Return a prediction of a model that states no covariances."""
+        return cls(np.asarray(mean, np.float64), np.zeros((*mean.shape, mean.shape[-1])))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Prediction]) -> Prediction:
+        """Return predictions one after another."""
+        return cls(np.concatenate([of.mean for of in parts]), np.concatenate([of.covariance for of in parts]))
+
+    def take(self, rows: NDArray[np.bool_]) -> Prediction:
+        """Return some of them."""
+        return Prediction(self.mean[rows], self.covariance[rows])
 
 
 @dataclass(frozen=True)
@@ -93,7 +122,9 @@ class Samples:
     @cached_property
     def labels(self) -> Floats:
         """What is to be predicted, shape (N, outputs)."""
-        return collect_labels(self.split, self.inputs.outputs).astype(np.float64)
+        outputs = self.inputs.outputs
+        labels = self.split.column(outputs[0]).astype(np.float32)[:, None] if len(outputs) == 1 else self.split.labels
+        return labels.astype(np.float64)
 
     @cached_property
     def weights(self) -> Floats:
@@ -109,10 +140,9 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A training: what messages call it, the hash of dataset and options, and where its state is kept until it is done."""
+    """A training: what messages call it, and where its state is kept until it is done."""
 
     name: str
-    key: str
     checkpoint: Path
 
 
@@ -121,8 +151,8 @@ class Fitted:
     """A fitted model, and what it, or models of the other folds, predict of samples that they were not fitted to."""
 
     predictor: Predictor
-    held_out: Labels
-    """Shape (N, outputs); NaN for samples that the model was fitted to."""
+    held_out: Prediction
+    """NaN for samples that the model was fitted to."""
     epochs: int = 1
     best_epoch: int = 1
     """Or the number of trees of an output."""
@@ -145,8 +175,11 @@ class Predictor(Protocol):
     stops_by_fold: ClassVar[bool] = False
     """Whether one fold of train stops its training, and the others alone are fitted."""
 
-    def predict(self, patches: Patches, features: ExtraFeatures) -> Labels:
-        """Return the outputs of N metres of ground, shape (N, outputs): power [W] and velocity [m/s], or energy [J]."""
+    def predict(self, patches: Patches, features: ExtraFeatures) -> Labels | tuple[Labels, Labels]:
+        """Return outputs of N metres of ground, shape (N, outputs): power [W] and velocity [m/s], or energy [J].
+
+        Or these and the covariances of their errors, shape (N, outputs, outputs), in squares and products of these units.
+        """
 
     @classmethod
     def fit(cls, samples: Samples) -> Predictor:
@@ -202,13 +235,14 @@ def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
     return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, 0.0, len(samples)))
 
 
-def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Floats:
-    """Return predictions of each part of the samples by a model of the others, shape (N, outputs)."""
+def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Prediction:
+    """Return predictions of each part of the samples by a model of the others."""
     require_folds(parts)
-    out = np.empty_like(samples.labels)
+    out = Prediction.without_covariance(np.empty_like(samples.labels))
     for part in np.unique(parts):
         held = parts == part
-        out[held] = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+        said = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+        out.mean[held], out.covariance[held] = said.mean, said.covariance
     return out
 
 
@@ -218,28 +252,56 @@ def require_folds(folds: NDArray[np.generic]) -> None:
         raise ModelError(f"{len(folds)} training samples are in one fold, expected two or more")
 
 
-def predict_samples(predictor: Predictor, samples: Samples) -> Floats:
-    """Return predictions of samples, shape (N, outputs); their patches are formed some at a time."""
-    out = np.empty((len(samples), len(samples.inputs.outputs)))
-    together = samples.split.view.form.batch_rows
+def predict_samples(predictor: Predictor, samples: Samples) -> Prediction:
+    """Return predictions of samples; their patches are formed some at a time."""
+    parts, together = list[Prediction](), samples.split.view.form.batch_rows
     for first in range(0, len(samples), together):
         rows = np.arange(first, min(first + together, len(samples)))
         patches = samples.split.batch(rows)[0]
-        out[rows] = predict_outputs(predictor, patches, samples.features.take(rows), samples.inputs.outputs)
-    return out
+        parts.append(ask_predictor(predictor, patches, samples.features.take(rows), samples.inputs.outputs))
+    nothing = np.empty((0, len(samples.inputs.outputs)))
+    return Prediction.concatenate([Prediction.without_covariance(nothing), *parts])
 
 
-def predict_outputs(predictor: Predictor, patches: Patches, features: ExtraFeatures, outputs: Sequence[str]) -> Labels:
-    """Return predictions of patches, shape (N, outputs); `ModelError` where a model gives something else."""
-    out = np.asarray(predictor.predict(patches, features))
-    if out.shape != (len(patches), len(outputs)):
-        raise ModelError(f"predict returned shape {out.shape}, expected {len(patches)} rows of {', '.join(outputs)}")
-    return out
+_ROUNDING = 1e-6
+"""Negative share of the largest eigenvalue up to which a covariance counts as one."""
 
 
-def find_held_out(held_out: Labels) -> NDArray[np.bool_]:
+def ask_predictor(
+    predictor: Predictor, patches: Patches, features: ExtraFeatures, outputs: Sequence[str]
+) -> Prediction:
+    """Return predictions of patches; `ModelError` where a model gives something else."""
+    said, count, named = predictor.predict(patches, features), len(outputs), " and ".join(outputs)
+    name = type(predictor).__name__
+    who = name if name == "predict" else f"{name}.predict"
+    is_pair = isinstance(said, tuple) and len(said) == 2
+    mean: Floats = np.array(said[0] if is_pair else said, np.float64)
+    if mean.shape != (len(patches), count):
+        raise ModelError(
+            f"{who} returned shape {mean.shape}, expected {(len(patches), count)}: {named} of {len(patches)} patches"
+        )
+    if not is_pair:
+        return Prediction.without_covariance(mean)
+    covariance: Floats = np.array(said[1], np.float64)
+    if covariance.shape != (*mean.shape, count):
+        raise ModelError(
+            f"{who} returned covariances of shape {covariance.shape}, expected {(*mean.shape, count)}: those of {named}"
+        )
+    transposed = covariance.transpose(0, 2, 1)
+    eigenvalues = np.linalg.eigvalsh(np.where(np.isfinite(covariance + transposed), covariance, -np.eye(count)))
+    wrong = eigenvalues.min(axis=1) < -_ROUNDING * np.abs(eigenvalues).max(axis=1)
+    wrong |= ~np.isclose(covariance, transposed, rtol=1e-4, atol=0.0).all(axis=(1, 2))
+    if wrong.any():
+        raise ModelError(
+            f"{who} returned {int(wrong.sum())} of {len(mean)} covariances that are none: expected finite symmetric matrices "
+            "without negative eigenvalues"
+        )
+    return Prediction(mean, covariance)
+
+
+def find_held_out(held_out: Prediction) -> NDArray[np.bool_]:
     """Return which samples have a held-out prediction, shape (N,)."""
-    return np.asarray(np.isfinite(held_out).all(axis=1))
+    return np.asarray(np.isfinite(held_out.mean).all(axis=1))
 
 
 def compute_held_loss(held: Samples, predicted: Labels) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from tcpipe.dataset.extra_features import (
     standardize_features,
 )
 from tcpipe.formats.weights import check_arrays
-from tcpipe.learning.architecture import require_torch
+from tcpipe.learning.network_model import require_torch
 from tcpipe.learning.physics_model import Curves, cross_fit_curves, fit_curves, list_curve_arrays, read_curves
 from tcpipe.learning.predictor import Inputs, Patches, Predictor, Samples
 
@@ -68,7 +68,7 @@ class ResidualModel(Predictor):
             batches, labels=(residuals / scale).astype(np.float32), weights=samples.weights.astype(np.float32)
         )
         steps = int(np.clip(config.residual_passes * len(samples) / _BATCH, _FEWEST_STEPS, _MOST_STEPS))
-        network = SmallNetwork(len(inputs.planes) + len(inputs.extra_features), len(inputs.outputs), seed=config.seed)
+        network = SmallNetwork.make(inputs.depth, len(inputs.outputs), seed=config.seed)
         network.fit((_add_planes(inputs, *batch) for batch in batches.forever()), steps, config)
         return cls(fit_curves("linear", *ground, samples.labels), network, scale, inputs)
 
@@ -80,16 +80,16 @@ class ResidualModel(Predictor):
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> ResidualModel:
         """Return the model of these arrays."""
         require_torch()
-        from tcpipe.learning.network import SmallNetwork  # noqa: PLC0415
+        from tcpipe.learning.network import SmallNetwork, load_network  # noqa: PLC0415
 
         outputs = len(inputs.outputs)
-        network = SmallNetwork(len(inputs.planes) + len(inputs.extra_features), outputs, seed=0)
-        weights = {name: ("float32", array.shape) for name, array in network.arrays().items()}
-        check_arrays(arrays, {**list_curve_arrays(outputs), "scale": ("float64", (outputs,)), **weights})
-        curves, rest = read_curves("linear", arrays)
-        scale = rest.pop("scale")
-        network.set_arrays(rest)
-        return cls(curves, network, scale, inputs)
+        forms = {**list_curve_arrays(outputs), "scale": ("float64", (outputs,))}
+        weights = {name: of for name, of in arrays.items() if name not in forms}
+        network = load_network(SmallNetwork, inputs.depth, outputs, arrays=weights)
+        rest = {name: of for name, of in arrays.items() if name in forms}
+        check_arrays(rest, forms)
+        curves, rest = read_curves("linear", rest)
+        return cls(curves, cast("SmallNetwork", network), rest["scale"], inputs)
 
 
 def _add_planes(inputs: Inputs, patches: Any, labels: Any, weights: Any) -> tuple[Patches, Patches, Patches]:

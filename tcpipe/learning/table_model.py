@@ -34,7 +34,7 @@ from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
 from tcpipe.learning.fitting import TrainingTimes
 from tcpipe.learning.physics_model import Curves, cross_fit_curves, fit_curves, list_curve_arrays, read_curves
-from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Predictor, Samples, require_folds
+from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Prediction, Predictor, Samples, require_folds
 from tcpipe.recipe import TrainConfig
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
 
@@ -439,7 +439,13 @@ class BoostingModel(Predictor):
         )
         trees = int(np.bincount(table.forest.output).max())
         times = TrainingTimes(time.perf_counter() - began, fed_s, len(samples))
-        return Fitted(cls(table, inputs, components), held_out, trees, trees, training_times_s=times)
+        return Fitted(
+            cls(table, inputs, components),
+            Prediction.without_covariance(held_out),
+            trees,
+            trees,
+            training_times_s=times,
+        )
 
     def _compute_features(self, patches: Patches) -> Floats:
         of = self.inputs

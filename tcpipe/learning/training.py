@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.cost.prediction_errors import make_residuals
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
 from tcpipe.dataset.extra_features import ExtraFeature, available_features, read_extra_features
@@ -23,12 +24,10 @@ from tcpipe.formats.bucket_directories import fetch_directory, has_card
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
-from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.fitting import FitConfig, ModelKind, Task, TrainingTimes, collect_labels
+from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
-from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, format_readme, is_current
+from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, format_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
-from tcpipe.learning.network_model import read_checkpoint
 from tcpipe.learning.own_models import load_own_kind, report_errors
 from tcpipe.learning.physics_model import find_idle_power
 from tcpipe.learning.predictor import (
@@ -36,7 +35,7 @@ from tcpipe.learning.predictor import (
     Fitted,
     Inputs,
     Job,
-    Labels,
+    Prediction,
     Predictor,
     Samples,
     compute_held_loss,
@@ -110,16 +109,16 @@ def choose_kind(data: Dataset, config: FitConfig, variant: Variant) -> ModelKind
     Each part of the runs is predicted by models of the others; of a single run, each fold. The loss is the squared error of time and of
     energy, each over its variance.
     """
-    split = make_training_task(data, config.fold, variant).train
+    split = select_train(data, variant)
     runs, folds = (np.unique(split.column(name), return_inverse=True)[1] for name in ("run_id", "fold"))
     part = runs % _MOST_FOLDS if runs.any() else folds
     clusters = runs if runs.max() + 1 >= _FEWEST_RUNS else runs * (folds.max() + 1) + folds
     losses: dict[ModelKind, Array] = {}
     for name in AUTOMATIC:
         kind = find_kind(name)
-        samples = make_samples(make_training_task(data, config.fold, variant, kind), config, data, kind)
         try:
-            losses[name] = _compute_losses(samples, cross_predict(kind, samples, part))
+            samples = make_samples(data, config, variant, kind)
+            losses[name] = _compute_losses(samples, cross_predict(kind, samples, part).mean)
         except ModelError as error:
             logger.info("%s is not compared: %s", name, error.problems[0])
     best = min(losses, key=lambda name: float(losses[name].mean()))
@@ -156,7 +155,6 @@ def train(
     config: FitConfig | None = None,
     variant: Variant | None = None,
     no_resume: bool = False,
-    disposable: bool = False,
     predictor: str | None = None,
 ) -> TrainResult:
     """Train a model on a dataset and write the model folder ``out``, whole or not at all.
@@ -165,12 +163,12 @@ def train(
     ----------
     dataset : what ``tcpipe build-dataset`` wrote.
     out : a new folder, or one with only a model, which is replaced unless it is complete and of the same dataset and options; or a URL in a
-        bucket, where it becomes the newest generation. ``<out>.checkpoint`` beside a folder keeps the state, so that a training continues.
+        bucket, where it becomes the newest generation. ``<out>.KEY.checkpoint`` beside a folder keeps the state, so that a training
+        continues; another dataset, or other options, have another one.
     config : the options.
     variant : what another network than the paper's is trained on.
     no_resume : ignore an earlier state.
     predictor : code of the user, ``FILE.py[:NAME]`` or an entry point, that is fitted instead of a shipped kind.
-    disposable : replace a state that is damaged or of another training, with a warning; otherwise such a state is an error.
 
     Raises
     ------
@@ -187,14 +185,12 @@ def train(
         return _train_into_bucket(str(out).rstrip("/"), key, again)
     place = Path(out)
     clear_beside(place)
-    checkpoint = _find_checkpoint_path(place)
-    if (
-        (known := _read_known_card(place)) is not None
-        and known.training.key == key
-        and not no_resume
-        and _is_whole(place, predictor)
-    ):
-        _remove_finished_state(checkpoint, key)
+    named = place if place.name not in {"", ".."} else place.resolve()
+    checkpoint = named.with_name(f"{named.name}.{key[:8]}.checkpoint")
+    if no_resume:
+        checkpoint.unlink(missing_ok=True)
+    elif (known := _read_known_model(place, predictor)) is not None and known.training.key == key:
+        checkpoint.unlink(missing_ok=True)  # of a training that was killed after it wrote its model
         return _make_result(place, "unchanged", known.training, TrainingTimes())
     name = choose_kind(data, rules, other) if rules.model == "auto" else rules.model
     kind = find_kind(name) if own is None else own.kind
@@ -205,15 +201,10 @@ def train(
         logger.log(level, "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
     elif variant is None:
         _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
-    task = make_training_task(data, rules.fold, other, kind)
+    samples = make_samples(data, rules, other, kind)
     _reject_other_files(place)
-    if rules.inverse_variance_weights and not other.energy_only:
-        _require_deviations(task, data)
-    if no_resume or (disposable and checkpoint.exists() and not _can_continue(checkpoint, key)):
-        checkpoint.unlink(missing_ok=True)
-    samples = make_samples(task, rules, data, kind)
     with report_errors(own):
-        fitted = kind.fit_folds(samples, Job(str(place), key, checkpoint))
+        fitted = kind.fit_folds(samples, Job(str(place), checkpoint))
         weights = {name: np.asarray(array) for name, array in kind.to_arrays(fitted.predictor).items()}
     if own is not None and (missing := int((~find_held_out(fitted.held_out)).sum())):
         raise ModelError(f"--predictor {predictor}: no finite prediction of {missing} of {len(samples)} samples")
@@ -256,53 +247,62 @@ def compute_dataset_checksum(card: DatasetCard) -> str:
     return digest(card.checksums)
 
 
-def make_training_task(data: Dataset, fold: int, variant: Variant, kind: type[Predictor] = Predictor) -> Task:
-    """Return labelled samples of train to fit a kind of model to, and the fold of train that stops the fitting.
-
-    Raises
-    ------
-    DatasetError : there is nothing to train on, or the fold is empty.
-    """
+def select_train(data: Dataset, variant: Variant, kind: type[Predictor] = Predictor) -> Split:
+    """Return the labelled samples of train that a kind of model is fitted to; `DatasetError` where there are none."""
     train = data["train"]
-    outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
     wanted = np.isfinite(train.labels).all(axis=1)
     if unlabelled := len(train) - int(wanted.sum()):
         logger.info("%s: %d of %d samples of train have no label and are not used", data.path, unlabelled, len(train))
     if variant.classes:
         wanted &= np.isin(train.column("terrain_class"), variant.classes)
     train = train.take(wanted)
-    if channels := kind.channels or variant.channels:
-        train = train.with_channels(*channels)
     if not len(train):
         raise DatasetError(
             f"{data.path}: no labelled samples in split train; check that its region (--split) contains runs"
         )
-    fitted, held = train.fold(fold)
-    if not len(held) or not len(fitted):
-        folds = sorted({int(number) for number in train.column("fold")})
-        named = ", ".join(map(str, folds))
+    channels = kind.channels or variant.channels
+    return train.with_channels(*channels) if channels else train
+
+
+def make_samples(
+    data: Dataset, rules: FitConfig, variant: Variant, kind: type[Predictor], train: Split | None = None
+) -> Samples:
+    """Return what a model of a kind is fitted to: of ``train`` as it is, or of all that `select_train` finds.
+
+    Raises
+    ------
+    DatasetError : there is nothing to train on, or the fold that is to stop the training is empty, or all of it.
+    """
+    needs_folds, train = train is None, select_train(data, variant, kind) if train is None else train
+    outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
+    folds = train.column("fold")
+    fitted = train.take(folds != rules.fold)
+    is_lacking = len(fitted) in {0, len(train)} if kind.stops_by_fold else len(np.unique(folds)) < 2
+    if needs_folds and is_lacking:
         cure = f"a block contains {data.card.recipe.split.block_m:g} m of ground: drive more of it"
         if data.card.recipe.split.holdout in ("run", "tag"):
             cure = "they are of whole runs: drive once more, or build it with --holdout block"
         raise DatasetError(
-            f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} held out; "
-            f"expected both (there are folds {named}; {cure})"
+            f"{data.path}: fold {rules.fold} of train leaves {len(fitted)} samples to fit and {len(train) - len(fitted)} held out; "
+            f"expected both (there are folds {', '.join(map(str, np.unique(folds)))}; {cure})"
         )
-    return Task(train, fitted, held, outputs)
-
-
-def make_samples(task: Task, rules: FitConfig, data: Dataset, kind: type[Predictor]) -> Samples:
-    """Return what a model of a kind is fitted to; a network of energy alone takes no extra features."""
-    used = task.fit if kind.stops_by_fold else task.train
-    extra_features: tuple[ExtraFeature, ...] = ()
-    if kind.features or (kind.features is None and rules.extra_features and len(task.outputs) > 1):
+    used = fitted if kind.stops_by_fold else train
+    if rules.inverse_variance_weights and not variant.energy_only:
+        none = [label for label, weights in zip(outputs, used.weights.T, strict=True) if not weights.any()]
+        if none:
+            raise DatasetError(
+                f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; "
+                "train without --inverse-variance-weights"
+            )
+    extra_features: tuple[ExtraFeature, ...] = ()  # a network of energy alone takes none
+    if kind.features or (kind.features is None and rules.extra_features and len(outputs) > 1):
         extra_features = _find_extra_features(used, kind.features, data)
     inputs = Inputs(
-        channels=task.train.channels, patch_px=data.card.patch_px, planes=task.train.view.form.planes, patch_m=data.card.patch_m,
-        class_count=read_class_table(data.card).count, extra_features=extra_features, outputs=task.outputs,
-        scale=tuple(map(float, collect_labels(task.train, task.outputs).max(axis=0))),
+        channels=train.channels, patch_px=data.card.patch_px, planes=train.view.form.planes, patch_m=data.card.patch_m,
+        class_count=read_class_table(data.card).count, extra_features=extra_features, outputs=outputs, scale=(),
     )  # fmt: skip
-    return Samples(task.train, inputs, rules, find_idle_power(task.train))
+    samples = Samples(train, inputs, rules, find_idle_power(train))
+    return replace(samples, inputs=replace(inputs, scale=tuple(map(float, samples.labels.max(axis=0)))))
 
 
 def _find_extra_features(used: Split, wanted: Sequence[str] | None, data: Dataset) -> tuple[ExtraFeature, ...]:
@@ -341,18 +341,16 @@ def find_training_range(split: Split) -> TrainingRange:
     return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges)
 
 
-def _read_known_card(place: Path) -> ModelCard | None:
-    """Return the card of the model that is there, None if there is none or one of another schema; an error if it is something else."""
+def _read_known_model(place: Path, predictor: str | None) -> ModelCard | None:
+    """Return the card of the model that is there; None if there is none, a damaged one, or one of another schema."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None
-    found = None
-    with suppress(StoreError):  # what cannot be read is told by `read_model_card`
-        found = read_json(place / CARD) if (place / CARD).is_file() else {}
-    if found is not None and found.get("kind") != KIND:
-        raise UsageError(f"{place}: exists and is no model; it is not changed; give another OUT")
-    if found is not None and not is_current(found):
-        return None
-    return read_model_card(place)
+    with suppress(StoreError):
+        if (read_json(place / CARD) if (place / CARD).is_file() else {}).get("kind") != KIND:
+            raise UsageError(f"{place}: exists and is no model; it is not changed; give another OUT")
+    with suppress(ModelError):
+        return load_model(place, predictor).card
+    return None
 
 
 def _reject_other_files(place: Path) -> None:
@@ -362,46 +360,6 @@ def _reject_other_files(place: Path) -> None:
     if strangers:
         raise UsageError(
             f"{place}: contains {', '.join(strangers)} in the directory of a model, which would be replaced; move it, or give another OUT"
-        )
-
-
-def _find_checkpoint_path(place: Path) -> Path:
-    """Return the path of the state, beside the folder (which may be ``.`` or ``..``)."""
-    named = place if place.name not in {"", ".."} else place.resolve()
-    return named.with_name(f"{named.name}.checkpoint")
-
-
-def _can_continue(checkpoint: Path, key: str) -> bool:
-    """Return whether training can continue from a checkpoint; warn where it cannot."""
-    try:
-        read_checkpoint(checkpoint, key)
-    except ModelError as error:
-        logger.warning("%s. Training starts again", error.problems[0])
-        return False
-    return True
-
-
-def _remove_finished_state(checkpoint: Path, key: str) -> None:
-    """Remove the state of a training that was killed after it wrote its model."""
-    with suppress(ModelError):
-        read_checkpoint(checkpoint, key)
-        checkpoint.unlink()
-
-
-def _is_whole(place: Path, predictor: str | None) -> bool:
-    try:
-        load_model(place, predictor)
-    except ModelError:
-        return False
-    return True
-
-
-def _require_deviations(task: Task, data: Dataset) -> None:
-    """Raise `DatasetError` if no sample has a standard deviation of a label to weigh it by."""
-    none = [label for label, weights in zip(task.outputs, task.fit.weights.T, strict=True) if not weights.any()]
-    if none:
-        raise DatasetError(
-            f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; train without --inverse-variance-weights"
         )
 
 
@@ -420,19 +378,8 @@ def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: 
     used = samples.split.take(samples.folds != config.fold) if is_network else samples.split
     held = samples.take(is_held)
     return ModelCard(
-        architecture=Architecture(
-            inputs.patch_px,
-            len(inputs.planes),
-            len(inputs.outputs),
-            config.width if is_network else 0,
-            len(inputs.extra_features),
-        ),
-        channels=inputs.channels,
+        inputs=inputs,
         layers={name: card.layers[name] for name in samples.split.view.form.layers if name not in PAPER_LAYERS},
-        outputs=inputs.outputs,
-        scale=inputs.scale,
-        extra_features=inputs.extra_features,
-        patch_m=card.patch_m,
         chord_m=card.recipe.segment.chord_m,
         max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
         label_velocity=card.label.velocity,
@@ -453,7 +400,7 @@ def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: 
             samples={"fitted": len(used), "held out": len(held)},
             epochs=fitted.epochs,
             best_epoch=fitted.best_epoch,
-            held_out_loss=compute_held_loss(held, fitted.held_out[is_held]),
+            held_out_loss=compute_held_loss(held, fitted.held_out.mean[is_held]),
             device=fitted.device,
         ),
     )
@@ -464,16 +411,17 @@ def read_class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _make_residuals_table(samples: Samples, held_out: Labels) -> pa.Table:
+def _make_residuals_table(samples: Samples, held_out: Prediction) -> pa.Table:
     """Return labels and predictions of what was held out, one row a sample."""
     is_held, outputs = find_held_out(held_out), samples.inputs.outputs
-    held, said, labels = samples.split.take(is_held), held_out[is_held], samples.labels[is_held]
+    held, said, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class", "fold")}
-    for number, name in enumerate(("power_watt", "velocity_mps") if len(outputs) > 1 else outputs):
-        quantity, _, unit = name.rpartition("_")
-        columns[name] = labels[:, number]
-        columns[f"{quantity}_predicted_{unit}"] = said[:, number].astype(np.float64)
-    if len(outputs) > 1:  # what the labels have in common is in no residual
+    if len(outputs) > 1:
+        columns |= make_residuals(
+            labels, said.mean, said.covariance
+        )  # what the labels have in common is in no residual
         columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}
         columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
+    else:
+        columns |= {"energy_joule": labels[:, 0], "energy_predicted_joule": said.mean[:, 0]}
     return pa.table(columns)

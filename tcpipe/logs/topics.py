@@ -42,6 +42,17 @@ class Topic:
     """How long between the first and the last message there was none, as far as the index tells [ns]."""
     schema_encoding: str = ""
 
+    @property
+    def span_s(self) -> float | None:
+        """From the first message to the last."""
+        return None if self.start_ns is None or self.end_ns is None else (self.end_ns - self.start_ns) / 1e9
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages a second."""
+        span_s = self.span_s or 0.0
+        return (self.message_count - 1) / span_s if self.message_count is not None and span_s > 0.0 else None
+
     def joined(self, other: Topic) -> Topic:
         """Return this topic with the messages of ``other``, the same topic in another file."""
         counts = (self.message_count, other.message_count)
@@ -142,8 +153,8 @@ def _describe_topic(topic: Topic) -> str:
     parts = [topic.type_name]
     if topic.message_count is not None:
         parts.append(f"{topic.message_count} messages")
-        if topic.start_ns is not None and topic.end_ns is not None and topic.end_ns > topic.start_ns:
-            parts.append(f"{(topic.message_count - 1) / (topic.end_ns - topic.start_ns) * 1e9:.3g} Hz")
+    if topic.rate_hz is not None:
+        parts.append(f"{topic.rate_hz:.3g} Hz")
     return f"{topic.name} ({', '.join(parts)})"
 
 
@@ -208,21 +219,14 @@ def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -
 
 def format_coverage(topic: Topic) -> str:
     """Return ``658 messages over 65.7 s``, as far as the index tells."""
-    span_s = _compute_span_s(topic)
+    span_s = topic.span_s
     count = "some messages" if topic.message_count is None else f"{topic.message_count} messages"
     silent = f", no messages for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""
     return count if span_s is None else f"{count} over {span_s:.1f} s{silent}"
 
 
 def _compute_covered_s(topic: Topic) -> float | None:
-    span_s = _compute_span_s(topic)
-    return None if span_s is None else span_s - topic.silent_ns / 1e9
-
-
-def _compute_span_s(topic: Topic) -> float | None:
-    if topic.start_ns is None or topic.end_ns is None:
-        return None
-    return (topic.end_ns - topic.start_ns) / 1e9
+    return None if topic.span_s is None else topic.span_s - topic.silent_ns / 1e9
 
 
 MISSING = {"no-gnss": "gnss", "no-power": "power", "no-imu": "imu", "no-wheel-odometry": "wheel_odometry"}

@@ -132,12 +132,7 @@ def commit_call(log: LogWriter, command: str, works_on: Sequence[str], *, option
 
     When it ends well, calls that were to do the same, and do not run, end with it. A store that cannot be written goes without.
 
-    Parameters
-    ----------
-    log : writes into the log of the store.
-    command : ``ingest`` or ``build-dataset``.
-    works_on : logs and folders, or the dataset, in full.
-    options : what else distinguishes its work from that of another call.
+    ``works_on`` are logs and folders, or the dataset, in full; ``options`` what else distinguishes its work from that of another call.
     """
     call, opened, begun = make_call(command, works_on, options), OpenCall(), list[int]()
     done = find_settled_calls(log.state, call)

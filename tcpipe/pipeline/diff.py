@@ -66,12 +66,7 @@ _CHANGES = ("only in a", "only in b", "other labels", "other columns", "other pa
 
 
 def diff(a: str | Path, b: str | Path) -> Difference:
-    """Compare two datasets; `DatasetError` if either is none.
-
-    Parameters
-    ----------
-    a, b : their directories or URLs, the older one first.
-    """
+    """Compare two datasets; `DatasetError` if either is none."""
     first, second = fetch_directory(a), fetch_directory(b)
     cards = read_card(first), read_card(second)
     there = [sample_columns(directory) for directory in (first, second)]

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -49,6 +49,9 @@ _NEARBY_NS = 5_000_000_000
 
 Value: TypeAlias = str | int | float | bool | None
 """Of a column in one row."""
+
+Row: TypeAlias = Mapping[str, Any]
+"""Values of a row of samples.parquet by column."""
 
 Setting: TypeAlias = Value | Sequence[Value | Mapping[str, Value]] | Mapping[str, Value | Sequence[Value]]
 """Of a key of a recipe."""
@@ -150,39 +153,18 @@ class Explained:
         return clean_lines(tuple(_iterate_lines(self.sample_id, self.facts, self.differences)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Sample:
-    """A sample's row of samples.parquet, and what of it is asked for."""
-
-    values: Mapping[str, Value]
-    row: int
-    sample_id: str
-    run_id: str
-    map: str
-    start_ns: int
-    end_ns: int
-    quality: int
-    labels: Mapping[str, float]
-
-
 def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
     """Tell where a sample of a dataset came from, and make it again from the store.
 
     Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data model, or the store no
     longer holds the sample's run.
-
-    Parameters
-    ----------
-    sample_id : its id.
-    dataset : the dataset's directory.
-    store : the store it was built from.
     """
     opened = open_store(store)
     directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)
-    card, sample = read_current_card(directory), _sample(directory, sample_id)
+    card, sample = read_current_card(directory), _read_sample(directory, sample_id)
     run = _run(opened, directory, card, sample)
     streams = opened.read_streams(run.run_id, key=run.streams_key)
-    source = open_map(*opened.map_files(sample.map))
+    source = open_map(*opened.map_files(sample["map"]))
     made = _sample_again(sample, run, streams, source, card)
     differences = tuple(_iterate_differences(open_patches(directory, card, fetched), card, sample, made))
     if differences:
@@ -191,13 +173,13 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
 
 
 def _read_history(
-    store: Store, card: DatasetCard, sample: _Sample, run: RunDirectory, *, streams: Streams | None, source: MapFile
+    store: Store, card: DatasetCard, sample: Row, run: RunDirectory, *, streams: Streams | None, source: MapFile
 ) -> History:
-    window, known = (sample.start_ns, sample.end_ns), store.run_json(run.run_id)
+    window, known = (sample["start_ns"], sample["end_ns"]), store.run_json(run.run_id)
     return History(
-        sample={**sample.values, "row": sample.row},
-        labels=sample.labels,
-        quality=flag_names(sample.quality, Quality),
+        sample=sample,
+        labels={name: sample[name] for name in _LABELS},
+        quality=flag_names(sample["quality"], Quality),
         run=convert_record(run.manifest, Ingestion),
         source=known.source if known else None,
         messages={} if streams is None else dict(_find_messages(streams, *window)),
@@ -217,7 +199,8 @@ _LABELS = tuple(
 )
 
 
-def _sample(directory: Path, sample_id: str) -> _Sample:
+def _read_sample(directory: Path, sample_id: str) -> Row:
+    """Return the row of a sample, and which ``row`` it is."""
     ids = read_samples(directory, ["sample_id"]).column("sample_id")
     row = pc.index(ids, sample_id).as_py()
     if row < 0:
@@ -231,23 +214,20 @@ def _sample(directory: Path, sample_id: str) -> _Sample:
         group = read_row_group(directory / SAMPLES, row // ROWS_PER_GROUP, names)
     except StoreError as error:
         raise DatasetError(*error.problems) from None
-    found = group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0]
-    asked = ("sample_id", "run_id", "map", "start_ns", "end_ns", "quality")
-    labels = {name: found[name] for name in _LABELS}
-    return _Sample(found, row, **{name: found[name] for name in asked}, labels=labels)
+    return {**group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0], "row": row}
 
 
-def _run(store: Store, directory: Path, card: DatasetCard, sample: _Sample) -> RunDirectory:
-    recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample.run_id), None)
+def _run(store: Store, directory: Path, card: DatasetCard, sample: Row) -> RunDirectory:
+    recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample["run_id"]), None)
     if recipe_id is None:
         raise DatasetError(
-            f"{directory}: its card lists no run {sample.run_id}; 'tcpipe verify {directory}' lists all problems"
+            f"{directory}: its card lists no run {sample['run_id']}; 'tcpipe verify {directory}' lists all problems"
         )
-    for run in store.recipes_of(sample.run_id):
+    for run in store.recipes_of(sample["run_id"]):
         if run.recipe_id == recipe_id:
             return run
     raise DatasetError(
-        f"{store.root}: run {sample.run_id} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
+        f"{store.root}: run {sample['run_id']} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
         "name the store it was built from with --store"
     )
 
@@ -297,8 +277,8 @@ def _iterate_rejections(run: RunDirectory, start_ns: int, end_ns: int) -> Iterat
         yield NearbyRefusal(role, reason, count)
 
 
-def _map(source: MapFile, sample: _Sample, card: DatasetCard) -> SampleMap:
-    known = {**sample.values, "position_std_m": 0.0}  # that of the shift is in it already
+def _map(source: MapFile, sample: Row, card: DatasetCard) -> SampleMap:
+    known = {**sample, "position_std_m": 0.0}  # that of the shift is in it already
     corners = _sample_segment(known, source, card).footprint_xy_m.reshape(-1, 2)
     px = source.grid.px_from_xy(corners)
     ends = (px.min(axis=0), px.max(axis=0)) if len(px) else (np.zeros(2), -np.ones(2))
@@ -323,7 +303,7 @@ def _sample_segment(segment: Mapping[str, Value], source: MapFile, card: Dataset
 
 
 def _sample_again(
-    sample: _Sample, run: RunDirectory, streams: Streams | None, source: MapFile, card: DatasetCard
+    sample: Row, run: RunDirectory, streams: Streams | None, source: MapFile, card: DatasetCard
 ) -> tuple[Mapping[str, Value], Patches] | str:
     """Return the segment and its patch as they come out now, or why they do not.
 
@@ -336,9 +316,11 @@ def _sample_again(
             segments = run_stages(streams, card.recipe.ingest, run_id=run.run_id)[2].table
         except TcpipeError as error:
             return "; ".join(error.problems)
-    row = pc.index(segments.column("segment_id"), sample.sample_id).as_py()
+    row = pc.index(segments.column("segment_id"), sample["sample_id"]).as_py()
     if row < 0:
-        away_s = np.abs(to_integers(segments, "start_ns") - sample.start_ns).min(initial=np.iinfo(np.int64).max) / 1e9
+        away_s = (
+            np.abs(to_integers(segments, "start_ns") - sample["start_ns"]).min(initial=np.iinfo(np.int64).max) / 1e9
+        )
         near = f"; the nearest begins {away_s:.3f} s away" if segments.num_rows else "; it has none now"
         return f"no segment of run {run.run_id} begins at this stamp now{near}"
     segment = segments.slice(row, 1).to_pylist()[0]
@@ -349,7 +331,7 @@ def _sample_again(
 
 
 def _iterate_differences(
-    files: PatchFiles, card: DatasetCard, sample: _Sample, made: tuple[Mapping[str, Value], Patches] | str
+    files: PatchFiles, card: DatasetCard, sample: Row, made: tuple[Mapping[str, Value], Patches] | str
 ) -> Iterator[str]:
     """Yield a line for each value and each layer that is not, bit for bit, what the dataset holds."""
     if isinstance(made, str):
@@ -357,27 +339,27 @@ def _iterate_differences(
         return
     segment, patches = made
     for name, value in segment.items():
-        if name in sample.values and sample.values[name] != value:
-            yield f"{name}: {value!r} now, {sample.values[name]!r} in the dataset"
+        if name in sample and sample[name] != value:
+            yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
     for name, values in patches.columns().items():
         now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
-        if now != sample.values[name]:
-            yield f"{name}: {now!r} now, {sample.values[name]!r} in the dataset"
-    for layer, stored in _read_stored_layers(files, card, sample.row).items():
+        if now != sample[name]:
+            yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"
+    for layer, stored in _read_stored_layers(files, card, sample["row"]).items():
         pixels = patches.pixels.get(layer)
         if pixels is None:
-            yield f"{layer}: map {sample.map} no longer has this layer"
+            yield f"{layer}: map {sample['map']} no longer has this layer"
         elif not np.array_equal(pixels[0], stored, equal_nan=pixels.dtype.kind == "f"):
             yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
 
 
-def _iterate_reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, source: MapFile) -> Iterator[str]:
+def _iterate_reasons(card: DatasetCard, sample: Row, run: RunDirectory, source: MapFile) -> Iterator[str]:
     """Yield what is not as it was when the dataset was built, which may be why."""
     versions = {card.tcpipe_version, run.manifest.tcpipe_version, __version__}
     if len(versions) > 1:
         yield f"made by tcpipe {', '.join(sorted(versions - {__version__}))}, this is {__version__}"
     for entry in card.maps:
-        if entry.name == sample.map and entry.inputs != source.facts.inputs:
+        if entry.name == sample["map"] and entry.inputs != source.facts.inputs:
             yield f"map {source.name} was added again later, from other files"
     for made_from in card.runs:
         now = run.checksum("segments.parquet").sha256

@@ -39,14 +39,13 @@ from tcpipe.pipeline.calls import (
     stored_bytes,
 )
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_queue import Item, LogQueue, hold_claims
+from tcpipe.pipeline.log_queue import Item, LogQueue, hold_claims, make_tasks
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
     find_failure,
     find_sources,
     is_there,
-    make_definitions_key,
     select_shard,
 )
 from tcpipe.pipeline.options import IngestOptions
@@ -112,22 +111,11 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
         log = open_log(opened)
         before = log.state
         given = tuple(make_absolute(path) for path in logs if not is_presigned(path))  # signed URLs are not stored
-        root = opened.root
-        message_definitions = None if options.message_definitions is None else Path(options.message_definitions)
-        if options.cluster is not None:  # its workers are elsewhere
-            root = root.absolute() if isinstance(root, Path) else root
-            message_definitions = None if message_definitions is None else message_definitions.absolute()
-        common = (root, ruling, robot, dict(options.tags or {}), options.force, message_definitions)
-        how = (*common, make_definitions_key(message_definitions), options.retry_failed, options.min_age_s)
-        tasks = [IngestTask(source, *how) for source in found.sources]
+        tasks = make_tasks(found.sources, options, opened.root, ruling)
         own = range(len(tasks)) if shard is None else select_shard(found.sources, shard)
         if options.on_found:
-            options.on_found(
-                {
-                    **dict.fromkeys(map(clean_line, found.problems), 0),
-                    **{tasks[at].source.name: tasks[at].source.size_bytes for at in own},
-                }
-            )
+            sizes = {tasks[at].source.name: tasks[at].source.size_bytes for at in own}
+            options.on_found({**dict.fromkeys(map(clean_line, found.problems), 0), **sizes})
         results: dict[int, IngestResult] = {}
 
         def tell(ended: Iterable[tuple[int, IngestResult]]) -> IngestSummary:

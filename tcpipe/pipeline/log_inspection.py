@@ -1,4 +1,4 @@
-"""What a log holds: topics and roles from its index; with everything read, also gaps, clocks and damage, in bounded memory."""
+"""What a log holds: topics and roles from its index; with everything read, also gaps, clocks and damage."""
 
 from __future__ import annotations
 
@@ -32,8 +32,6 @@ from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_MOST_ROWS = 1 << 17
-"""Of a topic with more messages every second, fourth … is kept to judge its clock by: steps that last are seen all the same."""
 _GAP_PERIODS, _GAP_NS = 3, 300_000_000
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIMES = 2
@@ -51,10 +49,10 @@ class StampCounts:
     median_period_s: float | None
     gaps: int
     """Where log time and header agree that nothing came."""
-    zero_stamps: int | None
-    backward_stamps: int | None
-    repeated_stamps: int | None
-    duplicates: int | None
+    zero_stamps: int | None = None
+    backward_stamps: int | None = None
+    repeated_stamps: int | None = None
+    duplicates: int | None = None
     """Messages that repeat the one before exactly."""
 
 
@@ -166,7 +164,12 @@ def _inspect_index(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
         played = "transforms", "places the sensors"
     role, why = played or (None, cast.left_out.get(topic.name) or topic.problem)
     return InspectedTopic(
-        name=topic.name, type=topic.type_name, messages=topic.message_count, rate_hz=_rate_hz(topic), role=role, why=why
+        name=topic.name,
+        type=topic.type_name,
+        messages=topic.message_count,
+        rate_hz=topic.rate_hz and round(topic.rate_hz, 2),
+        role=role,
+        why=why,
     )
 
 
@@ -200,7 +203,7 @@ def _add_stamps(
     counts = stamps.counts()
     if timeline is None:
         return replace(topic, stamps=counts)
-    wrong = timeline.notes.get("stamps_replaced", 0) * stamps.every - (counts.zero_stamps or 0)
+    wrong = timeline.notes.get("stamps_replaced", 0) - (counts.zero_stamps or 0)
     return replace(
         topic,
         stamps=counts,
@@ -221,7 +224,7 @@ def _find_slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, 
         choices = find_sources(
             topic.type_name, name, known.power_sources, platform=robot.platform, husky_power=recipe.read.husky_power
         )
-        rate_hz = _rate_hz(topic)
+        rate_hz = topic.rate_hz and round(topic.rate_hz, 2)
         if isinstance(choices, Finding) or rate_hz is None or not any(of.current or of.energy for of in choices[0]):
             continue  # a voltage alone may be slow
         averaged = {"auto": choices[0][0].averaged, "yes": True, "no": False}[recipe.read.power_averaged]
@@ -241,44 +244,24 @@ def _find_simulated_time(topics: Iterable[Topic]) -> Iterable[Finding]:
         yield make_finding("simulated-time", LOG_CLOCK, names={"topics": ", ".join(clocks)})
 
 
-def _rate_hz(topic: Topic) -> float | None:
-    if topic.message_count is None or topic.start_ns is None or topic.end_ns is None or topic.end_ns <= topic.start_ns:
-        return None
-    return round((topic.message_count - 1) / ((topic.end_ns - topic.start_ns) / 1e9), 2)
-
-
 class TopicStamps:
-    """Counts over all messages of a topic, and as many of its times as its clock is judged by."""
+    """The times of all messages of a topic, and which messages repeat the one before exactly."""
 
     def __init__(self) -> None:
-        self.every = 1
-        """One of so many messages is among `topic_times`."""
-        self._messages = self._zero = self._backward = self._repeated = self._duplicates = 0
-        self._long_steps: list[Ints] = []
-        self._longest_ns, self._longest_at_ns = 0, 0
+        self._pieces: list[tuple[Ints, Ints | None, Mask]] = []
         self._last: pa.Table | None = None
-        self._last_set_ns: int | None = None
-        self._kept: list[tuple[Ints, Ints | None, Mask]] = []
 
     def add(self, table: pa.Table) -> None:
         """Add the next rows, in the order of log time."""
         if not table.num_rows:
             return
-        first = table if self._last is None else pa.concat_tables([self._last, table])
-        log_ns, header_ns = to_integers(first, "log_time_ns"), _read_header_ns(first)
-        again = np.zeros(len(log_ns), bool)
-        steps = np.diff(log_ns)
+        rows = table if self._last is None else pa.concat_tables([self._last, table])
+        header_ns, same = _read_header_ns(rows), np.zeros(rows.num_rows, bool)
         if header_ns is not None:
-            again[1:] = (np.diff(header_ns) == 0) & (header_ns[1:] != 0)
-            steps = np.minimum(steps, np.where(header_ns[1:] != 0, np.diff(header_ns), steps))
-            self._count_stamps(header_ns[len(header_ns) - table.num_rows :])
-        same = again.copy()
-        same[again] = _find_repeated_rows(first, np.flatnonzero(again))
-        self._repeated += int(np.count_nonzero(again & ~same))
-        self._duplicates += int(np.count_nonzero(same))
-        self._note_gaps(steps, log_ns)
-        new = slice(len(log_ns) - table.num_rows, None)
-        self._keep(log_ns[new], None if header_ns is None else header_ns[new], same[new])
+            again = np.flatnonzero((np.diff(header_ns) == 0) & (header_ns[1:] != 0)) + 1
+            same[again] = _find_repeated_rows(rows, again)
+            header_ns = header_ns[-table.num_rows :].copy()
+        self._pieces.append((to_integers(table, "log_time_ns").copy(), header_ns, same[-table.num_rows :]))
         self._last = table.take(pa.array([table.num_rows - 1]))  # a slice would keep all of it
 
     def topic_times(self) -> TopicTimes:
@@ -287,52 +270,37 @@ class TopicStamps:
         return TopicTimes(log_ns, header_ns, (np.cumsum(~same).astype(np.float64),))
 
     def counts(self) -> StampCounts:
-        """Return what was counted."""
-        log_ns, header_ns, _ = self._joined()
-        period_ns = float(np.median(np.diff(log_ns))) / self.every if len(log_ns) > 1 else None
-        steps = np.concatenate([np.zeros(0, np.int64), *self._long_steps])
-        odd = (self._zero, self._backward, self._repeated, self._duplicates)
+        """Return what they show."""
+        log_ns, header_ns, same = self._joined()
+        steps, odd = np.diff(log_ns), dict[str, int]()
+        period_ns = float(np.median(steps)) if len(steps) else None
+        if header_ns is not None:
+            steps = np.minimum(steps, np.where(header_ns[1:] != 0, np.diff(header_ns), steps))
+            again = (np.diff(header_ns) == 0) & (header_ns[1:] != 0)
+            odd = {
+                "zero_stamps": int(np.count_nonzero(header_ns == 0)),
+                "backward_stamps": int(np.count_nonzero(np.diff(header_ns[header_ns != 0]) < 0)),
+                "repeated_stamps": int(np.count_nonzero(again & ~same[1:])),
+                "duplicates": int(np.count_nonzero(same)),
+            }
+        longest = int(np.argmax(steps)) if len(steps) else 0
         return StampCounts(
-            self._messages,
-            self._longest_ns / 1e9 if self._messages > 1 else None,
-            self._longest_at_ns if self._messages > 1 else None,
-            None if period_ns is None else period_ns / 1e9,
-            int(np.count_nonzero(steps > max(_GAP_PERIODS * (period_ns or 0), _GAP_NS))),
-            *((None,) * len(odd) if header_ns is None else odd),
+            messages_read=len(log_ns),
+            longest_gap_s=max(int(steps[longest]), 0) / 1e9 if len(steps) else None,
+            longest_gap_at_ns=(int(log_ns[longest]) if steps[longest] > 0 else 0) if len(steps) else None,
+            median_period_s=None if period_ns is None else period_ns / 1e9,
+            gaps=int(np.count_nonzero(steps > max(_GAP_PERIODS * (period_ns or 0), _GAP_NS))),
+            **odd,
         )
-
-    def _count_stamps(self, header_ns: Ints) -> None:
-        self._zero += int(np.count_nonzero(header_ns == 0))
-        stamps = header_ns[header_ns != 0]
-        if len(stamps):
-            before = stamps[0] if self._last_set_ns is None else self._last_set_ns
-            self._backward += int(np.count_nonzero(np.diff(stamps, prepend=before) < 0))
-            self._last_set_ns = int(stamps[-1])
-
-    def _note_gaps(self, steps: Ints, log_ns: Ints) -> None:
-        if len(steps) and steps.max() > self._longest_ns:
-            self._longest_ns, self._longest_at_ns = int(steps.max()), int(log_ns[steps.argmax()])
-        self._long_steps.append(steps[steps > _GAP_NS])  # of these a log of an hour has 12 000 at most
-
-    def _keep(self, log_ns: Ints, header_ns: Ints | None, same: Mask) -> None:
-        chosen = slice(-self._messages % self.every, None, self.every)
-        self._kept.append(
-            (log_ns[chosen].copy(), None if header_ns is None else header_ns[chosen].copy(), same[chosen])
-        )
-        self._messages += len(log_ns)
-        while sum(len(log) for log, _, _ in self._kept) > _MOST_ROWS:
-            log, header, again = self._joined()
-            self._kept = [(log[::2].copy(), None if header is None else header[::2].copy(), again[::2].copy())]
-            self.every *= 2
 
     def _joined(self) -> tuple[Ints, Ints | None, Mask]:
-        if not self._kept:
+        if not self._pieces:
             return np.zeros(0, np.int64), None, np.zeros(0, bool)
-        headers = [header for _, header, _ in self._kept if header is not None]
+        log_ns, header_ns, same = zip(*self._pieces, strict=True)
         return (
-            np.concatenate([log for log, _, _ in self._kept]),
-            np.concatenate(headers) if headers else None,
-            np.concatenate([same for _, _, same in self._kept]),
+            np.concatenate(log_ns),
+            None if header_ns[0] is None else np.concatenate(header_ns),
+            np.concatenate(same),
         )
 
 

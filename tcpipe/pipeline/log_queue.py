@@ -17,6 +17,7 @@ import time
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 from tcpipe import __version__
@@ -27,8 +28,16 @@ from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import SPOOL
 from tcpipe.pipeline.calls import LogWriter, identify_process, is_alive
-from tcpipe.pipeline.log_sources import add_hashes, group_possible_duplicates, plan_rounds
+from tcpipe.pipeline.log_sources import (
+    LogSource,
+    add_hashes,
+    group_possible_duplicates,
+    make_definitions_key,
+    plan_rounds,
+)
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, make_planner
+from tcpipe.recipe import Recipe
 
 LEASE_S = 120.0
 """A claim expires after this time. Where clocks differ by more, two tasks do the same work; nothing worse happens."""
@@ -126,6 +135,19 @@ def hold_claims(store: Place) -> Iterator[Claims]:
     finally:
         ended.set()
         claims.release_all()
+
+
+def make_tasks(
+    sources: Iterable[LogSource], options: IngestOptions, root: Path | str, recipe: Recipe
+) -> list[IngestTask]:
+    """Return the task of each log; on a cluster, whose workers are elsewhere, with absolute paths."""
+    definitions = None if options.message_definitions is None else Path(options.message_definitions)
+    if options.cluster is not None:
+        root = root.absolute() if isinstance(root, Path) else root
+        definitions = definitions and definitions.absolute()
+    robot, tags = options.robot or recipe.robot, dict(options.tags or {})
+    how = (root, recipe, robot, tags, options.force, definitions, make_definitions_key(definitions))
+    return [IngestTask(source, *how, options.retry_failed, options.min_age_s) for source in sources]
 
 
 Item: TypeAlias = tuple[int, IngestTask]

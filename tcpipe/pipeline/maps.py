@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines, hide_secrets
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.integrity import compute_checksum, read_seal
+from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import list_raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, RasterOrigin, map_lines, origin_lines
@@ -31,7 +31,7 @@ from tcpipe.formats.maps.remote_geotiff import open_window
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.run_documents import remove_if_empty
 from tcpipe.pipeline.options import AddMapOptions, Files
-from tcpipe.report.pictures import draw_quick_look, write_quick_look
+from tcpipe.report.pictures import draw_quick_look, write_overview
 from tcpipe.store import Store, open_store
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.levels import SAMPLES
@@ -114,7 +114,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
                     inputs=inputs,
                     origins=origins,
                 )
-                write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), read_seal(path))
+                write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
         except StoreError:
             if before or opened.map_number(name) == before:
                 raise

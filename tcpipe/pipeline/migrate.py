@@ -32,7 +32,6 @@ from tcpipe.formats.run_documents import (
     Manifest,
     RunJson,
     StoreDocument,
-    is_outdated,
     read_layout,
     read_sealed_at,
     split_number,
@@ -94,16 +93,9 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
     Raises `UsageError`: the path is none of these, or no store and to be brought elsewhere, or of a data model that this version does not
     know.
 
-    Parameters
-    ----------
-    path : the store, map (``.zarr``) or dataset; a store or dataset also by its URL.
-    to : where a store is brought to, a directory or URL; what is there of it already is not copied again. None: where it is.
+    ``to``: where a store is brought to; what is there of it already is not copied again. None: where it is.
     """
     source = open_place(path)
-    if is_outdated(source):
-        raise UsageError(
-            f"{path}: is a store of data model 1, which this version does not read, or an incomplete copy (no {MARK})"
-        )
     if (version := read_layout(source)) is not None:
         if version not in _KNOWN_VERSIONS:
             raise UsageError(f"{path}: is of data model {version}, this version knows {', '.join(_KNOWN_VERSIONS)}")

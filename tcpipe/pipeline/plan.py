@@ -218,13 +218,7 @@ class _Known:
 
 
 def make_planner(state: State, *, broken: Container[tuple[str, str]] = ()) -> Callable[[IngestTask], Step]:
-    """Return what finds out what a log needs that is to be ingested now.
-
-    Parameters
-    ----------
-    state : what the log of the store says.
-    broken : runs and recipes of which files are gone.
-    """
+    """Return what finds out what a log needs that is to be ingested now."""
     made, failures, names = dict[str, list[RunFacts]](), dict[str, list[Failure]](), set[str]()
     for key, row in state.runs.items():
         if key in broken:

@@ -79,11 +79,6 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
 
     Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is none of a run or log with a problem, or of
     several logs; nothing was acknowledged then.
-
-    Parameters
-    ----------
-    names : runs by their id, logs by path, URL or, where that is enough, file name; killed calls and commits by their name in `status`.
-    store : the store that knows the problems.
     """
     opened = open_store(store)
     log = LogWriter(opened, state := opened.state())

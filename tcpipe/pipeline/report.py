@@ -49,11 +49,7 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
 
     Raises `UsageError`: the path is none of these; `StoreError`: something cannot be read; of a store all other pages are written.
 
-    Parameters
-    ----------
-    path : what the page is of.
-    runs : of a store: write the page of every run too.
-    patches : of a dataset: write pictures of all patches into a folder beside the page, which shows them.
+    ``runs``: of a store, write the page of every run too. ``patches``: of a dataset, write pictures of all patches beside the page.
     """
     inside = is_store(path) or find_store_above(path) is not None
     if not inside and (is_url(path) or (Path(path) / CARD).is_file()):

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 
@@ -33,13 +32,14 @@ from tcpipe.pipeline.calls import (
     is_below,
     list_begun_calls,
 )
-from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, select_shard
-from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, IngestTask, LogState, Step, plan
+from tcpipe.pipeline.log_queue import make_tasks
+from tcpipe.pipeline.log_sources import find_sources, select_shard
+from tcpipe.pipeline.options import IngestOptions
+from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
-from tcpipe.recipe import Recipe
 from tcpipe.robust import estimate_robust_std
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding, Severity, Subject, Verdict, judge_by_code, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding, read_threshold
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
@@ -115,38 +115,17 @@ class Status:
 
 
 @pause_garbage_collection()
-def find_status(
-    logs: Iterable[str | Path] = (),
-    *,
-    store: str | Path = "tcpipe-store",
-    recipe: Recipe | str | Path | None = None,
-    robot: str | None = None,
-    as_one: bool = False,
-    shard: tuple[int, int] | None = None,
-    min_age_s: float = 600.0,
-    message_definitions: Path | None = None,
-    force: bool = False,
-    retry_failed: bool = False,
-    jobs: int = 1,
-    create: bool = False,
-) -> Status:
-    """Return where every log stands; parameters as those of `tcpipe.pipeline.ingest.ingest`.
+def find_status(options: IngestOptions, *, create: bool = False) -> Status:
+    """Return what a call of ingest with these options would find; with ``create`` the store need not be there.
+
+    Without logs: those that the latest calls of ingest were given. A log that was written more recently than ``min_age_s`` is growing.
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or nothing is known of its sources.
-
-    Parameters
-    ----------
-    logs
-        Logs and folders; none: those that the store's latest calls of ingest were given.
-    min_age_s
-        A log that was written since so many seconds is growing.
-    create
-        The store need not be there.
     """
-    ruling = resolve_recipe(recipe)
+    ruling, store = resolve_recipe(options.recipe), options.store
     opened = Store(store if is_url(store) else check_local_output(store)) if create else open_store(store)
     state = opened.state()
-    begun, given = list_begun_calls(state), [str(log) for log in logs]
+    begun, given = list_begun_calls(state), [str(log) for log in options.logs]
     sources = [format_path(log) for log in given]
     ingests = [(call.begin, call.logs) for call in state.calls if call.logs]
     ingests += [(call.begin, call.works_on) for call in begun if call.command == INGEST]
@@ -156,13 +135,10 @@ def find_status(
     if not given and not state.calls:
         raise UsageError(f"{opened.root}: no earlier call of ingest is known; give the logs or their folders")
     with make_scratch_directory() as staging:
-        found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
-    no_tags: Mapping[str, str] = {}
-    common = (opened.root, ruling, robot or ruling.robot, no_tags, force, message_definitions)
-    how = (*common, make_definitions_key(message_definitions), retry_failed)
-    runs = opened.ingestions(state=state)
-    mine = range(len(found.sources)) if shard is None else select_shard(found.sources, shard)
-    tasks = (IngestTask(found.sources[at], *how, min_age_s) for at in mine)
+        found = find_sources(given, as_one=options.as_one, staging=staging, tables=ruling.tables)
+    runs, shard = opened.ingestions(state=state), options.shard
+    tasks = make_tasks(found.sources, options, opened.root, ruling)
+    tasks = tasks if shard is None else [tasks[at] for at in select_shard(found.sources, shard)]
     steps = plan(tasks, state, broken=runs.lost if opened.place.path else ())
     problems = [*state.problems, *find_incomplete_runs(runs)]
     problems += [call.problem for call in begun if call.state == "killed"]
@@ -184,7 +160,7 @@ def find_status(
         sources=tuple(sources),
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
-        to_do=estimate(state.calls, INGEST, sum(step.task.source.size_bytes for step in waiting), jobs=jobs)
+        to_do=estimate(state.calls, INGEST, sum(step.task.source.size_bytes for step in waiting), jobs=options.jobs)
         if waiting
         else None,
         problems=tuple(problem.finding for problem in problems),
@@ -252,24 +228,20 @@ def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
     for run in sorted(dated, key=lambda run: (run.start_ns or 0, run.run_id)):
         for measure, unit, value in _iterate_measures(run):
             series.setdefault((run.robot, measure, unit), []).append(value)
-    return tuple(_find_changes(series.items()))
-
-
-def _find_changes(series: Iterable[tuple[tuple[str, str, str], Sequence[float]]]) -> Iterator[Finding]:
-    for (robot, measure, unit), values in series:
-        if (shift := find_shift(values)) is not None:
-            severity: Severity | None = "note" if measure == _USED else None
-            names = {"robot": robot, "unit": unit}
-            yield make_finding(
-                _CHANGE,
-                Subject("column", measure),
-                severity=severity,
-                names=names,
-                before=shift.before,
-                after=shift.after,
-                earlier_count=shift.earlier_count,
-                latest_count=shift.latest_count,
-            )
+    found = ((key, shift) for key, values in series.items() if (shift := find_shift(values)) is not None)
+    return tuple(
+        make_finding(
+            _CHANGE,
+            Subject("column", measure),
+            severity="note" if measure == _USED else None,
+            names={"robot": robot, "unit": unit},
+            before=shift["before"],
+            after=shift["after"],
+            earlier_count=shift["earlier_count"],
+            latest_count=shift["latest_count"],
+        )
+        for (robot, measure, unit), shift in found
+    )
 
 
 _USED = "used share of the distance"
@@ -288,18 +260,8 @@ def _iterate_measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 
-@dataclass(frozen=True, slots=True)
-class Shift:
-    """The medians of a series' latest values and of those before, and how many there are of each."""
-
-    before: float
-    after: float
-    earlier_count: int
-    latest_count: int
-
-
-def find_shift(values: Sequence[float]) -> Shift | None:
-    """Return how the latest values of a series differ from those before; None where they do not.
+def find_shift(values: Sequence[float]) -> dict[str, float] | None:
+    """Return the medians of a series' latest values and of those before, and how many they are; None where they do not differ.
 
     The latest quarter of the values, at most 20, is compared with those before: the medians must differ by more than three robust standard
     deviations (by the median absolute deviation) of the earlier values and by 5 % of their median (thresholds of the catalogue).
@@ -318,4 +280,4 @@ def find_shift(values: Sequence[float]) -> Shift | None:
     )
     if abs(after - before) <= enough:
         return None
-    return Shift(before, after, len(earlier), count)
+    return {"before": before, "after": after, "earlier_count": len(earlier), "latest_count": count}

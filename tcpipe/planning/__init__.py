@@ -1,1 +1,1 @@
-"""Costs of paths, directional cost maps and least-cost paths, by any model that satisfies `cost_model.CostModel`."""
+"""Costs of paths, directional cost maps and least-cost paths, by a trained model."""

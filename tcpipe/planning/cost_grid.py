@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError
-from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, CostModel, Reason, SegmentPredictions, iterate_predictions
+from tcpipe.learning.models import Model
+from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, Reason, SegmentPredictions, iterate_predictions
 from tcpipe.terrain.projection import make_metres_from_plane, parse_crs
 from tcpipe.terrain.sampling import PatchFrames, find_classes_at
 from tcpipe.terrain.target_grid import MapGrid
@@ -156,7 +157,7 @@ def make_empty_grid(grid: MapGrid) -> CostGrid:
 
 
 def iterate_blocks(
-    source: MapReader, model: CostModel, grid: MapGrid, wanted: NDArray[np.bool_] | None = None
+    source: MapReader, model: Model, grid: MapGrid, wanted: NDArray[np.bool_] | None = None
 ) -> Iterator[Cells]:
     """Yield flat indices of cells, at most `CELLS_OF_BLOCK` together, by tile of the map, so that each tile is decoded once.
 
@@ -167,7 +168,7 @@ def iterate_blocks(
     source, model, grid : the map, whose patches are sampled from it, and the cells.
     wanted : which cells, shape (rows, cols); None: all.
     """
-    level = choose_level(source, model.patch_m / model.patch_px)
+    level = choose_level(source, model.card.inputs.patch_m / model.card.inputs.patch_px)
     side_m = level.tile_px * level.grid.pixel_size_m
     tile_of_row, tile_of_col = (
         ((np.arange(count) + 0.5) * grid.pixel_size_m / side_m).astype(np.int64) for count in (grid.rows, grid.cols)
@@ -218,7 +219,7 @@ Mask = NDArray[np.bool_]
 class LazyCostGrid:
     """Costs and reasons, and of which cells they are known, shape (rows, cols) each."""
 
-    model: CostModel
+    model: Model
     source: MapReader
     costs: CostGrid
     judged: Mask
@@ -265,7 +266,7 @@ def read_classes(source: MapReader, grid: MapGrid) -> Classes:
     return classes
 
 
-def make_survey(model: CostModel, source: MapReader, cell_size_m: float) -> LazyCostGrid:
+def make_survey(model: Model, source: MapReader, cell_size_m: float) -> LazyCostGrid:
     """Return a survey of which nothing is known."""
     grid = make_grid(source, cell_size_m)
     known = np.zeros((2, grid.rows, grid.cols), np.bool_)
@@ -274,7 +275,7 @@ def make_survey(model: CostModel, source: MapReader, cell_size_m: float) -> Lazy
     )
 
 
-def read_survey(model: CostModel, source: MapReader, costs: CostGrid) -> LazyCostGrid:
+def read_survey(model: Model, source: MapReader, costs: CostGrid) -> LazyCostGrid:
     """Return a survey of which all is known, from a cost map."""
     known = np.ones((2, costs.grid.rows, costs.grid.cols), np.bool_)
     return LazyCostGrid(model, source, costs, known[0], known[1], CellFrames(costs.grid, where=f"map {source.name}"))

@@ -26,7 +26,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, fit_errors
+from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
@@ -38,6 +38,7 @@ from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.formats.qgis_styles import make_raster_style
+from tcpipe.learning.models import Model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
@@ -52,7 +53,7 @@ from tcpipe.planning.cost_grid import (
     make_grid,
     read_classes,
 )
-from tcpipe.planning.cost_model import CostModel, Reason, check_model, iterate_predictions
+from tcpipe.planning.cost_model import Reason, check_model, iterate_predictions
 from tcpipe.planning.path_cost import find_origin_m
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
@@ -153,13 +154,13 @@ class CostMapResult:
         )
 
 
-def make_cost_map_key(model: CostModel, source: MapFile, cell_size_m: float) -> str:
+def make_cost_map_key(model: Model, source: MapFile, cell_size_m: float) -> str:
     """Return what a cost map is made from, as a digest."""
     return digest({"model": model.checksum, "map": source.summary(), "cell_size_m": cell_size_m, "version": VERSION})
 
 
 def make_cost_map(
-    model: CostModel,
+    model: Model,
     source: MapFile,
     out: Path | str,
     *,
@@ -301,7 +302,7 @@ def _read_job(place: Path) -> str | None:
         return None
 
 
-def _predict_missing(model: CostModel, source: MapFile, spool: _Spool, step: Step) -> None:
+def _predict_missing(model: Model, source: MapFile, spool: _Spool, step: Step) -> None:
     """Ask the model about every cell that is not done."""
     costs = spool.costs
     frames = CellFrames(costs.grid, where=f"map {source.name}")
@@ -321,17 +322,17 @@ def _predict_missing(model: CostModel, source: MapFile, spool: _Spool, step: Ste
 
 
 def _write_files(
-    model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
+    model: Model, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
 ) -> CostMapCard:
     """Write all files but the card; return it."""
-    scales = _write(directory, _Strips(costs, fit_errors(model.residuals), read_classes(source, costs.grid)), origin_m)
+    scales = _write(directory, _Strips(costs, model.errors, read_classes(source, costs.grid)), origin_m)
     cells, shares = _compute_shares(costs)
     return CostMapCard(
         key=key,
         map=source.name,
         model=model.checksum,
-        robot=model.robot,
-        label_energy=model.label_energy,
+        robot=model.card.robot,
+        label_energy=model.card.label_energy,
         grid=costs.grid,
         courses_deg=tuple(ANGLES_DEG.tolist()),
         bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course", "std")),

@@ -1,6 +1,4 @@
-"""What planning needs of a trained model; `tcpipe.learning.models.Model` satisfies the protocol, and planning imports no trainer.
-
-Predictions of a model for 1 m segments of ground, and the reasons against each: no data, not traversable, outside the training range.
+"""Predictions of a model for 1 m segments of ground, and the reasons against each: no data, not traversable, outside the training range.
 
 A prediction outside the training range is a guess, so every segment has its reasons. The ranges are the smallest and largest values of
 training, not quantiles. Segments are processed in batches; a thread samples the next batch while the model predicts.
@@ -8,23 +6,22 @@ training, not quantiles. Segments are processed in batches; a thread samples the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import BiasCorrection, fit_bias_correction
+from tcpipe.cost.prediction_errors import BiasCorrection, fit_bias_correction, propagate_stated
 from tcpipe.dataset.extra_features import ExtraFeatures
-from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.errors import ModelError
+from tcpipe.learning.models import Model
+from tcpipe.learning.predictor import Prediction
 from tcpipe.tables.bits import flag_name
-from tcpipe.tables.facts import PhysicsFit
-from tcpipe.terrain.classes import NODATA_ID, ClassTable
-from tcpipe.terrain.layers import COLOURS, HEIGHT_STEP_M, LAYERS, PAPER_LAYERS, Layer
+from tcpipe.terrain.classes import NODATA_ID
+from tcpipe.terrain.layers import COLOURS, HEIGHT_STEP_M, LAYERS, PAPER_LAYERS
 from tcpipe.terrain.sampling import (
     Patches,
     PatchFrames,
@@ -38,106 +35,11 @@ from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, list_layers
 Floats = NDArray[np.float64]
 
 
-class CostModel(Protocol):
-    """A model of power [W] and velocity [m/s] of a patch; which velocity, ``label_velocity`` says."""
-
-    @property
-    def name(self) -> str:
-        """What the user calls it, for messages."""
-
-    @property
-    def checksum(self) -> str:
-        """Hex digest of all that rules its predictions."""
-
-    @property
-    def robot(self) -> str:
-        """The robot that it was trained on."""
-
-    @property
-    def classes(self) -> ClassTable:
-        """The class table that it was trained with."""
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Channels of the tensor, in order (`tcpipe.dataset.tensor`)."""
-
-    @property
-    def layers(self) -> Mapping[str, Layer]:
-        """Layers by name, of which its channels are, with the ranges by which they were scaled in training."""
-
-    @property
-    def patch_m(self) -> float:
-        """Side of a patch on the ground [m]."""
-
-    @property
-    def patch_px(self) -> int:
-        """Side of a patch in pixels."""
-
-    @property
-    def chord_m(self) -> float:
-        """Length of the segments that it was trained on [m]."""
-
-    @property
-    def max_arc_to_chord(self) -> float:
-        """Arc over chord above which no segment was trained on."""
-
-    @property
-    def label_velocity(self) -> str:
-        """``ground``: chord over duration; ``fused``: forward velocity along the surface (ADR-10)."""
-
-    @property
-    def label_energy(self) -> str:
-        """``total``: all that the power source measured; ``net``: less what the robot draws while it stands."""
-
-    @property
-    def class_counts(self) -> Mapping[int, int]:
-        """How many training samples each class had under its chord."""
-
-    @property
-    def pixel_classes(self) -> tuple[int, ...]:
-        """Classes of which any pixel occurred in training."""
-
-    @property
-    def training_range(self) -> Mapping[str, tuple[float, float]]:
-        """Smallest and largest ``slope_rad``, ``cross_slope_rad`` [rad] and ``relief_m`` [m] of the training patches."""
-
-    @property
-    def physics(self) -> PhysicsFit | None:
-        """What turning costs the robot, beside all else; None where no physics could be fitted."""
-
-    @property
-    def residuals(self) -> Mapping[str, NDArray[np.generic]]:
-        """Held-out samples, one row each.
-
-        ``run_id``, ``start_ns``, ``terrain_class``, labels ``power_watt`` and ``velocity_mps``, and what the model said of them:
-        ``power_predicted_watt``, ``velocity_predicted_mps``.
-        """
-
-    @property
-    def takes_turns(self) -> bool:
-        """Whether it is told how far a metre turns: its predictions hold what that costs."""
-
-    def predict(self, patches: NDArray[np.float32], extra_features: ExtraFeatures) -> NDArray[np.float32]:
-        """Return power [W] and velocity [m/s], shape (N, 2), of tensors of shape (N, px, px, channels), and what is known beside them."""
-
-
-@dataclass(frozen=True, slots=True)
-class Predicted:
-    """Power [W] and velocity [m/s] of N patches, shape (N,); NaN where the model was not asked or answered no velocity."""
-
-    power_watt: Floats
-    velocity_mps: Floats
-
-
-def _make_layout(model: CostModel) -> TensorLayout:
-    return TensorLayout(model.channels, model.layers, model.patch_px)
-
-
-def check_model(model: CostModel, source: MapReader) -> None:
+def check_model(model: Model, source: MapReader) -> None:
     """Raise `ModelError` if a map cannot give the model what it was trained on; all differences at once."""
     problems = []
-    needed = _make_layout(model).layers
-    there = list_layers(source, model.patch_m, model.patch_px)
+    needed = model.card.layout.layers
+    there = list_layers(source, model.card.inputs.patch_m, model.card.inputs.patch_px)
     if missing := [layer for layer in needed if layer not in there]:
         option = f"--{missing[0]}" if missing[0] in LAYERS else f"--layer {missing[0]}=FILE"
         option = "--ortho-bands rgb" if missing[0] in COLOURS else option
@@ -145,14 +47,14 @@ def check_model(model: CostModel, source: MapReader) -> None:
             f"map {source.name}: has no {', '.join(missing)}, which model {model.name} needs; add the map with {option}"
         )
     for name in set(needed) & there.keys() - PAPER_LAYERS.keys():
-        its, wanted = there[name], model.layers[name]
+        its, wanted = there[name], model.card.layout.known[name]
         if its.signature != wanted.signature:
             text = f"is {its.signature}, but {wanted.signature} in training"
             problems.append(f"map {source.name}: {name} {text}; add the raster that the model was trained with")
         elif its.classes != wanted.classes:
             problems.append(f"map {source.name}: {name} has other classes than in training; add it with those")
-    if "terrain" in needed and "terrain" in source.layers and model.classes != source.classes:
-        different = "; ".join(source.classes.differences(model.classes))
+    if "terrain" in needed and "terrain" in source.layers and model.card.class_table != source.classes:
+        different = "; ".join(source.classes.differences(model.card.class_table))
         problems.append(
             f"map {source.name}: its classes are not those that model {model.name} was trained with: {different}; "
             "train on a dataset of this class table, or add the map with the model's"
@@ -162,8 +64,8 @@ def check_model(model: CostModel, source: MapReader) -> None:
 
 
 def predict_patches(
-    model: CostModel, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats | None = None
-) -> Predicted:
+    model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats | None = None
+) -> Prediction:
     """Return what the model says of the patches that it is asked about, shape (N,); tensors are formed batch by batch.
 
     ``turn_radpm`` is how far a metre of each turns; NaN, or nothing, is as usual, and so is the speed that is commanded.
@@ -172,21 +74,21 @@ def predict_patches(
     ------
     ModelError : it gives something else than power and velocity.
     """
-    form = _make_layout(model)
+    form = model.card.layout
     pixels = {layer: patches.pixels[layer] for layer in form.layers}
-    out, unknown = np.full((asked.size, 2), np.nan), np.full(asked.size, np.nan)
+    out, unknown = Prediction.without_covariance(np.full((asked.size, 2), np.nan)), np.full(asked.size, np.nan)
     turns = unknown if turn_radpm is None else turn_radpm
     extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
     chosen = np.flatnonzero(asked)
     for rows in (chosen[first : first + form.batch_rows] for first in range(0, chosen.size, form.batch_rows)):
-        said = model.predict(form.form(pixels, rows), extra_features.take(rows))
-        if said.shape != (rows.size, 2):
+        said = model.ask(form.form(pixels, rows), extra_features.take(rows))
+        if said.mean.shape[1] != 2:
             raise ModelError(
-                f"{model.name}: gives {said.shape[-1]} numbers a patch, expected two: power and velocity; train it on both labels"
+                f"{model.name}: gives {said.mean.shape[1]} numbers a patch, expected two: power and velocity; train it on both labels"
             )
-        out[rows] = said
-    out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan
-    return Predicted(out[:, 0].copy(), out[:, 1].copy())
+        out.mean[rows], out.covariance[rows] = said.mean, said.covariance
+    out.mean[~(np.isfinite(out.mean).all(axis=1) & (out.mean[:, 1] > 0.0))] = np.nan
+    return out
 
 
 LANE_M = 0.7
@@ -233,7 +135,7 @@ def count_reasons(bits: Bits) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, source: MapReader) -> Bits:
+def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, source: MapReader) -> Bits:
     """Return the reasons of each patch, shape (N,).
 
     Parameters
@@ -250,7 +152,7 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, 
         Reason.RELIEF_OUTSIDE_TRAINING: (compute_relief_m(patches.pixels["height"]), "relief_m"),
     }
     for reason, (values, name) in ranges.items():
-        low, high = model.training_range[name]
+        low, high = model.card.training_range.ranges[name]
         bits[~((values >= low) & (values <= high))] |= np.uint16(reason)
     if "terrain" in patches.pixels:
         bits |= _find_class_reasons(patches, patches.pixels["terrain"], model, source)
@@ -259,19 +161,19 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, 
     return bits
 
 
-def _find_class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: CostModel, source: MapReader) -> Bits:
+def _find_class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: Model, source: MapReader) -> Bits:
     """Return what the map's classes forbid, and which of them training has not met; a model of another table takes no terrain."""
     traversable = source.classes.traversable()
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
     bits[patches.terrain_class == NODATA_ID] |= np.uint16(Reason.NODATA)
     seen, known = np.zeros(256, np.bool_), np.zeros(256, np.bool_)
-    seen[[class_id for class_id, count in model.class_counts.items() if count > 0]] = True
-    known[list(model.pixel_classes)] = True
-    if model.classes != source.classes:
+    seen[[class_id for class_id, count in model.card.training_range.class_counts.items() if count > 0]] = True
+    known[list(model.card.training_range.pixel_classes)] = True
+    if model.card.class_table != source.classes:
         seen[:], known[:] = True, True
     px = terrain.shape[1]
-    lane = np.flatnonzero(np.abs((np.arange(px) + 0.5) / px - 0.5) * model.patch_m <= LANE_M / 2.0)
+    lane = np.flatnonzero(np.abs((np.arange(px) + 0.5) / px - 0.5) * model.card.inputs.patch_m <= LANE_M / 2.0)
     of_pixels = (
         (~known + 2 * ~traversable).astype(np.uint8).take(terrain)
     )  # 1: unknown, 2: blocked; one pass over the pixels
@@ -290,13 +192,16 @@ BATCH = 4_096
 class SegmentPredictions:
     """What is said of N metres, shape (N,): `Reason` bits, predictions (NaN without a cost), and what the ground is.
 
-    Predictions are centred (`tcpipe.cost.prediction_errors`). ``velocity_mps`` is horizontal, whichever velocity the model predicts: a
-    metre of the map takes its inverse. ``height_m`` is that of the metre's middle, NaN where the map has none.
+    Predictions are centred (`tcpipe.cost.prediction_errors`); ``duration_std_s`` and ``energy_std_joule`` are what the model states of a
+    metre: 0 where it states none. ``velocity_mps`` is horizontal, whichever velocity the model predicts: a metre of the map takes its
+    inverse. ``height_m`` is that of the metre's middle, NaN where the map has none.
     """
 
     reasons: Bits
     power_watt: Floats
     velocity_mps: Floats
+    duration_std_s: Floats
+    energy_std_joule: Floats
     terrain_class: NDArray[np.uint8]
     slope_rad: Floats
     cross_slope_rad: Floats
@@ -304,7 +209,7 @@ class SegmentPredictions:
 
 
 def iterate_predictions(
-    model: CostModel,
+    model: Model,
     source: MapReader,
     batches: Iterable[PatchFrames],
     *,
@@ -316,16 +221,16 @@ def iterate_predictions(
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
     after another; without it all turn as usual.
     """
-    source = source.select({*PAPER_LAYERS, *_make_layout(model).layers})
+    source = source.select({*PAPER_LAYERS, *model.card.layout.layers})
     centring, tiles = (
         fit_bias_correction(model.residuals),
-        TilePool(choose_level(source, model.patch_m / model.patch_px)),
+        TilePool(choose_level(source, model.card.inputs.patch_m / model.card.inputs.patch_px)),
     )
 
     def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
-        chord_m = np.full(len(frames.centre_xy_m), model.chord_m)
-        on_map = count_corners_on(source.grid, compute_footprints(frames, model.patch_m)) == 4
-        patch_m, patch_px = model.patch_m, model.patch_px
+        chord_m = np.full(len(frames.centre_xy_m), model.card.chord_m)
+        on_map = count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)) == 4
+        patch_m, patch_px = model.card.inputs.patch_m, model.card.inputs.patch_px
         found = sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles)
         return found, on_map, None if turn_radpm is None else turn_radpm[first : first + len(chord_m)]
 
@@ -341,7 +246,7 @@ def iterate_predictions(
 
 
 def _predict_batch(
-    model: CostModel,
+    model: Model,
     source: MapReader,
     patches: Patches,
     on_map: NDArray[np.bool_],
@@ -353,15 +258,20 @@ def _predict_batch(
     bits = find_reasons(patches, on_map, model, source)
     asked = (bits & NO_COST == 0) & ask
     said = predict_patches(model, patches, asked, turn_radpm)
-    power_watt, velocity_mps = centring.apply(said.power_watt, said.velocity_mps, patches.terrain_class)
+    power_watt, velocity_mps = centring.apply(said.mean[:, 0], said.mean[:, 1], patches.terrain_class)
+    stated = propagate_stated(said.mean, said.covariance)
     bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
     known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
-    horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0
-    middle = patches.pixels["height"][:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
+    horizontal = np.cos(patches.slope_rad) if model.card.label_velocity == "fused" else 1.0
+    middle = (
+        patches.pixels["height"][:, model.card.inputs.patch_px // 2, model.card.inputs.patch_px // 2] * HEIGHT_STEP_M
+    )
     return SegmentPredictions(
         reasons=bits,
         power_watt=power_watt,
         velocity_mps=velocity_mps * horizontal,
+        duration_std_s=stated["duration"] / horizontal,
+        energy_std_joule=stated["energy"] / horizontal,
         terrain_class=patches.terrain_class,
         slope_rad=np.where(known, patches.slope_rad, np.nan),
         cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),
@@ -370,7 +280,7 @@ def _predict_batch(
 
 
 def predict_segments(
-    model: CostModel, source: MapReader, frames: PatchFrames, turn_radpm: Floats | None = None
+    model: Model, source: MapReader, frames: PatchFrames, turn_radpm: Floats | None = None
 ) -> SegmentPredictions:
     """Return what is said of all frames, in batches of `BATCH`; ``turn_radpm`` is how far a metre of each turns."""
     count = len(frames.centre_xy_m)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.cost.adaptation import Metres, Run
+from tcpipe.cost.adaptation import Metres, Run, predict
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
-from tcpipe.cost.prediction_errors import COVERAGE, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError, clean_lines
@@ -24,9 +24,10 @@ from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.learning.models import Model
 from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.pipeline.generations import write_generation
-from tcpipe.planning.cost_model import CostModel, Reason, check_model, predict_segments
+from tcpipe.planning.cost_model import Reason, check_model, predict_segments
 from tcpipe.planning.path_cost import find_added_turning
 from tcpipe.recipe import SampleConfig
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
@@ -132,7 +133,7 @@ class DrivenMetres:
 
 
 def predict_run(
-    model: CostModel,
+    model: Model,
     source: MapReader,
     run: RunDirectory,
     *,
@@ -151,7 +152,7 @@ def predict_run(
         name: to_floats(segments, name)
         for name in ("chord_m", "arc_length_m", "duration_s", "mean_abs_yaw_rate_radps", "position_std_m")
     }
-    measured, length_m = to_floats(segments, ENERGIES[model.label_energy].energy), values["arc_length_m"]
+    measured, length_m = to_floats(segments, ENERGIES[model.card.label_energy].energy), values["arc_length_m"]
     turn_rad = values["mean_abs_yaw_rate_radps"] * values["duration_s"]
     projection = find_map_projection(source, gnss_crs or run.manifest.recipe.read.gnss_crs)
     start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift[:2] for name in ("start", "end"))
@@ -162,11 +163,14 @@ def predict_run(
     turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, class_id, is_driven=True)
     distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start, axis=0), axis=1)), 0, 0.0)[: len(start)]
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
-    both = {"duration": (duration, values["duration_s"]), "energy": (energy, measured)}
+    both = {
+        "duration": (duration, values["duration_s"], said.duration_std_s),
+        "energy": (energy, measured, said.energy_std_joule),
+    }
     rise_m = length_m * np.tan(said.slope_rad)
     metres = {
-        name: Metres(predicted, label, class_id, distance_m, length_m, duration, rise_m, turn_rad)
-        for name, (predicted, label) in both.items()
+        name: Metres(predicted, label, class_id, distance_m, length_m, duration, rise_m, turn_rad, std)
+        for name, (predicted, label, std) in both.items()
     }
     uncertain = np.hypot(values["position_std_m"], shift[2]) > (sample or SampleConfig()).max_position_std_m
     reasons = [
@@ -178,7 +182,7 @@ def predict_run(
     return DrivenMetres(Run(run.run_id, metres), reasons)
 
 
-def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
+def collect_run(model: Model, source: MapReader, run: RunDirectory) -> Run:
     """Return the labelled segments of a run on ground that the model knows, predicted and measured; `UsageError` if there are none.
 
     The run may be of another robot, payload or season: a model is adapted by it.
@@ -193,30 +197,30 @@ def collect_run(model: CostModel, source: MapReader, run: RunDirectory) -> Run:
 
 
 def compute_drive_cost(
-    model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
+    model: Model, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
 ) -> DriveCost:
     """Return what a drive took beside what a model says of it.
 
     ``data`` is the dataset that the model was trained on: what of the drive it has seen; ``log`` what the user calls the drive;
     ``shifts`` are of runs on the map. `ModelError`, `UsageError`: it is of another robot, or has no segments.
     """
-    if run.manifest.robot != model.robot:
-        raise ModelError(f"{log}: is of robot {run.manifest.robot}, model {model.name} of {model.robot}")
+    if run.manifest.robot != model.card.robot:
+        raise ModelError(f"{log}: is of robot {run.manifest.robot}, model {model.name} of {model.card.robot}")
     segments = run.segments()
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
     recipe, shift = data.card.recipe, (shifts or {}).get(run.run_id, (0.0, 0.0, 0.0))
     found = predict_run(model, source, run, gnss_crs=recipe.read.gnss_crs, sample=recipe.sample, shift=shift)
-    errors, trained, length_m = fit_errors(model.residuals), data["train"], found.run.metres["energy"].length_m
+    errors, trained, length_m = model.errors, data["train"], found.run.metres["energy"].length_m
     near = are_near(
         compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
-        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.chord_m,
+        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.card.chord_m,
     )  # fmt: skip
     good = {name: of.take(found.is_good) for name, of in found.run.metres.items()}
     sums = {
         name: IntervalComparison(
             float(of.measured.sum()), float(of.predicted.sum()),
-            *((None, None) if errors is None else errors[name].compute_sum(of.predicted, of.class_id).interval),
+            *((None, None) if errors is None else predict(errors[name], of).total.interval),
         )
         for name, of in good.items()
     }  # fmt: skip
@@ -226,7 +230,7 @@ def compute_drive_cost(
         rest_m={name: float(length_m[[name in why for why in found.reasons]].sum()) for name in found.names},
         samples_in_training=int((trained.column("run_id").astype(np.str_) == run.run_id).sum()),
         near_training_percent=100.0 * float(near.mean()),
-        duration_s=sums["duration"], energy_joule=sums["energy"], label_energy=model.label_energy,
+        duration_s=sums["duration"], energy_joule=sums["energy"], label_energy=model.card.label_energy,
     )  # fmt: skip
 
 
@@ -293,7 +297,7 @@ class DrivesResult:
 
 
 def evaluate_drives(
-    model: CostModel, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
+    model: Model, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
 ) -> DrivesResult:
     """Compare drives with what a model says of them and write ``drives.json`` into the directory ``out``, or to a URL.
 

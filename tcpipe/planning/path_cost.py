@@ -13,15 +13,15 @@ from pyarrow import csv
 from pyproj import Geod
 
 from tcpipe.cost.adaptation import ELSEWHERE_M, Adapted, Metres, Run, adapt, predict
-from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.rotation import wrap_to_pi
+from tcpipe.learning.models import Model
 from tcpipe.path import find_cuts
 from tcpipe.planning.cost_model import (
-    CostModel,
     Reason,
     SegmentPredictions,
     check_model,
@@ -111,7 +111,7 @@ def find_origin_m(source: MapReader, origin_deg: tuple[float, float] | None) -> 
 
 
 def compute_path_cost(
-    model: CostModel,
+    model: Model,
     source: MapReader,
     lonlat_deg: Floats,
     *,
@@ -130,16 +130,16 @@ def compute_path_cost(
     shortest_m : the least length of a path, without it that of a piece.
     """
     check_model(model, source)
-    pieces = _cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where, shortest_m=shortest_m)
-    frames = pieces.frames(model.chord_m)
-    if not count_corners_on(source.grid, compute_footprints(frames, model.patch_m)).any():
+    pieces = _cut_into_pieces(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
+    frames = pieces.frames(model.card.chord_m)
+    if not count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
     turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
     turn_radpm = turn_rad / pieces.arc_m
-    usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
+    usual_radpm = 0.0 if model.card.physics is None else model.card.physics.mean_turn_radpm
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
     said = predict_segments(model, source, frames, turn_radpm)
-    said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
+    said.reasons[pieces.arc_m > model.card.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _sum_costs(model, source, pieces, said, turn_rad, known)
 
 
@@ -164,20 +164,20 @@ def _cut_into_pieces(
     return pieces
 
 
-def find_added_turning(model: CostModel) -> Turning | None:
+def find_added_turning(model: Model) -> Turning | None:
     """Return what turns cost beside what a model predicts; None where it was told them, or the robot's physics is not known."""
-    return None if model.takes_turns else find_turning(model.physics, model.classes)
+    return None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
 
 
 def _sum_costs(  # noqa: PLR0917
-    model: CostModel,
+    model: Model,
     source: MapReader,
     pieces: Pieces,
     said: SegmentPredictions,
     turn_rad: Floats,
     known: Run | None,
 ) -> PathCost:
-    class_id, errors, turning = said.terrain_class, fit_errors(model.residuals), find_added_turning(model)
+    class_id, errors, turning = said.terrain_class, model.errors, find_added_turning(model)
     nothing = np.full(len(class_id), np.nan)
     duration = pieces.arc_m / said.velocity_mps
     turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
@@ -192,7 +192,8 @@ def _sum_costs(  # noqa: PLR0917
     if errors is not None:
         begin_m, rise_m = ELSEWHERE_M + np.cumsum(pieces.arc_m), pieces.arc_m * np.tan(said.slope_rad)
         for name, of in found.items():
-            there = Metres(of.value, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad)
+            std = pieces.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
+            there = Metres(of.value, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad, std)
             found[name] = (
                 predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
             )
@@ -222,8 +223,8 @@ def _sum_costs(  # noqa: PLR0917
     totals = PathTotals(
         model=model.name,
         map=source.name,
-        robot=model.robot,
-        label_energy=model.label_energy,
+        robot=model.card.robot,
+        label_energy=model.card.label_energy,
         adapted_by=None if known is None else known.name,
         length_m=float(pieces.arc_m.sum()),
         pieces=table.num_rows,

@@ -18,13 +18,14 @@ from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
-from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_sealed_as, write_sealed
+from tcpipe.formats.integrity import compute_checksum, describe_broken, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.geometry.rotation import wrap_to_pi
+from tcpipe.learning.models import Model
 from tcpipe.planning.cost_grid import make_survey, read_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
-from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.planning.cost_model import check_model
 from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, find_added_turning, write_pieces
 from tcpipe.planning.path_options import PlanPathOptions
 from tcpipe.planning.plan import OBJECTIVES, Objective, Plan, PlanTotals, plan_paths
@@ -121,7 +122,7 @@ def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
 
 
 def predict_path(
-    model: CostModel, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
+    model: Model, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
 ) -> PathResult:
     """Return what the line in a GeoJSON file costs; write its pieces to ``out`` and the totals beside it.
 
@@ -279,7 +280,7 @@ _RULES = ("start", "goal", "objective", "cell_size_m", "allow_extrapolation", "r
 """Options that determine a plan."""
 
 
-def plan(model: CostModel, source: MapFile, options: PlanPathOptions) -> PlanResult:
+def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     """Find the path that is asked for and write it to ``out``; with ``picture`` all three, side by side."""
     out, picture = Path(options.out), None if options.picture is None else Path(options.picture)
     _check_names(out, picture)
@@ -323,7 +324,7 @@ def plan(model: CostModel, source: MapFile, options: PlanPathOptions) -> PlanRes
     return PlanResult(objective, out, picture, "done", origin.plans, together)
 
 
-def _add_up(model: CostModel, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
+def _add_up(model: Model, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
     """Return what a path and the way back take, with the turn between them, and the probability that a budget suffices."""
     energy, complete = there.totals.energy_joule, there.totals.complete
     errors = None if there.cost.errors is None else there.cost.errors["energy"]
@@ -353,13 +354,13 @@ def _check_names(out: Path, picture: Path | None) -> None:
         raise UsageError(f"{picture}: expected the name of a file that ends in .png")
 
 
-def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
+def _read_card(path: Path, model: Model, source: MapFile) -> CostMapCard:
     """Return the card of a cost map of this model and map; `ModelError` if it is none."""
     card = read_cost_map_card(path)
     if card is None:
         if not (path / CARD).is_file():
             raise UsageError(f"{path}: not a cost map; make one with tcpipe cost-map")
-        raise ModelError(f"{find_broken_seal(path / CARD)}; make one with tcpipe cost-map")
+        raise ModelError(f"{describe_broken(path / CARD)}; make one with tcpipe cost-map")
     if card.key != make_cost_map_key(model, source, card.grid.pixel_size_m):
         raise ModelError(
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, fit_errors
+from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
 from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
@@ -123,7 +123,7 @@ def plan_paths(
     PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
     ModelError : the model states no errors for ``risk``.
     """
-    errors = fit_errors(survey.model.residuals)
+    errors = survey.model.errors
     if risk is not None and errors is None:
         raise ModelError(
             f"{survey.model.name}: has too few held-out samples for errors, which --risk and --budget need"
@@ -203,9 +203,9 @@ class _Search:
                 elif not may[class_id]:
                     problems.append(f"{label}: is on {names[class_id]}, which is not traversable")
         apart_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]))
-        if apart_m < self.survey.model.chord_m:
+        if apart_m < self.survey.model.card.chord_m:
             problems.append(
-                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; expected at least {self.survey.model.chord_m:g} m"
+                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; expected at least {self.survey.model.card.chord_m:g} m"
             )
         elif len(set(self._cells.tolist())) == 1:
             pixel_size_m = self.survey.costs.grid.pixel_size_m
@@ -268,7 +268,7 @@ class _Search:
             return steps, ()
         if objective != "energy" or class_id is None:
             return steps, find_least_cost_paths(steps, 0.0, start, goal)
-        turning = find_turning(self.survey.model.physics, self.survey.model.classes)
+        turning = find_turning(self.survey.model.card.physics, self.survey.model.card.class_table)
         return steps, find_least_cost_paths(steps, find_best_potential(steps), start, goal, turning, class_id)
 
     def find_finalists(

@@ -18,7 +18,8 @@ from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import Json, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.route_graph import RouteEdge, RouteGraph, make_route_graph, read_route_graph
-from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.learning.models import Model
+from tcpipe.planning.cost_model import check_model
 from tcpipe.planning.path_cost import PathCost, compute_path_cost, find_origin_m, find_projection
 from tcpipe.store import Store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
@@ -80,7 +81,7 @@ class RouteGraphResult:
 
 
 def write_route_graph(
-    model: CostModel,
+    model: Model,
     source: MapFile,
     out: Path,
     *,

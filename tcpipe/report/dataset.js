@@ -1,5 +1,5 @@
 "use strict";
-// The dataset's page: samples on the map and in the plot, one of them in words with its patch, and the gallery.
+// The dataset's page. One selection, made by filters that combine, is shown on the map, in the plots, in words, as patches and as a table.
 const unpacked = page.unpack(page.data.samples.packed);
 page.start(async () => {
   const told = page.data;
@@ -11,17 +11,19 @@ page.start(async () => {
   const kinds = {
     split: ["split"], class: ["terrain class"], quality: ["quality"], run: ["run"],
     power: ["power w", "W", 0], velocity: ["velocity v", "m/s", 2], duration: ["time T", "s", 2], energy: ["energy E", "J", 0],
-    slope: ["slope along travel", "°", 1], turn: ["turn", "°", 1], residual: ["w beyond physics", "W", 0],
+    slope: ["slope along travel", "°", 1], turn: ["turn", "°", 1], residual: ["w beyond physics", "W", 0], power_std: ["σ of w", "W", 1],
     apart: ["way to the nearest train metre", "m", 2],
   };
   const label = (name) => kinds[name][0] + (kinds[name][1] ? ` [${kinds[name][1]}]` : "");
   const classes = new Map(told.classes.map((one) => [one.id, one]));
+  const className = (i) => classes.get(c.class[i])?.name ?? "unknown";
+  const splitName = (i) => told.splits[c.split[i]].name;
   const shades = Array.from({ length: 64 }, (_, i) => {
     const place = (i / 63) * (ramp.length - 1), low = Math.min(Math.floor(place), ramp.length - 2), share = place - low;
     const part = (k) => Math.round(parseInt(ramp[low].slice(k, k + 2), 16) * (1 - share) + parseInt(ramp[low + 1].slice(k, k + 2), 16) * share);
     return `rgb(${part(1)},${part(3)},${part(5)})`;
   });
-  const digits = (value, name) => Number.isFinite(value) ? `${value.toFixed(kinds[name][2])}\u00a0${kinds[name][1]}` : "none";
+  const digits = (value, name) => Number.isFinite(value) ? `${page.fixed(value, kinds[name][2])}\u00a0${kinds[name][1]}` : "none";
 
   function coloured(name) {
     const legend = [];
@@ -56,10 +58,13 @@ page.start(async () => {
     return fill;
   }
 
-  const there = (names) => names.filter((name) => name in c && (name !== "apart" || c.apart.some(Number.isFinite)));
-  fillSelect(at("colour"), there(Object.keys(kinds)), (name) => kinds[name][0]);
-  fillSelect(at("across"), there(["slope", "velocity", "turn", "residual"]), (name) => kinds[name][0]);
-  fillSelect(at("up"), there(["power", "energy", "velocity"]), (name) => kinds[name][0]);
+  const there = (names) => names.filter((name) => c[name]?.some(Number.isFinite));
+  const fillKinds = (id, names) => fillSelect(at(id), there(names), (name) => kinds[name][0]);
+  const numeric = Object.keys(kinds).filter((name) => kinds[name].length > 1);
+  fillKinds("colour", Object.keys(kinds));
+  fillKinds("across", ["slope", "velocity", "turn", "residual"]);
+  fillKinds("up", ["power", "energy", "velocity"]);
+  fillKinds("quantity", numeric);
   page.chooseGround(told.ground);
   for (const [id, name] of [["next", "drive next"], ["leaks", "leaks"]]) {
     const drawn = page.model(name);
@@ -74,76 +79,250 @@ page.start(async () => {
   }
   const brush = page.model("brush");
   const plotted = () => ({ across: Float64Array.from(c[at("across").value]), up: Float64Array.from(c[at("up").value]) });
-  const replot = () => {
+  source.data = { x: c.x, y: c.y, fill: coloured("split"), ...plotted() };
+  at("colour").onchange = () => { source.data = { ...source.data, fill: coloured(at("colour").value) }; };
+  at("across").onchange = at("up").onchange = () => {
     source.data = { ...source.data, ...plotted() };
     brush.below[0].axis_label = label(at("across").value);
     brush.left[0].axis_label = label(at("up").value);
+    drawHere();
   };
-  source.data = { x: c.x, y: c.y, fill: coloured("split"), ...plotted() };
-  at("colour").onchange = () => { source.data = { ...source.data, fill: coloured(at("colour").value) }; };
-  at("across").onchange = at("up").onchange = replot;
+
+  // The selection: rows that pass all filters; none without a filter. `current` is the one of them that is shown in words.
+  const filters = new Map();
+  const passes = (i, without) => [...filters].every(([name, passed]) => name === without || passed(i));
+  let [selected, current, isLone] = [[], -1, false];
+  function setFilter(name, passed) {
+    if (name !== "picked" && isLone) filters.delete("picked");  // a single sample would leave nothing to filter
+    if (passed) filters.set(name, passed);
+    else filters.delete(name);
+    selected = filters.size ? [...c.x.keys()].filter((i) => passes(i)) : [];
+    current = passes(current) && filters.size ? current : selected[0] ?? -1;
+    drawSelection();
+  }
+  function pick(rows) {
+    if (rows.length === 1 && !passes(rows[0], "picked")) clear();
+    isLone = rows.length === 1;
+    const picked = new Set(rows);
+    setFilter("picked", rows.length ? (i) => picked.has(i) : null);
+  }
+  function clear() {
+    filters.clear();
+    ["run", "class", "split", "flag", "least", "most"].forEach((id) => { at(id).value = ""; });
+    setFilter("picked", null);
+  }
+  const choices = {
+    run: [[...told.runs.keys()], (k) => told.runs[k].id, (k) => (i) => c.run[i] === k],
+    class: [[...new Set(c.class)].sort((a, b) => a - b), (k) => classes.get(k)?.name ?? "unknown", (k) => (i) => c.class[i] === k],
+    split: [[...told.splits.keys()].filter((k) => told.splits[k].count), (k) => told.splits[k].name, (k) => (i) => c.split[i] === k],
+    flag: [told.quality.map(([bit]) => bit).filter((bit) => c.quality.some((q) => q & bit)), (k) => told.quality.find(([bit]) => bit === k)[1],
+      (k) => (i) => (k ? c.quality[i] & k : !(c.quality[i] & told.flags))],
+  };
+  for (const [id, [values, text, passed]] of Object.entries(choices)) {
+    fillSelect(at(id), values, text);
+    at(id).onchange = () => setFilter(id, at(id).value === "" ? null : passed(Number(at(id).value)));
+  }
+  function setRange() {
+    const values = c[at("quantity").value], given = (id, open) => (at(id).value === "" ? open : at(id).valueAsNumber);
+    const [least, most] = [given("least", -Infinity), given("most", Infinity)];
+    setFilter("range", least > -Infinity || most < Infinity ? (i) => values[i] >= least && values[i] <= most : null);
+  }
+  at("least").onchange = at("most").onchange = setRange;
+  at("quantity").onchange = () => {
+    at("least").value = at("most").value = "";
+    setRange();
+  };
+  page.model("histogram").on_event("selectiongeometry", ({ geometry: { x0, x1 } }) => {
+    at("least").value = Number(Math.min(x0, x1).toPrecision(4));
+    at("most").value = Number(Math.max(x0, x1).toPrecision(4));
+    setRange();
+  });
+  for (const [name, axes] of [["map", ["x", "y"]], ["brush", ["across", "up"]]]) {
+    page.clickNearest(name, source, axes, (i) => passes(i, "picked"), (i, adds) => {
+      pick(adds ? (selected.includes(i) ? selected.filter((k) => k !== i) : [...selected, i]) : [i]);
+    });
+  }
+  let drawing = false;
+  source.selected.change.connect(() => { if (!drawing) pick([...source.selected.indices]); });
+
+  // What shows it.
+  const bins = 40;
+  const histogram = page.model("histogram"), bars = page.model("bars").data_source, here = page.model("here").data_source;
+  function drawHistogram() {
+    const name = at("quantity").value, values = c[name], known = values.filter(Number.isFinite);
+    const [low, high] = known.reduce(([least, most], v) => [Math.min(least, v), Math.max(most, v)], [Infinity, -Infinity]);
+    const width = (high - low) / bins || 1, all = new Array(bins).fill(0), chosen = [...all];
+    const binOf = (v) => Math.min(bins - 1, Math.floor((v - low) / width));
+    known.forEach((v) => { all[binOf(v)] += 1; });
+    selected.forEach((i) => { if (Number.isFinite(values[i])) chosen[binOf(values[i])] += 1; });
+    bars.data = { left: all.map((_, k) => low + k * width), right: all.map((_, k) => low + (k + 1) * width), all, chosen };
+    histogram.below[0].axis_label = label(name);
+  }
+  function drawHere() {
+    here.data = Object.fromEntries(Object.entries(source.data).map(([name, values]) => [name, current < 0 ? [] : [values[current]]]));
+  }
+  function focus(i) {
+    current = i;
+    drawHere();
+    drawWords();
+    drawPage();
+  }
+  function drawSelection() {
+    drawing = true;
+    source.selected.indices = selected;
+    drawing = false;
+    first = 0;
+    drawHistogram();
+    drawHere();
+    drawWords();
+    drawPage();
+    drawExport();
+  }
+  at("filters").closest("section").querySelector(".figures").append(at("filters"));  // beside the histogram
+  page.stepThrough(
+    () => (selected.length > 1 ? selected.length : n),
+    (by) => (selected.length > 1 ? selected.indexOf(current) : current < 0 && by < 0 ? 0 : current),
+    (k) => (selected.length > 1 ? focus(selected[k]) : pick([k])),
+  );
+  at("clear").onclick = clear;
 
   // One sample in words.
   const sheets = told.patches;
   const cell = new Map((sheets?.rows ?? []).map((row, i) => [row, i]));
   const start = (i) => BigInt(told.runs[c.run[i]].first_ns) + BigInt(c.after_s[i]) * 1000000000n + BigInt(c.after_ns[i]);
   const idOf = (i) => told.samples.ids ? told.samples.ids[i] : `${told.runs[c.run[i]].id}-${start(i)}`;
+  const flagsOf = (i) => told.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words).join("; ") || "clean";
+  function withStd(i, name) {
+    const std = c[`${name}_std`]?.[i];
+    return Number.isFinite(std) ? `${c[name][i].toFixed(kinds[name][2] + 1)} ± ${std.toPrecision(2)} ${kinds[name][1]}` : digits(c[name][i], name);
+  }
+  // Sheets with a sample's patch, and its number in them: inside the page, or beside it.
+  function pictureOf(i) {
+    if (cell.has(i)) return [sheets, cell.get(i)];
+    if (!sheets || !told.folder) return null;
+    const layers = sheets.layers.map(({ name }, k) => ({ name, uri: `${told.folder}/${k}-${Math.floor(i / told.per_sheet)}.webp` }));
+    return [{ ...sheets, layers }, i % told.per_sheet];
+  }
+  const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${told.count} patches; 'tcpipe report --patches' puts all beside it.` : "";
   function inWords(i) {
-    const flags = told.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words);
-    const rows = ["power", "velocity", "duration", "energy"].map((name) => {
-      const std = c[`${name}_std`]?.[i];
-      return [kinds[name][0], Number.isFinite(std) ? `${c[name][i].toFixed(kinds[name][2] + 1)} ± ${std.toPrecision(2)} ${kinds[name][1]}` : digits(c[name][i], name)];
-    });
+    const run = told.runs[c.run[i]];
+    const rows = ["power", "velocity", "duration", "energy"].map((name) => [kinds[name][0], withStd(i, name)]);
     rows.push(["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")]);
     if (c.residual) rows.push(["beyond physics", digits(c.residual[i], "residual")]);
-    rows.push(["ground", classes.get(c.class[i])?.name ?? "unknown"], ["split", told.splits[c.split[i]].name]);
+    rows.push(["ground", className(i)], ["split", splitName(i)]);
     if (Number.isFinite(c.apart[i])) rows.push(["nearest train", digits(c.apart[i], "apart")]);
-    rows.push(["quality", flags.length ? flags.join("; ") : "clean"]);
-    const run = told.runs[c.run[i]];
-    rows.push(["run", run.href ? make("a", run.id, { href: run.href }) : run.id]);
-    rows.push(["time", page.clock(Number(start(i) / 1000000n))]);
-    rows.push(["where from", page.explain(idOf(i))]);
-    return rows;
+    rows.push(["quality", flagsOf(i)], ["run", run.href ? make("a", run.id, { href: run.href }) : run.id]);
+    return [...rows, ["time", page.clock(Number(start(i) / 1000000n))], ["where from", page.explain(idOf(i))]];
   }
-  function show(chosen) {
+  function drawWords() {
     const box = at("chosen");
     box.replaceChildren();
-    if (!chosen.length) {
-      box.append(make("p", "Click a point on the map, or draw a box in the plot: the samples appear here."));
+    if (current < 0) {
+      const nothing = filters.size ? "No sample passes all filters." : "Click a sample on the map or in the plot, draw a box, or set a filter: the selection appears here.";
+      box.append(make("p", nothing));
       return;
     }
-    const i = chosen[0];
-    at("row").value = i + 1;
+    at("row").max = selected.length > 1 ? selected.length : n;
+    at("row").value = selected.length > 1 ? selected.indexOf(current) + 1 : current + 1;
     const left = make("div"), right = make("div");
-    if (chosen.length > 1) {
-      const mean = (name) => page.mean(chosen.map((k) => c[name][k]).filter(Number.isFinite));
-      const by = told.splits.map((s, k) => [s.name, chosen.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
-      left.append(make("b", `${chosen.length} chosen`), pairs([
+    if (selected.length > 1) {
+      const mean = (name) => page.mean(selected.map((k) => c[name][k]).filter(Number.isFinite));
+      const by = told.splits.map((s, k) => [s.name, selected.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
+      left.append(make("b", `${selected.length} selected`), pairs([
         ...["power", "velocity", "energy", "slope"].map((name) => [`mean ${kinds[name][0]}`, digits(mean(name), name)]),
         ["splits", by.map(([name, count]) => `${name} ${count}`).join(", ")],
-        ["flagged", `${chosen.filter((j) => c.quality[j] & told.flags).length}`]]), make("p", "The first of them:"));
+        ["flagged", `${selected.filter((j) => c.quality[j] & told.flags).length}`]]), make("p", `Number ${selected.indexOf(current) + 1} of them:`));
     }
-    left.append(pairs(inWords(i)));
-    if (sheets && cell.has(i)) {
-      right.append(...page.patches(sheets, cell.get(i)));
-    } else if (sheets && told.folder) {
-      const layers = sheets.layers.map(({ name }, k) => ({ name, uri: `${told.folder}/${k}-${Math.floor(i / told.per_sheet)}.webp` }));
-      right.append(...page.patches({ ...sheets, layers }, i % told.per_sheet));
+    left.append(pairs(inWords(current)));
+    const picture = pictureOf(current);
+    if (picture) {
+      right.append(...page.patches(...picture));
       const lost = () => right.replaceChildren(make("p", `${told.folder} is not beside this page.`, { className: "note" }));
-      Object.assign(new Image(), { src: layers[0].uri, onerror: lost });
-    } else if (sheets) {
-      right.append(make("p", `The page carries ${sheets.rows.length} of ${told.count} patches, and this one is not among them; 'tcpipe report --patches' puts all beside it.`, { className: "note" }));
+      if (picture[0] !== sheets) Object.assign(new Image(), { src: picture[0].layers[0].uri, onerror: lost });
+    } else {
+      right.append(make("p", noPicture, { className: "note" }));
     }
     box.append(left, right);
   }
-  const choose = page.chooseSamples(source, () => n, show);
-  at("row").max = n;
-  show([]);
 
-  if (sheets) {
-    page.gallery(sheets, (i) => {
-      const [kind, split] = [classes.get(c.class[i])?.name ?? "unknown", told.splits[c.split[i]].name];
-      return { kind, split, words: `${kind} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${split}` };
-    }, (i) => choose([i]));
+  // A page of the selection as patches and rows; without a selection, patches that are inside the page.
+  const perPage = 24;
+  let first = 0;
+  const orders = {
+    "order of the dataset": null,
+    "|w beyond physics|": c.residual && ((i) => Math.abs(c.residual[i])),
+    "σ of w": (i) => c.power_std[i],
+    "w, largest first": (i) => c.power[i],
+    "w, smallest first": (i) => -c.power[i],
+  };
+  fillSelect(at("sort"), Object.keys(orders).filter((name) => orders[name] !== undefined));
+  fillSelect(at("layer"), (sheets?.layers ?? []).map((layer) => layer.name));
+  if (sheets?.layers.some((layer) => layer.name === "ortho")) at("layer").value = "ortho";
+  function drawPage() {
+    const key = orders[at("sort").value], rows = [...(filters.size ? selected : sheets?.rows ?? [])];
+    if (key) {
+      const value = (i) => (Number.isFinite(key(i)) ? key(i) : -Infinity);
+      rows.sort((a, b) => value(b) - value(a) || a - b);
+    }
+    const shown = rows.slice(first, first + perPage);
+    at("gallery").replaceChildren(...(sheets ? shown : []).map((i) => {
+      const button = make("button", "", { type: "button", ariaPressed: `${i === current}` });
+      const picture = pictureOf(i);
+      const layer = picture?.[0].layers.find((one) => one.name === at("layer").value);
+      button.append(picture ? page.patch(picture[0], layer, picture[1], 92) : make("span", "not in this page", { className: "patch" }));
+      button.append(`${className(i)} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${splitName(i)}`);
+      button.onclick = () => {
+        if (selected.length > 1) focus(i);
+        else pick([i]);
+        at("gallery").querySelector("[aria-pressed=true]")?.focus();  // it is another button now
+      };
+      return button;
+    }));
+    at("no-picture").hidden = !sheets || shown.every((i) => pictureOf(i));
+    at("no-picture").textContent = noPicture;
+    at("page-count").textContent = rows.length ? `${first + 1} to ${first + shown.length} of ${rows.length}` : "none";
+    at("page-before").disabled = first === 0;
+    at("page-after").disabled = first + perPage >= rows.length;
+    const columns = [
+      ["sample_id", idOf], ["split", splitName], ["class", className], ["w", (i) => withStd(i, "power")], ["v", (i) => withStd(i, "velocity")],
+      ["E", (i) => withStd(i, "energy")], ...(c.residual ? [["w beyond physics", (i) => digits(c.residual[i], "residual")]] : []), ["quality", flagsOf],
+    ];
+    const line = (tag, texts) => {
+      const row = make("tr");
+      row.append(...texts.map((text) => make(tag, text)));
+      return row;
+    };
+    at("rows").replaceChildren(line("th", columns.map(([name]) => name)), ...(selected.length ? shown : []).map((i) => line("td", columns.map(([, text]) => text(i)))));
   }
+  const turnTo = (row) => { first = row; drawPage(); };
+  at("sort").onchange = at("layer").onchange = () => turnTo(0);
+  at("page-before").onclick = () => turnTo(first - perPage);
+  at("page-after").onclick = () => turnTo(first + perPage);
+
+  // Its ids, and what opens them.
+  const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+  const directory = location.protocol === "file:" ? decodeURIComponent(new URL(".", location).pathname).replace(/(.)\/$/, "$1") : "DIR";
+  function drawExport() {
+    const part = told.count > n ? ` The selection covers the ${n} samples that the page shows, drawn at random from ${told.count}.` : "";
+    const words = filters.size ? `${selected.length} of ${n} samples are selected.` : `Nothing is selected: examples of every split, class and slope.`;
+    at("selection-count").textContent = words + part;
+    at("selected").hidden = !selected.length;
+    at("copy-ids").textContent = "Copy sample_ids";
+    const splits = new Set(selected.map(splitName)), of = splits.size === 1 ? `[${JSON.stringify([...splits][0])}]` : "";
+    const ids = selected.length > 3 ? '"sample_ids.csv"' : JSON.stringify(selected.map(idOf));
+    at("python").textContent = `tcpipe.open_dataset(${JSON.stringify(directory)})${of}.select(${ids})`;
+  }
+  at("download").onclick = () => {
+    const lines = selected.map((i) => `${quoted(idOf(i))},${splitName(i)}\n`);
+    const href = URL.createObjectURL(new Blob(["sample_id,split\n", ...lines], { type: "text/csv" }));
+    make("a", "", { href, download: "sample_ids.csv" }).click();
+  };
+  at("copy-ids").onclick = () => {
+    const area = make("textarea", selected.map((i) => `${idOf(i)}\n`).join(""));
+    document.body.append(area);
+    area.select();
+    at("copy-ids").textContent = document.execCommand("copy") ? "Copied" : "The browser does not copy: download them";  // also in pages without a server
+    area.remove();
+  };
+  drawSelection();
 });

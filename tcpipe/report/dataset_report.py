@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,7 @@ from tcpipe.report.page import (
     render_page,
     show_verdict,
 )
-from tcpipe.report.plots import Plot, draw_waterfall, label_histograms
+from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
@@ -88,6 +88,7 @@ def render_dataset_report(
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
+    balance, repeatability = make_balance_sections(card.balance)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
     return render_page(
         title=f"Dataset {card.name}",
@@ -98,17 +99,24 @@ def render_dataset_report(
         warnings=lost,
         sections=[
             _make_map_section(shown, card.samples, plots),
-            *([] if patches is None else [_GALLERY]),
-            *_make_label_sections(samples),
-            make_quality_section(quality, "samples"),
-            *_make_finding_sections(card),
-            *make_physics_sections(dict(card.physics)),
-            *make_budget_sections(card.energy_budget),
-            Section("Distance breakdown", "Used and excluded distances add up to the odometer.", plots=[waterfall]),
-            *_make_removal_sections(card),
-            *make_balance_sections(card.balance),
+            *([_SELECTION] if samples.num_rows else []),
+            Section(
+                "Labels",
+                parts=[
+                    make_quality_section(quality, "samples"),
+                    *make_physics_sections(dict(card.physics)),
+                    *make_budget_sections(card.energy_budget),
+                ],
+            ),
+            Section(
+                "Distance breakdown",
+                "Used and excluded distances add up to the odometer.",
+                plots=[waterfall],
+                parts=_make_removal_sections(card),
+            ),
+            replace(balance, parts=[*_make_class_sections(card), repeatability]),
             _make_audit_section(card),
-            *_make_table_sections(card, hrefs),
+            _make_run_section(card, hrefs),
             _make_provenance_section(card),
         ],
         script="dataset.js" if samples.num_rows else "",
@@ -123,10 +131,8 @@ def _make_verdict(card: DatasetCard) -> VerdictBox:
     return show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups)
 
 
-_GALLERY = Section(
-    "Patches",
-    "Examples of every split, class and slope. Travel is to the right; click one to select the sample on the map.",
-    controls="gallery.html",
+_SELECTION = Section(
+    "Selected samples", "Patches and table show the selection. Travel is to the right.", controls="selection.html"
 )
 
 
@@ -145,7 +151,8 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
 
 
 def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> Section:
-    text = "Positions of samples; dashed: region of the split. The buffer is in no split. A box in the plot selects on the map."
+    text = "Dashed: region of the split; the buffer is in no split. A click selects the nearest sample, with shift one more; "
+    text += "a drag in the plot or the histogram selects all within. Filters combine."
     if len(shown.xy_m) < count:
         text += f" Of {count} samples {len(shown.xy_m)}, drawn at random, are shown."
     if not len(shown.xy_m):
@@ -201,12 +208,6 @@ def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
     return [Link(f"All runs of {name}", f"../{name}/{_PAGE}") for name in stores if (beside / name / _PAGE).is_file()]
 
 
-def _make_label_sections(samples: pa.Table) -> list[Section]:
-    if not samples.num_rows:
-        return []
-    return [Section("Labels", "One value per sample.", plots=label_histograms(samples, "samples"))]
-
-
 def _make_audit_section(card: DatasetCard) -> Section:
     rows = [
         (
@@ -255,12 +256,13 @@ def _make_removal_sections(card: DatasetCard) -> list[Section]:
     return [section for section in sections if section.rows]
 
 
-def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section]:
-    sections = []
-    if card.terrain:
-        names = sorted({name for counts in card.terrain.values() for name in counts})
-        rows = [(name, *(card.terrain[split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
-        sections.append(Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows))
+def _make_class_sections(card: DatasetCard) -> list[Section]:
+    names = sorted({name for counts in card.terrain.values() for name in counts})
+    rows = [(name, *(card.terrain[split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
+    return [Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows)] if rows else []
+
+
+def _make_run_section(card: DatasetCard, hrefs: Mapping[str, str]) -> Section:
     runs = [
         (
             Link(run.run_id, hrefs[run.run_id]) if run.run_id in hrefs else run.run_id,
@@ -275,7 +277,7 @@ def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Se
     if hrefs:
         text = "Links lead to the pages of the runs, once 'tcpipe report STORE' has written them."
     header = ("run", "robot", "log", "samples", "noise floor of E")
-    return [*sections, Section("Runs", text, header=header, rows=runs, figures_from=3)]
+    return Section("Runs", text, header=header, rows=runs, figures_from=3, parts=_make_finding_sections(card))
 
 
 def _make_provenance_section(card: DatasetCard) -> Section:

@@ -74,7 +74,7 @@ page.start(async () => {
     right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page only contains the patches of the samples with the largest errors of E.", { className: "note" })]));
     box.append(left, right);
   }
-  const choose = page.chooseSamples(source, () => shown.length, (places) => show([...places].sort((a, b) => a - b)));
+  const choose = page.chooseSamples(source, { against: ["measured", "predicted"], off: ["slope", "error"] }, () => shown.length, (places) => show([...places].sort((a, b) => a - b)));
   for (const id of ["split", "quantity", "colour"]) at(id).onchange = () => { draw(); show([]); };
   draw();
   show([]);

@@ -18,7 +18,7 @@ from tcpipe.formats.dataset_files import CLASSES, DRIVE_NEXT, OVERVIEW, RELIEF
 from tcpipe.formats.geojson import PolygonGeometry, read_polygons
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.report.colours import CURSOR
+from tcpipe.report.colours import CURSOR, FAINT, SPLIT_COLOURS
 from tcpipe.report.pictures import (
     Bounds,
     compute_joint_bounds_m,
@@ -45,7 +45,7 @@ _LEAST_SHARE = 0.5
 def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> tuple[list[Plot], list[str]]:
     """Return the map of the samples and the plot beside it, and which parts of the map are lost."""
     bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
-    tools = "box_select,lasso_select,tap"
+    tools = "box_select,lasso_select"
     plot = make_map_plot(
         alt=f"Map of {sample_count} points, coloured by the quantity chosen above; the tables below list the counts.",
         axes=("easting [m]", "northing [m]"),
@@ -100,7 +100,30 @@ def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> t
         nonselection_fill_alpha=0.08,
         source=points.data_source,
     )
-    return [plot, brush], lost
+    here = {name: list[float]() for name in ("x", "y", "across", "up")}
+    ring = {"size": 16, "fill_alpha": 0.0, "line_color": CURSOR, "line_width": 3}
+    marks = figure.scatter("x", "y", source=here, name="here", **ring)
+    brush.figure.scatter("across", "up", source=marks.data_source, **ring)
+    return [plot, brush, _draw_histogram()], lost
+
+
+def _draw_histogram() -> Plot:
+    """Return the histogram of all and of the selected samples, which the page's script fills."""
+    plot = make_plot(
+        "histogram",
+        alt="Histogram of the quantity chosen below, of all and of the selected samples; a drag selects a range of it.",
+        axes=("power w [W]", "samples"),
+        legend={"all samples": FAINT, "selected": SPLIT_COLOURS["train"]},
+        height_px=240,
+        tools="xbox_select,save",
+        drag="xbox_select",
+    )
+    bars = {name: [0.0] for name in ("left", "right", "all", "chosen")}
+    all_bars = plot.figure.quad("left", "right", "all", 0, color=FAINT, source=bars, name="bars")
+    plot.figure.quad("left", "right", "chosen", 0, color=SPLIT_COLOURS["train"], source=all_bars.data_source)
+    plot.figure.toolbar.tools[0].renderers = []
+    plot.figure.y_range.start = 0
+    return plot
 
 
 def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds: Bounds) -> list[str]:

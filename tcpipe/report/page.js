@@ -176,13 +176,27 @@ const page = (() => {
     at("after").onclick = () => step(1);
     at("row").onchange = () => { const i = at("row").valueAsNumber - 1; if (i >= 0 && i < count()) choose(i); };
   }
-  // Points of a source that are chosen by a click, a box or these buttons; `show(rows)` says what they are.
-  function chooseSamples(source, count, show) {
+  // Points of a source that are chosen by a click (on plots by name, with their axes), a box or these buttons; `show(rows)` says what they are.
+  function chooseSamples(source, axes, count, show) {
     const choose = (rows) => { source.selected.indices = rows; };
     source.selected.change.connect(() => show(source.selected.indices));
+    for (const [name, of] of Object.entries(axes)) clickNearest(name, source, of, () => true, (i) => choose([i]));
     stepThrough(count, (by) => source.selected.indices[0] ?? (by > 0 ? -1 : 0), (i) => choose([i]));
     at("clear").onclick = () => choose([]);
     return choose;
+  }
+  // A click on a plot takes the nearest point that is `allowed`, at most 30 pixels away: `choose(row, whether shift is pressed)`.
+  function clickNearest(name, source, [x, y], allowed, choose) {
+    model(name).on_event("tap", ({ sx, sy, modifiers }) => {
+      const { x_scale, y_scale } = plots.find((one) => one.model.name === name).frame;
+      const [across, down] = [x_scale.v_compute(source.data[x]), y_scale.v_compute(source.data[y])];
+      let [nearest, least] = [-1, 30 ** 2];
+      for (let i = 0; i < across.length; i++) {
+        const apart = (across[i] - sx) ** 2 + (down[i] - sy) ** 2;
+        if (apart < least && allowed(i)) [nearest, least] = [i, apart];
+      }
+      if (nearest >= 0) choose(nearest, modifiers.shift);
+    });
   }
   const fixed = (value, digits) => (Number(value.toFixed(digits)) + 0).toFixed(digits);  // no -0.0
   const mean = (values) => values.reduce((a, b) => a + b, 0) / values.length;
@@ -204,7 +218,7 @@ const page = (() => {
     }));
   }
   return {
-    at, fixed, make, fillSelect, pairs, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, gallery, mean, stepThrough, unpack,
+    at, fixed, make, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, clickNearest, gallery, mean, stepThrough, unpack,
     data: read("page-data"),
     // What a page's own script does when the figures that it asks for are drawn; what it returns is called with the view of each that follows.
     start: (of) => { work = of; },

@@ -14,7 +14,6 @@ from PIL import Image, UnidentifiedImageError
 from pyproj import Transformer
 
 from tcpipe.formats.atomic import write_atomic_file
-from tcpipe.formats.integrity import read_picture_text, read_seal
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.terrain.layers import COLOURS, Pixels
@@ -208,17 +207,3 @@ def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str
     with write_atomic_file(path) as temporary:
         metadata = {**_PLAIN_PNG, **(texts or {})}
         imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=metadata)
-
-
-_SHOWS = "tcpipe map"
-"""Key of the text in a quick look that identifies its map: the seal of the map's checksums."""
-
-
-def write_quick_look(picture: Path, look: NDArray[np.uint8], seal: str) -> None:
-    """Write the `draw_quick_look` of a map; the picture carries which map it shows, by `tcpipe.formats.integrity.read_seal`."""
-    write_overview(picture, look, texts={_SHOWS: seal})
-
-
-def is_picture_of_map(picture: Path, map_path: Path) -> bool:
-    """Return whether a picture is the quick look of the map at ``map_path``; `StoreError` if that cannot be read."""
-    return read_picture_text(picture, _SHOWS) == read_seal(map_path)

@@ -86,7 +86,7 @@ def _estimate(
 ) -> Trajectory:
     gate = config.gate_probability
     if config.estimator == "ukf":
-        from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  scipy.linalg takes a while to load
+        from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  filterpy takes a second to load
 
         return run_ukf15(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
     return run_error_state(section.measurements, initial, output_ns=output_ns, gate_probability=gate)

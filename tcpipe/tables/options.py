@@ -198,14 +198,6 @@ EARLIER_DOCUMENT_KEYS = {
 }
 """Keys of manifests and cards; `tcpipe migrate` renames them."""
 
-EARLIER_MODEL_KEYS = {
-    "beside": "extra_features",
-    "seen": "training_range",
-    "batch": "batch_size",
-    "weights": "inverse_variance_weights",
-}
-"""Keys of model.json."""
-
 _EARLIER_PHYSICS = {"standing": "idle", "usual_turn_radpm": "mean_turn_radpm"}
 """Terms and keys below a key ``physics``."""
 

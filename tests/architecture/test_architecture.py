@@ -65,7 +65,7 @@ SUFFIX_OF_UNIT = {
 PLAIN_UNITS = {"", "1", "bits"}
 HEAVY = {
     "numpy", "pyarrow", "polars", "numba", "scipy", "zarr", "rasterio", "pyproj", "shapely", "pydantic", "rosbags", "mcap",
-    "bokeh", "matplotlib", "jinja2", "rich", "isal", "ruamel", "pandas", "torch", "lightgbm", "distributed",
+    "bokeh", "matplotlib", "jinja2", "rich", "filterpy", "isal", "ruamel", "pandas", "torch", "lightgbm", "distributed",
 }  # fmt: skip
 
 

@@ -421,7 +421,7 @@ def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
     run = next((tmp_path / "tcpipe-store" / "runs").iterdir())
     expected = {
         "tcpipe-store": run.name,
-        str(Store(tmp_path / "tcpipe-store").map_path("site")): "EPSG:32633",
+        str(Store(tmp_path / "tcpipe-store").map_files("site")[0]): "EPSG:32633",
         "dataset": run.name,
         str(run): "weather=dry",
         only_run(tmp_path / "tcpipe-store").where: "m kept",

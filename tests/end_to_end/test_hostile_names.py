@@ -56,7 +56,7 @@ def test_no_command_prints_or_writes_a_name_as_anything_but_text(work):
     harmless(tcpipe("add-map", "site", *layers, "--classes", "classes.csv", cwd=here), 0)
     harmless(tcpipe("build-dataset", cwd=here), 0, 3)
     run = next((here / "tcpipe-store/runs").iterdir())
-    for path in (run, "tcpipe-store", Store(here / "tcpipe-store").map_path("site"), "dataset"):
+    for path in (run, "tcpipe-store", Store(here / "tcpipe-store").map_files("site")[0], "dataset"):
         harmless(tcpipe("inspect", path, cwd=here), 0, 3)
     json.loads(harmless(tcpipe("inspect", run, "--json", cwd=here), 0, 3))
     for path in ("tcpipe-store", "dataset"):

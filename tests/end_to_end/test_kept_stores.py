@@ -80,7 +80,7 @@ def test_both_formats_give_the_same_patches_and_labels(kept):
 
 
 def test_a_dataset_is_built_of_it(kept):
-    assert tuple(open_map(Store(kept / "store").map_path("site")).layers) == ("height", "ortho", "terrain")
+    assert tuple(open_map(Store(kept / "store").map_files("site")[0]).layers) == ("height", "ortho", "terrain")
     build_dataset(kept / "new", store=kept / "store", recipe=Recipe(), holdout="sample")
     old, new = (tcpipe.open_dataset(kept / name)["train"] for name in ("zarr", "new"))
     assert new.column("sample_id").tolist() == old.column("sample_id").tolist()

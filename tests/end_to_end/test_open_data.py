@@ -156,7 +156,7 @@ def test_a_map_is_of_the_newest_heights_around_the_track(site):
     y = north - (np.arange(found.grid.rows) + 0.5) * PX
     wanted = WORLD.height(*np.meshgrid(x, y)) + np.where(x < WORLD.x_m, 5.0, 0.0)
     assert np.abs(found.read("height", 0, len(y), 0, len(x)) - wanted + found.height_reference_m).max() < 1e-3
-    inspected = tcpipe("inspect", store.map_path("site"), cwd=site.path)
+    inspected = tcpipe("inspect", store.map_files("site")[0], cwd=site.path)
     assert "2024-06-01, 0.25 metre" in inspected.stdout
     assert "licence: CC0" in inspected.stdout
 

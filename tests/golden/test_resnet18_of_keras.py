@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.architecture import Architecture, compute_loss_factors
+from tcpipe.learning.fitting import compute_loss_factors
 
 pytest.importorskip("torch")
 
@@ -41,8 +41,8 @@ def test_it_is_the_network_of_keras(case):
     patches, labels, weigh = (
         rng.random(shape, np.float32) for shape in ((8, px, px, depth), (8, outputs), (8, outputs))
     )
-    network = make_resnet18(Architecture(px, depth, outputs, 16), seed=0, start=[0.0] * outputs)
-    network.set_arrays(weights)
+    network = make_resnet18(depth, outputs, 16, seed=0, start=[0.0] * outputs)
+    network.load(weights)
     assert network.predict(patches) == pytest.approx(predicted, rel=1e-5, abs=1e-5)
     assert all(np.array_equal(array, weights[name]) for name, array in network.arrays().items())
     trainer = Trainer(network, compute_loss_factors("nrmse", [1.0] * outputs))
@@ -50,5 +50,5 @@ def test_it_is_the_network_of_keras(case):
     assert first == pytest.approx(case["losses"][0], rel=1e-5)
     assert second == pytest.approx(case["losses"][1], rel=1e-3)
     del weights["head/bias"]
-    with pytest.raises(ModelError, match="contains the weights of another network; remove it and train the model"):
-        network.set_arrays(weights)
+    with pytest.raises(ModelError, match="contains the weights of another model"):
+        network.load(weights)

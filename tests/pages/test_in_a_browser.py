@@ -8,6 +8,7 @@ from time import monotonic
 import pytest
 from synthetic_store import add_run, add_world, driven, lanes, make_noise_facts, segments
 
+import tcpipe
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
@@ -117,44 +118,191 @@ def test_it_fits_and_can_be_read_by_everyone(opened):
     fits_and_can_be_read_by_everyone(opened)
 
 
-def test_a_metre_that_is_clicked_tells_its_label_and_shows_its_patch(opened):
-    x, y = opened.evaluate(f"(() => {{ const data = {SOURCE}.data; return [data.x[7], data.y[7]]; }})()")
-    opened.locator("#s1 figure").first.scroll_into_view_if_needed()
-    opened.mouse.click(*opened.evaluate(PLACE, ["map", x, y]))
-    until(opened, f"{SOURCE}.selected.indices.length > 0")
+SELECTED = f"[...{SOURCE}.selected.indices]"
+
+
+def click(tab, plot, x, y):
+    tab.locator(f"figure:has(#{tab.evaluate(f'page.model({plot!r}).id')})").scroll_into_view_if_needed()
+    tab.mouse.click(*tab.evaluate(PLACE, [plot, x, y]))
+    tab.wait_for_timeout(400)  # a second click that comes earlier is a double click
+
+
+def drag(tab, plot, start, end):
+    """Drag from one place in a plot to another, given as shares of its frame, from the lower left."""
+    tab.locator(f"#{tab.evaluate(f'page.model({plot!r}).id')}").scroll_into_view_if_needed()
+    corners = tab.evaluate(
+        "(name) => { const { frame } = page.plots.find((one) => one.model.name === name);"
+        "return [frame.x_range, frame.y_range].map((range) => [range.start, range.end]); }",
+        plot,
+    )
+    points = [
+        [low + share * (high - low) for share, (low, high) in zip(of, corners, strict=True)] for of in (start, end)
+    ]
+    tab.mouse.move(*tab.evaluate(PLACE, [plot, *points[0]]))
+    tab.mouse.down()
+    tab.mouse.move(*tab.evaluate(PLACE, [plot, *points[1]]), steps=4)
+    tab.mouse.up()
+
+
+def column(tab, name):
+    """A column of the page, by sample."""
+    return tab.evaluate(f"page.unpack(page.data.samples.packed).then((c) => Array.from(c[{name!r}]))")
+
+
+def table_ids(tab):
+    return tab.locator("#rows td:first-child").all_inner_texts()
+
+
+def test_a_click_takes_the_nearest_sample_alone_and_tells_what_it_is(opened):
+    xs, ys = column(opened, "x"), column(opened, "y")
+    row = min(range(len(xs)), key=lambda i: (abs(ys[i] - max(ys)) > 0.1, abs(xs[i] - min(xs) - 5)))
+    click(
+        opened, "map", xs[row] + 0.4, ys[row]
+    )  # its neighbour is a metre away: less than the width of a point on a phone
+    until(opened, f"{SELECTED}.length > 0")
+    assert opened.evaluate(SELECTED) == [row]
+    assert opened.evaluate("page.model('here').data_source.data.x[0]") == xs[row]
     said = opened.locator("#chosen").inner_text()
-    assert "±" in said
-    assert "tcpipe explain '" in said
-    assert "UTC" in said
+    for words in ("±", "tcpipe explain '", "UTC"):
+        assert words in said
     assert opened.locator("#chosen .patch").count() == 3
+    assert opened.locator("#gallery button").count() == 1
+    assert table_ids(opened)[0] in said
+    far = max(range(len(xs)), key=lambda i: abs(xs[i] - xs[row]))
+    opened.keyboard.down("Shift")
+    click(opened, "map", xs[far], ys[far])
+    opened.keyboard.up("Shift")
+    until(opened, f"{SELECTED}.length === 2")
+    assert set(opened.evaluate(SELECTED)) == {row, far}
+    assert opened.locator("#gallery button").count() == 2
+    data = opened.evaluate(f"(({{ across, up }}) => [across[{row}], up[{row}]])({SOURCE}.data)")
+    click(opened, "brush", *data)
+    until(opened, f"{SELECTED}.length === 1")
+    found = opened.evaluate(SELECTED)[0]
+    assert opened.evaluate(f"[{SOURCE}.data.across[{found}], {SOURCE}.data.up[{found}]]") == pytest.approx(
+        data, rel=0.02
+    )
 
 
-def test_layers_switch_and_a_box_in_the_plot_chooses_on_the_map(opened):
+def test_a_box_and_filters_make_one_selection_that_every_view_shows(opened):
     seen = "Bokeh.documents[0].get_model_by_name('layer classes').visible"
     assert opened.evaluate(seen) is False
     opened.select_option("#ground", "classes")
     assert opened.evaluate(seen) is True
     opened.select_option("#across", "velocity")
     opened.select_option("#colour", "energy")
-    figure = opened.locator("#s1 figure").nth(1)
-    figure.scroll_into_view_if_needed()
-    box = figure.bounding_box()
-    opened.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.2 * box["height"])
-    opened.mouse.down()
-    opened.mouse.move(box["x"] + 0.95 * box["width"], box["y"] + 0.8 * box["height"], steps=4)
-    opened.mouse.up()
-    until(opened, f"{SOURCE}.selected.indices.length > 1")
-    assert " chosen" in opened.locator("#chosen").inner_text()
-
-
-def test_the_gallery_filters_and_leads_to_the_sample(opened):
     every = opened.locator("#gallery button").count()
-    opened.select_option("#gallery-split", "test")
-    shown = opened.locator("#gallery button")
-    assert 0 < shown.count() < every
-    assert all("test" in text for text in shown.all_inner_texts())
-    shown.first.click()
-    assert opened.locator("#chosen dd", has_text="test").count() >= 1
+    drag(opened, "brush", (0.02, 0.05), (0.98, 0.6))
+    until(opened, f"{SELECTED}.length > 1")
+    boxed = opened.evaluate(SELECTED)
+    run, split = column(opened, "run"), column(opened, "split")
+    opened.select_option("#run", label="north")
+    opened.select_option("#split", label="train")
+    both = [i for i in boxed if run[i] == 0 and split[i] == 0]
+    assert 1 < len(both) < len(boxed)
+    assert opened.evaluate(SELECTED) == both
+    assert f"{len(both)} of {len(run)} samples are selected." in opened.locator("#selection-count").inner_text()
+    assert f"{len(both)} selected" in opened.locator("#chosen").inner_text()
+    assert opened.locator("#gallery button").count() == min(len(both), 24)
+    assert all(name.startswith("north-") for name in table_ids(opened))
+    assert opened.evaluate("page.model('bars').data_source.data.chosen.reduce((a, b) => a + b)") == len(both)
+    opened.locator("#after").click()
+    assert opened.evaluate(SELECTED) == both  # it goes through the selection
+    assert "Number 2 of them" in opened.locator("#chosen").inner_text()
+    opened.select_option("#flag", "0")
+    assert opened.evaluate(SELECTED) == [
+        i for i, bits in enumerate(column(opened, "quality")) if i in both and not bits
+    ]
+    opened.locator("#clear").click()
+    assert opened.evaluate(SELECTED) == []
+    assert opened.locator("#run").input_value() == ""
+    assert opened.locator("#gallery button").count() == every
+    assert not opened.locator("#selected").is_visible()
+
+
+def test_a_range_is_drawn_in_the_histogram_or_typed(opened):
+    opened.select_option("#quantity", "velocity")
+    drag(opened, "histogram", (0.3, 0.5), (0.6, 0.5))
+    until(opened, f"{SELECTED}.length > 0")
+    least, most = (float(opened.locator(f"#{end}").input_value()) for end in ("least", "most"))
+    velocity = column(opened, "velocity")
+    inside = [i for i, value in enumerate(velocity) if least <= value <= most]
+    assert 0 < len(inside) < len(velocity)
+    assert opened.evaluate(SELECTED) == inside
+    opened.fill("#most", f"{max(velocity) + 1}")
+    opened.locator("#most").press("Tab")
+    assert opened.evaluate(SELECTED) == [i for i, value in enumerate(velocity) if least <= value]
+    opened.fill("#least", f"{max(velocity) + 1}")
+    opened.locator("#least").press("Tab")
+    assert "No sample passes all filters" in opened.locator("#chosen").inner_text()
+    assert opened.locator("#gallery button").count() == 0
+
+
+def test_patches_and_rows_are_sorted_and_turned_page_by_page(opened):
+    opened.select_option("#run", label="south")
+    power, run, std, off = (column(opened, name) for name in ("power", "run", "power_std", "residual"))
+    chosen = [i for i, of in enumerate(run) if of == 1]
+    for option, key in {
+        "w, largest first": lambda i: -power[i],
+        "w, smallest first": lambda i: power[i],
+        "σ of w": lambda i: -std[i],
+        "|w beyond physics|": lambda i: -abs(off[i]),
+    }.items():
+        opened.select_option("#sort", option)
+        wanted = sorted(chosen, key=lambda i: (key(i), i))
+        shown = list(table_ids(opened))
+        words = opened.locator("#gallery button").all_inner_texts()
+        assert opened.locator("#page-count").inner_text() == f"1 to 24 of {len(chosen)}"
+        assert len(shown) == len(words) == 24
+        opened.locator("#gallery button").nth(3).click()
+        assert shown[3] in opened.locator("#chosen").inner_text()
+        assert f"Number {chosen.index(wanted[3]) + 1} of them" in opened.locator("#chosen").inner_text()
+        assert opened.locator("#gallery button").nth(3).get_attribute("aria-pressed") == "true"
+    while opened.locator("#page-after").is_enabled():
+        opened.locator("#page-after").click()
+        shown += table_ids(opened)
+    assert len(set(shown)) == len(shown) == len(chosen)
+
+
+@pytest.mark.parametrize("look", [LOOKS[0], LOOKS[3]], ids=by_look)
+def test_ids_of_a_selection_open_and_exclude_these_samples(chromium, dataset, tmp_path, look):
+    with quiet_page(chromium, dataset / "report.html", look) as tab:
+        tab.select_option("#split", label="test")
+        fits_and_can_be_read_by_everyone(tab)
+        with tab.expect_download() as started:
+            tab.locator("#download").click()
+        started.value.save_as(tmp_path / "sample_ids.csv")
+        tab.locator("#copy-ids").click()
+        assert tab.locator("#copy-ids").inner_text() == "Copied"
+        tab.evaluate("document.body.prepend(document.createElement('textarea'))")
+        tab.locator("textarea").focus()
+        tab.keyboard.press("Control+V")
+        copied = tab.locator("textarea").input_value().split()
+        line = tab.locator("#python").inner_text()
+        tab.locator("textarea").evaluate("(area) => area.remove()")
+        shown = len(tab.evaluate(SELECTED))
+    chosen = eval(line.replace("sample_ids.csv", f"{tmp_path}/sample_ids.csv"), {"tcpipe": tcpipe})  # noqa: S307  the line itself is tested
+    assert chosen.column("sample_id").tolist() == copied
+    assert set(chosen.column("split")) == {"test"}
+    assert len(copied) == shown
+    built = build_dataset(
+        tmp_path / "smaller", store=dataset.parent / "store", exclude=tmp_path / "sample_ids.csv", reason="too far off"
+    )
+    assert built.card.splits["test"] == 0
+    assert built.card.exclusions[0].samples == shown
+
+
+def test_of_a_part_of_the_samples_the_page_says_what_a_selection_covers(chromium, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr("tcpipe.report.dataset_report.MOST_SAMPLES", 30)
+    monkeypatch.setattr("tcpipe.report.dataset_patches.MOST_PATCHES", 5)
+    shutil.copytree(dataset, tmp_path / "dataset")
+    report(tmp_path / "dataset")
+    with quiet_page(chromium, tmp_path / "dataset/report.html", LOOKS[0]) as tab:
+        tab.select_option("#run", label="north")
+        said = tab.locator("#selection-count").inner_text()
+        assert "The selection covers the 30 samples that the page shows, drawn at random from 144." in said
+        assert tab.get_by_text("not in this page").count() > 0
+        assert "'tcpipe report --patches' puts all beside it" in tab.locator("#no-picture").inner_text()
 
 
 def test_it_is_worked_by_keyboard(opened):
@@ -164,6 +312,11 @@ def test_it_is_worked_by_keyboard(opened):
     assert opened.evaluate(f"{SOURCE}.selected.indices") == [1]
     opened.keyboard.press("Shift+Tab")
     assert opened.evaluate("document.activeElement.id") == "row"
+    opened.locator("#run").focus()
+    opened.keyboard.press("ArrowDown")
+    opened.locator("#gallery button").first.focus()
+    opened.keyboard.press("Enter")
+    assert opened.evaluate("document.activeElement.ariaPressed") == "true"
 
 
 def test_an_evaluation_says_what_a_metre_was_and_was_predicted_to_be(judged):
@@ -177,9 +330,8 @@ def test_an_evaluation_says_what_a_metre_was_and_was_predicted_to_be(judged):
     off = f"Array.from({SOURCE}.data.error, Math.abs)"
     assert judged.evaluate(f"{off}[0] === Math.max(...{off})")
     x, y = judged.evaluate(f"[{SOURCE}.data.measured[3], {SOURCE}.data.predicted[3]]")
-    judged.locator("figure", has=judged.locator(".plot")).first.scroll_into_view_if_needed()
-    judged.mouse.click(*judged.evaluate(PLACE, ["against", x, y]))
-    until(judged, f"{SOURCE}.selected.indices.some((i) => Math.abs({SOURCE}.data.measured[i] - {x}) < 1e-6)")
+    click(judged, "against", x, y)
+    until(judged, f"{SELECTED}.length === 1 && Math.abs({SOURCE}.data.measured[{SELECTED}[0]] - {x}) < 1e-6")
 
 
 def test_an_evaluation_answers_to_quantity_and_split_and_shows_the_worst(judged):

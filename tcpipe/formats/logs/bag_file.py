@@ -8,6 +8,7 @@ A bag carries no checksum of its own: bz2 has one, lz4 and plain chunks have non
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,7 +30,7 @@ from tcpipe.formats.logs.bag_records import (
     stamp_ns,
     walk_chunk,
 )
-from tcpipe.formats.logs.chunk_reading import ChunkedPart, Entries, Excerpt, Messages, sort_by_place
+from tcpipe.formats.logs.chunk_reading import ChunkedPart, Excerpt, Messages
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     DamageError,
@@ -45,7 +46,6 @@ _MAX_CHUNK_HEADER = 128
 _INDEX_ENTRY_BYTES = 12
 _INDEX_HEAD_BYTES = 64
 """As much as an index record's header takes as a rule, and the length behind it."""
-_LEAST_RECORD_BYTES = 8
 _PLACED_AT_ONCE = 1024
 """Of so many chunks the heads are looked at together."""
 _EXPECTED_BYTES = 1 << 24
@@ -82,6 +82,7 @@ class BagPart(ChunkedPart[_Chunk]):
     """One .bag file, open for reading."""
 
     container = "bag"
+    least_bytes = 8
 
     def _open(self) -> dict[int, Topic]:
         self.outline = ""
@@ -168,8 +169,8 @@ class BagPart(ChunkedPart[_Chunk]):
             self._note("chunk-index-damaged", chunk.offset, messages_lost=lost or None)
         return walked
 
-    def entries(self, chunks: list[_Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
-        """Return the messages of several chunks by the index records behind them, and of which chunks these are sound."""
+    def read_indexes(self, chunks: list[_Chunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+        """Return the messages of several chunks by the index records behind them."""
         held: list[bytes] = []
         places: list[tuple[int, int, int]] = []
         unsound = []
@@ -184,16 +185,8 @@ class BagPart(ChunkedPart[_Chunk]):
             places += [(number, connection, len(entries) // _INDEX_ENTRY_BYTES) for connection, entries in found]
         of, connections, counts = np.array(places, np.int64).reshape(-1, 3).T
         words = np.frombuffer(b"".join(held), "<u4").reshape(-1, 3).astype(np.int64)
-        entries, sound = sort_by_place(
-            np.repeat(of, counts),
-            np.repeat(connections, counts),
-            words[:, 2],
-            words[:, 0] * NS + words[:, 1],
-            sizes,
-            least_bytes=_LEAST_RECORD_BYTES,
-        )
-        sound[unsound] = False
-        return entries, sound
+        stamps_ns = words[:, 0] * NS + words[:, 1]
+        return (np.repeat(of, counts), np.repeat(connections, counts), words[:, 2], stamps_ns), unsound
 
     def _index_of(self, chunk: _Chunk) -> list[tuple[int, bytes]]:
         """Return each connection's entries in the index behind a chunk; `DamageError` where it has none, or a broken one."""

@@ -134,6 +134,9 @@ AnyChunk = TypeVar("AnyChunk", bound=PlacedChunk)
 class ChunkedPart(ABC, Generic[AnyChunk]):
     """A file of chunks, open for reading. Methods raise `DamageError` where a chunk is lost."""
 
+    least_bytes: int
+    """No message's record is shorter."""
+
     def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         self.name = name
         self.damage: list[Damage] = []
@@ -161,8 +164,11 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it, at most."""
 
     @abstractmethod
-    def entries(self, chunks: list[AnyChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
-        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+    def read_indexes(self, chunks: list[AnyChunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+        """Return the messages of chunks by their indexes, and which chunks have no sound one.
+
+        Of each message that is its chunk's number in the list, its channel, offset in the chunk and log time, shape (N,) each.
+        """
 
     @abstractmethod
     def load(self, chunk: AnyChunk) -> memoryview:
@@ -201,6 +207,13 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
             entries, sound = self.entries([chunk for _, chunk in members], sizes)
             for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
                 yield from self._read_span_blocks(span, members, wanted)
+
+    def entries(self, chunks: list[AnyChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+        (chunk, channel, offset, log_time_ns), unsound = self.read_indexes(chunks)
+        entries, sound = sort_by_place(chunk, channel, offset, log_time_ns, sizes, least_bytes=self.least_bytes)
+        sound[unsound] = False
+        return entries, sound
 
     def _read_span_blocks(
         self, span: Span, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]

@@ -11,8 +11,7 @@ from typing import TypeAlias
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_container import find_autopilot
-from tcpipe.formats.logs.log_file import AUTOPILOT_SUFFIXES, Log, OpenLog, is_log_file, open_log
+from tcpipe.formats.logs.log_file import AUTOPILOT_SUFFIXES, Log, OpenLog, find_autopilot, is_log_file, open_log
 from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import Mappings, find_table_run

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from isal.isal_zlib import crc32
@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 from tcpipe.formats.logs.chunk_reading import (
     MAX_PLANNED_BYTES,
     ChunkedPart,
-    Entries,
     Excerpt,
     Messages,
-    sort_by_place,
 )
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
@@ -67,22 +65,15 @@ _AT_ONCE = 256
 """The heads of so many chunks are looked at together."""
 
 
-@dataclass(slots=True)
-class _Tally:
-    """Messages of a channel met on a walk."""
-
-    count: int = 0
-    start_ns: int | None = None
-    end_ns: int | None = None
-
-
 class McapPart(ChunkedPart[Chunk]):
     """One .mcap file, open for reading."""
 
     container = "mcap"
+    least_bytes = RECORD_HEAD + MESSAGE_HEAD
 
     def _open(self) -> dict[int, Topic]:
-        self._tallies: dict[int, _Tally] = {}
+        self._tallies: dict[int, tuple[int, int, int]] = {}
+        """By channel, how many messages a walk met, the first and the last log time."""
         self._untimed = 0
         self._complete = False
         self._without_crc: set[int] = set()
@@ -225,8 +216,8 @@ class McapPart(ChunkedPart[Chunk]):
             raise DamageError("chunk-damaged")
         return data
 
-    def entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
-        """Return the messages of several chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+    def read_indexes(self, chunks: list[Chunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+        """Return the messages of several chunks by their indexes."""
         regions: list[memoryview | bytes] = []
         places: list[tuple[int, int, int, int]] = []
         unsound, before = [], 0
@@ -246,12 +237,7 @@ class McapPart(ChunkedPart[Chunk]):
             before = end
         of, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
         right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
-        entries, sound = sort_by_place(
-            of[record], channels[record], offsets, stamps, sizes, least_bytes=RECORD_HEAD + MESSAGE_HEAD
-        )
-        sound[unsound] = False
-        sound[of[~right]] = False
-        return entries, sound
+        return (of[record], channels[record], offsets, stamps), [*unsound, *of[~right].tolist()]
 
     def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview | bytes, list[tuple[int, int]]]:
         """Return bytes that hold a chunk's message indexes, and of each channel's where it begins in them.
@@ -302,36 +288,40 @@ class McapPart(ChunkedPart[Chunk]):
     def _walk(self, contents: Contents, start: int, end: int) -> bool:
         """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
         position = start
-        run = _LooseMessages()
-        closed = False
         while position + RECORD_HEAD <= end:
-            try:
-                head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
-            except DamageError as error:
-                run.finish(contents.chunks)
-                position = self._stepped_over(contents, position, end, error)
-                continue
-            opcode, length = head[0], int.from_bytes(head[1:9], "little")
-            after = position + RECORD_HEAD + length
-            if opcode in (OP_FOOTER, OP_DATA_END) and length <= FOOTER:
-                closed = True
-                break
-            if opcode == OP_MESSAGE and after <= end and length >= MESSAGE_HEAD:
-                stamp = int.from_bytes(head[15:23], "little")
-                self._tally(int.from_bytes(head[9:11], "little"), 1, stamp, stamp)
-                run.extend(position, after, contents.chunks)
+            if (after := self._take_loose_messages(contents, position, end)) > position:
                 position = after
                 continue
-            run.finish(contents.chunks)
             try:
+                head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
+                opcode, length = head[0], int.from_bytes(head[1:9], "little")
+                if opcode in (OP_FOOTER, OP_DATA_END) and length <= FOOTER:
+                    if opcode == OP_DATA_END:
+                        self._check_data_section(contents, position)
+                    return True
+                after = position + RECORD_HEAD + length
                 self._take_record(contents, opcode, position, after, end)
             except DamageError as error:
                 after = self._stepped_over(contents, position, end, error)
             position = after
-        run.finish(contents.chunks)
-        if closed and opcode == OP_DATA_END:
-            self._check_data_section(contents, position)
-        return closed
+        return False
+
+    def _take_loose_messages(self, contents: Contents, position: int, end: int) -> int:
+        """Take messages outside chunks that follow one another as if they were a chunk; return where they end."""
+        after = position
+        with suppress(DamageError):
+            while after - position <= _LOOSE_BYTES and after + RECORD_HEAD <= end:
+                head = self._bytes.peek(after, RECORD_HEAD + MESSAGE_HEAD)
+                length = int.from_bytes(head[1:9], "little")
+                if head[0] != OP_MESSAGE or length < MESSAGE_HEAD or after + RECORD_HEAD + length > end:
+                    break
+                stamp = int.from_bytes(head[15:23], "little")
+                self._tally(int.from_bytes(head[9:11], "little"), 1, stamp, stamp)
+                after += RECORD_HEAD + length
+        size = after - position
+        if size:
+            contents.chunks.append(Chunk(position, position, size, "", size, 0, 0, headless=True))
+        return after
 
     def _stepped_over(self, contents: Contents, position: int, end: int, error: DamageError) -> int:
         """Note what cannot be at ``position``; return where the next chunk begins."""
@@ -421,7 +411,7 @@ class McapPart(ChunkedPart[Chunk]):
         if self._untimed:
             self._note("time-invalid", 0, messages_lost=self._untimed)
         if unknown := self._tallies.keys() - self._contents.channels.keys():
-            self._note("channel-undeclared", 0, messages_lost=sum(self._tallies[channel].count for channel in unknown))
+            self._note("channel-undeclared", 0, messages_lost=sum(self._tallies[channel][0] for channel in unknown))
 
     def _declare_and_count(self, chunk: Chunk) -> None:
         try:
@@ -450,8 +440,7 @@ class McapPart(ChunkedPart[Chunk]):
         if statistics:
             count, (start_ns, end_ns) = statistics.messages_by_channel.get(number, 0), self._times(number)
         else:
-            tally = self._tallies.get(number, _Tally())
-            count, start_ns, end_ns = tally.count, tally.start_ns, tally.end_ns
+            count, start_ns, end_ns = self._tallies.get(number, (0, None, None))
         return Topic(
             channel.topic,
             normalize_type_name(schema.name),
@@ -483,10 +472,8 @@ class McapPart(ChunkedPart[Chunk]):
         return min(first, default=None), max(last, default=None)
 
     def _tally(self, channel: int, count: int, start_ns: int, end_ns: int) -> None:
-        tally = self._tallies.setdefault(channel, _Tally())
-        tally.count += count
-        tally.start_ns = start_ns if tally.start_ns is None else min(start_ns, tally.start_ns)
-        tally.end_ns = end_ns if tally.end_ns is None else max(end_ns, tally.end_ns)
+        known, first_ns, last_ns = self._tallies.get(channel, (0, start_ns, end_ns))
+        self._tallies[channel] = known + count, min(start_ns, first_ns), max(end_ns, last_ns)
 
     def _tally_messages(self, data: memoryview, messages: Int64Array) -> None:
         channels = gather_integers(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
@@ -504,28 +491,6 @@ class McapPart(ChunkedPart[Chunk]):
         return Damage(
             error.cause, self.name, chunk.offset, messages_lost=lost or None, bytes_lost=size, reason=error.reason
         )
-
-
-class _LooseMessages:
-    """Messages outside chunks that follow one another: read together, as if they were a chunk."""
-
-    def __init__(self) -> None:
-        self._start = self._end = 0
-
-    def extend(self, start: int, end: int, chunks: list[Chunk]) -> None:
-        """Add one message."""
-        if self._end - self._start > _LOOSE_BYTES:
-            self.finish(chunks)
-        if self._end == self._start:
-            self._start = start
-        self._end = end
-
-    def finish(self, chunks: list[Chunk]) -> None:
-        """Append the run to the chunks."""
-        size = self._end - self._start
-        if size:
-            chunks.append(Chunk(self._start, self._start, size, "", size, 0, 0, headless=True))
-        self._start = self._end = 0
 
 
 def _find_needed_bytes(chunk: Chunk) -> tuple[int, int]:

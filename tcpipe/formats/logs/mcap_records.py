@@ -101,8 +101,6 @@ class Statistics:
 
     messages: int
     chunks: int
-    start_ns: int
-    end_ns: int
     messages_by_channel: dict[int, int]
 
 
@@ -189,8 +187,8 @@ def parse_chunk_index(content: bytes | memoryview) -> Chunk:
 def parse_statistics(content: bytes | memoryview) -> Statistics:
     """Return the counts of the file."""
     fields = FieldReader(content)
-    messages, _, _, _, _, chunks, start_ns, end_ns, map_bytes = fields.take("QHIIIIQQI")
-    return Statistics(messages, chunks, start_ns, end_ns, fields.pairs(map_bytes))
+    messages, _, _, _, _, chunks, _, _, map_bytes = fields.take("QHIIIIQQI")
+    return Statistics(messages, chunks, fields.pairs(map_bytes))
 
 
 def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:

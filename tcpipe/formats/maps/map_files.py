@@ -32,11 +32,12 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
+from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.integrity import read_checksums
 from tcpipe.formats.json_files import convert_record, parse_typed, read_json, to_plain
 from tcpipe.formats.maps.map_facts import Description, MapFacts, MapSummary, describe_layer, make_cf_flags, read_layers
 from tcpipe.formats.place import prove_files
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, ShardFetcher, open_sharded
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.options import rename_keys
@@ -179,7 +180,7 @@ class MapFile:
             ) from error
 
 
-def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = True) -> MapFile:
+def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool = True) -> MapFile:
     """Open a map for reading; its shards lie beside their descriptions, or are ``fetched``.
 
     Raises
@@ -240,7 +241,7 @@ def _refuse_sizes(kept: _Attributes, path: Path) -> None:
         raise StoreError(f"{path}: tiles and overviews are {(kept.tile_px, kept.factors)}, expected {wanted}")
 
 
-def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: ShardFetcher | None) -> ShardedArray:
+def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: FetchedShards | None) -> ShardedArray:
     grid, shard_px = make_overview_grid(whole, factor), _compute_shard_px(factor)
     return open_sharded(
         path / f"{_level_path(factor)}{layer.name}",
@@ -254,7 +255,7 @@ def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: 
     )
 
 
-def _open_bands(path: Path, layer: Layer, grid: MapGrid, fetched: ShardFetcher | None) -> ShardedArray:
+def _open_bands(path: Path, layer: Layer, grid: MapGrid, fetched: FetchedShards | None) -> ShardedArray:
     return open_sharded(
         path / BANDS / layer.name / layer.name,
         shape=(len(layer.bands), grid.rows, grid.cols),
@@ -272,7 +273,7 @@ def _compute_shard_px(factor: int) -> int:
     return max(SHARD_PX // factor, TILE_PX)
 
 
-def _prove(path: Path, fetched: ShardFetcher | None) -> None:
+def _prove(path: Path, fetched: FetchedShards | None) -> None:
     """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
     try:
         listed = read_checksums(path)

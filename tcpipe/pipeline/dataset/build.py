@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import shlex
 import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
@@ -82,7 +81,7 @@ from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_o
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import READ_VERSIONS
 from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
@@ -382,28 +381,10 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     card = make_dataset_card(figures, options, inputs, content, balance=balance, shards=shards)
     card = card if redaction is None else redact_card(card, redaction)
     shutil.rmtree(waiting)
-    spool, schema = content.spool, content.samples.schema
+    write_text(directory / HUB_CARD, format_hub_card(card, samples_file=SAMPLES, picture=OVERVIEW))
     files = compute_checksums(directory)
-    write_text(
-        directory / HUB_CARD,
-        format_hub_card(replace(card, checksums=files), schema, samples_file=SAMPLES, picture=OVERVIEW),
-    )
-    files = {**files, HUB_CARD: compute_checksum(directory / HUB_CARD)}
-    sizes = {name: math.prod(layer.patch_shape(spool.patch_px)) for name, layer in spool.layers.items()}
-    patches = {name: (sizes[name], layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
-    croissant = format_croissant(
-        name=card.name,
-        description=card.description,
-        licence=card.licence,
-        creator=card.creator,
-        attributions=card.attributions,
-        files=files,
-        samples_file=SAMPLES,
-        samples=schema,
-        version=f"{DATA_MODEL_VERSION}.0+{inputs.digest[:12]}",
-        shards=None if patches is None else f"{SHARDS}/*.parquet",
-        layers=patches,
-    )
+    shards_pattern = f"{SHARDS}/*.parquet"
+    croissant = format_croissant(card, content.samples.schema, files, samples_file=SAMPLES, shards=shards_pattern)
     write_text(directory / CROISSANT, croissant)
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)

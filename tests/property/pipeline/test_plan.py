@@ -21,6 +21,7 @@ from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
 from tcpipe.pipeline.log_sources import find_damaged_log
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import TO_DO, IngestResult, check_age, make_result
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
@@ -121,7 +122,7 @@ def test_what_status_predicts_is_what_ingest_does(row, actions):
 def compare(logs, store, worked, **how):
     predicted = {
         name: group.state
-        for group in find_status([logs], store=store, create=True, **how).groups
+        for group in find_status(IngestOptions([logs], store=store, **{"min_age_s": 600.0, **how}), create=True).groups
         for name in group.logs
     }
     before, worked[:] = Store(store).state(), []

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from physics_model import made_residuals
 
-from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
+from tcpipe.cost.prediction_errors import (
+    estimate_correlation,
+    fit_bias_correction,
+    fit_errors,
+    make_residuals,
+    propagate_stated,
+)
 
 _GRASS = np.uint8(4)
 
@@ -186,3 +192,61 @@ def test_a_budget_suffices_as_often_as_its_probability_says_there_and_back(share
         assert share > probability - 0.06 if probability > 0.5 else share < probability + 0.06
         if shared:
             assert share == pytest.approx(probability, abs=0.06)
+
+
+def _with_covariances(stated_by, count=6000, seed=4):
+    """Errors of power whose deviation varies by metre, and what a model states of it; correlated with those of velocity by half."""
+    rng = np.random.default_rng(seed)
+    true_std = rng.choice([2.0, 20.0], count)
+    both = rng.standard_normal((2, count))
+    power = 150.0 + true_std * both[0]
+    velocity = 0.8 + 0.01 * (0.5 * both[0] + np.sqrt(0.75) * both[1])
+    factor, std = stated_by(rng, true_std)
+    covariance = factor**2 * np.array([[std**2, 0.005 * std], [0.005 * std, np.full(count, 0.01**2)]]).transpose(
+        2, 0, 1
+    )
+    labels, mean = np.column_stack([power, velocity]), np.tile([150.0, 0.8], (count, 1))
+    columns = {name: made_residuals(count)[name] for name in ("run_id", "start_ns", "terrain_class")}
+    return columns | make_residuals(labels, mean, covariance), true_std, labels, covariance
+
+
+def test_what_a_model_states_counts_as_far_as_held_out_errors_follow_it():
+    """Half of the truth is doubled, so that metres of either deviation are covered; numbers that tell nothing are not followed."""
+    residuals, true_std, labels, covariance = _with_covariances(lambda _, std: (0.5, std))
+    errors, class_id = fit_errors(residuals), np.full(len(labels), _GRASS)
+    stated = propagate_stated(np.tile([150.0, 0.8], (len(labels), 1)), covariance)
+    for name, true in (("power", labels[:, 0]), ("energy", labels[:, 0] / labels[:, 1])):
+        predicted = np.full(len(true), {"power": 150.0, "energy": 187.5}[name])
+        low, high = errors[name].compute_intervals(predicted, class_id, stated[name])
+        inside = (low <= true) & (true <= high)
+        assert inside[true_std == 2.0].mean() == pytest.approx(0.9, abs=0.06)
+        assert inside[true_std == 20.0].mean() == pytest.approx(0.9, abs=0.04)
+    assert errors["power"].stated_share == pytest.approx(2.0, rel=0.1)
+    usual = errors["power"].compute_std(np.full(1, 150.0), class_id[:1])
+    assert usual == pytest.approx(np.mean(true_std), rel=0.1)
+    useless, *_ = _with_covariances(lambda rng, std: (1.0, rng.permutation(std)))
+    found = fit_errors(useless)["power"]
+    assert found.stated_share * 20.0 < 0.1 * found.compute_std(np.full(1, 150.0), class_id[:1])[0]
+
+
+def test_errors_of_power_and_velocity_are_correlated():
+    assert estimate_correlation(_with_covariances(lambda _, std: (1.0, std))[0]) == pytest.approx(0.5 * 0.77, abs=0.05)
+
+
+def test_propagation_is_that_of_small_errors():
+    """Against 200,000 draws of a correlated normal."""
+    mean, covariance = np.array([120.0, 0.7]), np.array([[4.0, -0.01], [-0.01, 1e-4]])
+    power, velocity = np.random.default_rng(0).multivariate_normal(mean, covariance, 200_000).T
+    found = propagate_stated(mean[None], covariance[None])
+    drawn = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
+    assert {name: of[0] for name, of in found.items()} == pytest.approx(
+        {name: of.std() for name, of in drawn.items()}, rel=0.02
+    )
+
+
+def test_errors_of_one_fold_are_wider_by_what_folds_differ():
+    residuals = made_residuals(4000)
+    one, two = (fit_errors({**residuals, "fold": fold})["energy"] for fold in (np.zeros(4000), np.arange(4000) % 2))
+    assert one.compute_std(np.full(1, 150.0), np.full(1, _GRASS)) == pytest.approx(
+        1.225 * two.compute_std(np.full(1, 150.0), np.full(1, _GRASS)), rel=1e-3
+    )

@@ -37,10 +37,10 @@ def test_one_line_in_any_wrapping_is_read(tmp_path, document):
     [
         ("{", "not JSON"),
         ({"type": "FeatureCollection", "features": []}, "is empty"),
-        ({"type": "LineString", "coordinates": []}, "no points"),
-        ({"type": "LineString", "coordinates": [[15.0, 47.0]]}, "one point"),
+        ({"type": "LineString", "coordinates": []}, "is empty"),
+        ({"type": "LineString", "coordinates": [[15.0, 47.0]]}, "must contain 0 or >1"),
         ({"type": "LineString", "coordinates": [[15.0, 47.0], [15.0, 47.0]]}, "one point"),
-        ({"type": "LineString", "coordinates": [[15.0, None], [15.0, 47.0]]}, "not finite"),
+        ({"type": "LineString", "coordinates": [[15.0, None], [15.0, 47.0]]}, "type must be number, but is null"),
         ({"type": "LineString", "coordinates": [[15.0], [15.0, 47.0]]}, "positions"),
         ({"type": "LineString", "coordinates": [[47.0, 115.0], [47.0, 115.1]]}, "axes look swapped"),
         ({"type": "LineString", "coordinates": [[500000.0, 5200000.0], [500010.0, 5200000.0]]}, "projected"),

@@ -11,6 +11,7 @@ from tcpipe.cli.output import show_progress
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.place import open_place
 from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
@@ -111,7 +112,9 @@ def _ingest(logs):
 def _finish(logs):
     """Expect that the next call makes up for the log that failed, and that nothing is left to do."""
     assert {name: of.status for name, of in _ingest(logs).items()} == {"one": "done", "two": "unchanged"}
-    assert find_status([logs], store="s3://tests/store", recipe=Recipe(), min_age_s=0.0).counts == {"done": 2}
+    assert find_status(IngestOptions([logs], store="s3://tests/store", recipe=Recipe(), min_age_s=0.0)).counts == {
+        "done": 2
+    }
     assert verify("s3://tests/store").problems == ()
 
 

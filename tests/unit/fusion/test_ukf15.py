@@ -4,20 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from rough_drive import drive, initial, measured
 
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
-from tcpipe.fusion.ukf15 import (
-    STATES,
-    VX,
-    SensorRows,
-    collect_sources,
-    filter_forward,
-    predict_measurements,
-    predict_states,
-    run_ukf15,
-)
+from tcpipe.fusion.ukf15 import VX, SensorRows, collect_sources, filter_forward, run_ukf15
 from tcpipe.geometry.rotation import invert, rotate, rpy_from_matrix, rpy_from_quat, wrap_to_pi
 
 SETTLED = 100  # rows, 5 s: the start is wrong on purpose
@@ -159,25 +149,3 @@ def test_a_covariance_that_rounding_has_made_useless_keeps_its_variances():
     found = filter_forward([still], [np.inf], x=np.zeros(15), P=P, q=np.zeros(15), start_ns=0, output_ns=end_ns)
     assert found.variance[0, VX] == pytest.approx(0.01 / 3, rel=0.1)
     assert np.isfinite(found.x).all()
-
-
-def test_a_prediction_and_an_update_are_filterpys():
-    rng = np.random.default_rng(4)
-    x, P, q = rng.normal(0, 0.3, STATES), np.diag(rng.uniform(0.001, 0.02, STATES)), rng.uniform(0.1, 1.0, STATES)
-    z, variance = rng.normal(0, 0.3, (1, 3)), np.full((1, 3), 0.01)
-    P[3:6, 3:6] = np.eye(3) * 1e-8  # so near to each other angles have the mean of numbers
-    stamp_ns = np.array([50_000_000])
-    antenna = SensorRows(GNSS, (0, 1, 2), stamp_ns, z, variance, (0.3, -0.2, 0.8))
-    found = filter_forward([antenna], [np.inf], x=x, P=P, q=q, start_ns=0, output_ns=stamp_ns)
-    points = MerweScaledSigmaPoints(STATES, alpha=1.0, beta=2.0, kappa=0.0)
-    ukf = UnscentedKalmanFilter(
-        STATES, 3, 0.05,
-        hx=lambda state: predict_measurements(state[None], antenna)[0],
-        fx=lambda state, dt: predict_states(state[None], dt)[0], points=points,
-    )  # fmt: skip
-    ukf.x, ukf.P, ukf.Q, ukf.R = x, P, np.diag(q * 0.05), np.diag(variance[0])
-    ukf.predict()
-    ukf.sigmas_f = points.sigma_points(ukf.x, ukf.P)  # its update would take those of before the prediction's noise
-    ukf.update(z[0])
-    np.testing.assert_allclose(found.x[0], ukf.x, atol=1e-10)
-    np.testing.assert_allclose(found.variance[0], np.diag(ukf.P), atol=1e-10)

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from made_models import CARD, made_comparison
 
+from tcpipe.cost.prediction_errors import make_residuals
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.learning.baselines import SIMPLEST_FIRST, _group_samples, compare_baselines, describe_ratios, rank_model
 from tcpipe.learning.metrics import Ratio, compute_costs
 from tcpipe.learning.models import Model
-from tcpipe.learning.predictions import Predicted, collect_measured, make_residuals
+from tcpipe.learning.predictions import Predicted, collect_measured
+from tcpipe.learning.predictor import Prediction
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +28,7 @@ def said_by(sets, factor=1.0):
         name: compute_costs(factor * part.costs["w"], part.costs["v"], 1.0) | {"E": factor * part.costs["E"]}
         for name, part in sets.items()
     }
-    return {name: Predicted(costs, costs) for name, costs in said.items()}
+    return {name: Predicted(costs, costs, {}) for name, costs in said.items()}
 
 
 def model_of(kind="resnet18"):
@@ -133,7 +135,8 @@ def test_one_rule_centres_every_predictor(sets, is_of_energy):
     train = data["train"]
     factor = np.where(train.column("terrain_class") == 4, 1.2, 1.0)
     said = np.column_stack([train.labels[:, 0] * factor, train.labels[:, 1]]).astype(float)
-    residuals = {name: values for name, values in make_residuals(train, said).items() if name != "fold"}
+    residuals = {name: train.column(name) for name in ("run_id", "start_ns", "terrain_class")}
+    residuals |= make_residuals(train.labels.astype(float), said, np.zeros((len(said), 2, 2)))
     test = parts["test"]
     again = np.where(test.class_ids == 4, 1.2, 1.0)
     outputs = np.column_stack([test.costs["w"] * again, test.costs["v"]])
@@ -142,6 +145,7 @@ def test_one_rule_centres_every_predictor(sets, is_of_energy):
         energy = train.labels[:, 0] / train.labels[:, 1]
         residuals = kept | {"energy_joule": energy, "energy_predicted_joule": energy * factor}
         outputs = (outputs[:, :1] / outputs[:, 1:]).astype(float)
-    found, true = Predicted.centre(residuals, outputs, test.class_ids, 1.0), test.costs["w"] / test.costs["v"]
+    said = Prediction.without_covariance(outputs)
+    found, true = Predicted.centre(residuals, said, test.class_ids, 1.0), test.costs["w"] / test.costs["v"]
     np.testing.assert_allclose(found.uncentred["E"], again * true, rtol=1e-5)
     np.testing.assert_allclose(found.costs["E"], true, rtol=0.02)

@@ -48,21 +48,21 @@ def test_what_is_told_beside_a_patch_is_heeded(told, tmp_path, kind):
     config = FitConfig(model=kind, extra_features=True, epochs=1, width=16, batch_size=32)
     train(told, tmp_path / "model", config=config)
     model, split = load_model(tmp_path / "model"), open_dataset(told)["test"]
-    assert [of.name for of in model.card.extra_features] == ["turn_radpm", "command_mps"]
-    assert model.card.extra_features[1].training_range == (0.5, 1.0)
+    assert [of.name for of in model.card.inputs.extra_features] == ["turn_radpm", "command_mps"]
+    assert model.card.inputs.extra_features[1].training_range == (0.5, 1.0)
     assert model.takes_turns
     extra_features = read_extra_features(split)
-    said = model.predict(split.patches, extra_features)
+    said = model.predict(split.patches, extra_features).mean
     assert predict_costs(model, split).uncentred["w"] == pytest.approx(said[:, 0])  # not centred
-    usual = model.predict(split.patches)
+    usual = model.predict(split.patches).mean
     straight = replace(
         extra_features,
-        turn_radpm=np.full(len(split), model.card.extra_features[0].usual),
+        turn_radpm=np.full(len(split), model.card.inputs.extra_features[0].usual),
         command_mps=np.full(len(split), np.nan),
     )
-    assert model.predict(split.patches, straight) == pytest.approx(usual, rel=1e-5)
+    assert model.predict(split.patches, straight).mean == pytest.approx(usual, rel=1e-5)
     assert np.abs(said - usual).max() > 0.0
-    full, half = (set_speed(model, mps).predict(split.patches)[:, 1] for mps in (1.0, 0.5))
+    full, half = (set_speed(model, mps).predict(split.patches).mean[:, 1] for mps in (1.0, 0.5))
     assert np.abs(full - half).max() > 0.0
     if kind == "boosting":
         assert 0.35 < (full - half).mean() < 0.6  # 0.5 was put in
@@ -77,8 +77,8 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
     assert verify(tmp_path / "model").problems == ()
     assert model.takes_turns
     assert sorted(model.residuals["sample_id"]) == sorted(split.column("sample_id"))
-    assert set(model.pixel_classes) >= {4, 5}
-    said = model.predict(split.with_channels("height").patches, read_extra_features(split))
+    assert set(model.card.training_range.pixel_classes) >= {4, 5}
+    said = model.predict(split.with_channels("height").patches, read_extra_features(split)).mean
     centred = predict_costs(model, split).costs["w"] / said[:, 0]
     for of in (4, 5):
         assert np.ptp(centred[split.column("terrain_class") == of]) < 1e-5, "a class is centred as one"
@@ -111,7 +111,7 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     config = FitConfig(model="boosting", extra_features=True)
     train(dataset, tmp_path / "model", config=config)
     assert "its samples have no commanded speed (commanded_velocity_mps): the model does not use it" in caplog.text
-    assert [of.name for of in load_model(tmp_path / "model").card.extra_features] == ["turn_radpm"]
+    assert [of.name for of in load_model(tmp_path / "model").card.inputs.extra_features] == ["turn_radpm"]
     absent.add("mean_abs_yaw_rate_radps")
     with pytest.raises(
         DatasetError,

@@ -56,7 +56,7 @@ def evaluated(model, dataset, tmp_path_factory):
 
 def _centred(model, split):
     """What a model says, shape (N, 2), by its bias on held-out samples corrected."""
-    said = load_model(model).predict(split.patches).astype(float)
+    said = load_model(model).predict(split.patches).mean.astype(float)
     return np.stack(
         fit_bias_correction(load_model(model).residuals).apply(*said.T, split.column("terrain_class")), axis=1
     )
@@ -165,9 +165,9 @@ def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):
     patches = test.patches.copy()
     patches[..., 1] = np.random.default_rng([7, 1]).random(patches.shape[:3], np.float32)
     ours = replace(ours, residuals={})  # not centred
-    by_hand = ours.predict(patches)[:, 0]
+    by_hand = ours.predict(patches).mean[:, 0]
     assert predict_costs(ours, test, noise=["terrain"], seed=(7, 1)).costs["w"] == pytest.approx(by_hand, rel=1e-5)
-    assert predict_costs(ours, test).costs["w"] == pytest.approx(ours.predict(test.patches)[:, 0], rel=1e-5)
+    assert predict_costs(ours, test).costs["w"] == pytest.approx(ours.predict(test.patches).mean[:, 0], rel=1e-5)
 
 
 def test_seven_input_sets(evaluated):
@@ -308,9 +308,8 @@ def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch)
 
 
 def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
-    architecture = replace(CARD.architecture, outputs=1, depth=1)
     place = made_model(
-        tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
+        tmp_path / "energy", channels=("height",), planes=("height",), outputs=("energy_joule",), scale=(400.0,)
     )
     with pytest.raises(ModelError, match="it predicts only energy_joule, expected power_watt and velocity_mps"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)

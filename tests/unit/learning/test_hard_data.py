@@ -49,7 +49,7 @@ def test_one_run_left_to_train_wants_another_or_blocks(bare, tmp_path):
 def test_heights_alone_are_enough(bare, tmp_path, kind):
     train(bare / "dataset", tmp_path / "model", config=FitConfig(model=kind))
     model = load_model(tmp_path / "model")
-    assert model.channels == ("height",)
+    assert model.card.inputs.channels == ("height",)
     found = run_evaluation(tmp_path / "model", bare / "dataset", tmp_path / "evaluation", config=CONFIG)
     assert np.isfinite(found.values.splits["unseen"].errors["E"]["all"].rmse)
     assert "unseen, energy E: " in str(found)
@@ -76,7 +76,7 @@ def test_three_samples_of_a_class_are_enough_to_be_told_something(dataset, tmp_p
 
     monkeypatch.setattr(Split, "column", column)
     train(dataset, tmp_path / "model", config=FitConfig(model=kind))
-    assert load_model(tmp_path / "model").class_counts[1] == 3
+    assert load_model(tmp_path / "model").card.training_range.class_counts[1] == 3
     values = run_evaluation(tmp_path / "model", dataset, tmp_path / "evaluation", config=CONFIG).values
     assert np.isfinite([row.errors.rmse for row in values.baselines]).all()
 

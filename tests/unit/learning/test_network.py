@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.architecture import Architecture, check_trainable, compute_loss_factors, mean_loss
+from tcpipe.learning.fitting import compute_loss_factors, mean_loss
+from tcpipe.learning.network_model import check_trainable
 
 SCALE = (400.0, 1.0)
 LABELS = np.array([[150.0, 0.8], [200.0, 0.9]]) / SCALE
@@ -46,10 +47,9 @@ pytest.importorskip("torch")
 
 STEPS = """
 import numpy as np
-from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.network import make_resnet18
 from tcpipe.learning.network import Trainer
-trainer = Trainer(make_resnet18(Architecture(40, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
+trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), np.ones(1, np.float32))
 rng = np.random.default_rng(0)
 for count in (11, 11, 35, 3) * 2:
     trainer.step(rng.random((count, 40, 40, 1), np.float32), *rng.random((2, count, 1), np.float32), 1e-3)
@@ -64,15 +64,14 @@ def test_odd_batches_of_a_narrow_network_on_two_threads():
 @pytest.mark.parametrize("width", [4, 8, 24])
 def test_widths_that_are_no_multiple_of_sixteen(width):
     with pytest.raises(ModelError, match=f"a network of width {width}: expected a multiple of 16"):
-        check_trainable(Architecture(40, 3, 2, width))
+        check_trainable(3, 2, width)
 
 
 def test_first_weights_are_he_s_of_the_seed():
     """Variance 2 / inputs of a filter, nothing beyond two deviations of the uncut normal; the head starts with what it is given."""
     from tcpipe.learning.network import make_resnet18
 
-    shape = Architecture(40, 3, 2, 32)
-    one, other, third = (make_resnet18(shape, seed=seed, start=[0.4, 0.8]).arrays() for seed in (0, 0, 1))
+    one, other, third = (make_resnet18(3, 2, 32, seed=seed, start=[0.4, 0.8]).arrays() for seed in (0, 0, 1))
     assert all(np.array_equal(one[name], other[name]) for name in one)
     kernel = "stage3_block2_first_convolution/kernel"
     assert one[kernel].shape == (3, 3, 128, 128)
@@ -86,7 +85,7 @@ def test_a_batch_of_one_sample_of_one_pixel_is_trained_on():
     """The last stage sees a patch of 16 pixels as one, of which a batch normalisation has no deviation."""
     from tcpipe.learning.network import Trainer, make_resnet18
 
-    trainer = Trainer(make_resnet18(Architecture(16, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
+    trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), np.ones(1, np.float32))
     patch, label = np.full((1, 16, 16, 1), 0.5, np.float32), np.array([[0.7]], np.float32)
     losses = [trainer.step(patch, label, np.ones_like(label), 1e-2) for _ in range(5)]
     assert losses[0] == pytest.approx(0.2, abs=0.1)

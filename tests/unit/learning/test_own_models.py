@@ -10,6 +10,7 @@ from installed_command import tcpipe as command
 from synthetic_store import box, lonlat, region_file, small_store
 
 import tcpipe
+from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.learning import own_models
 from tcpipe.learning.models import load_model
@@ -98,12 +99,43 @@ def test_predictions_are_those_of_the_code_and_a_change_of_it_is_said(place, tmp
     features = tcpipe.dataset.extra_features.read_extra_features(split)
     model = load_model(tmp_path / "model", str(code))
     wanted = 60.0 + 0.8 * (90.0 + 400.0 * np.tan(slope))
-    assert model.predict(split.patches, features)[:, 0] == pytest.approx(wanted, rel=1e-5)
+    assert model.predict(split.patches, features).mean[:, 0] == pytest.approx(wanted, rel=1e-5)
     code.write_text(EXAMPLES["by_hand.py"].replace("60.0", "61.0"))
     changed = load_model(tmp_path / "model", str(code))
     assert "has changed since" in caplog.text
-    assert changed.predict(split.patches, features)[:, 0] == pytest.approx(wanted + 1.0, rel=1e-5)
+    assert changed.predict(split.patches, features).mean[:, 0] == pytest.approx(wanted + 1.0, rel=1e-5)
     assert changed.checksum != model.checksum
+
+
+STATED = """
+import numpy as np
+
+def predict(patches, features):
+    mean = np.column_stack([150.0 + 300.0 * features.slope_rad, np.full(len(patches), 0.8)])
+    covariance = np.zeros((len(patches), 2, 2))
+    covariance[:, 0, 0] = 1.0 + 1e4 * features.slope_rad**2
+    return mean, covariance
+"""
+
+
+def test_covariances_of_an_own_model_reach_its_intervals(place, tmp_path):
+    """What it states is kept beside held-out predictions; `predict` scales it by their errors, and fills in what is not stated."""
+    here, _ = place
+    (tmp_path / "mine.py").write_text(STATED)
+    tcpipe.train(here / "dataset", tmp_path / "model", predictor=str(tmp_path / "mine.py"))
+    model, split = (
+        load_model(tmp_path / "model", str(tmp_path / "mine.py")),
+        tcpipe.open_dataset(here / "dataset")["test"],
+    )
+    features = read_extra_features(split)
+    kept = tcpipe.open_dataset(here / "dataset")["train"].column("slope_rad").astype(float)
+    assert sorted(model.residuals["power_predicted_std_watt"]) == pytest.approx(sorted(np.sqrt(1.0 + 1e4 * kept**2)))
+    said, asked = model.predict(split.patches, features), model.ask(split.patches, features)
+    assert np.array_equal(said.mean, asked.mean)
+    assert (asked.covariance[:, 1, 1] == 0.0).all()
+    assert (np.linalg.eigvalsh(said.covariance) > 0.0).all()
+    by_hand = model.errors["power"].compute_std(said.mean[:, 0], features.class_id, np.sqrt(asked.covariance[:, 0, 0]))
+    assert np.sqrt(said.covariance[:, 0, 0]) == pytest.approx(by_hand)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +143,9 @@ def test_predictions_are_those_of_the_code_and_a_change_of_it_is_said(place, tmp
     [
         ("1 / 0", ModelError, r"mine.py: ZeroDivisionError: division by zero \(.*mine.py, line 1, in <module>\)"),
         ("def predict(patches, features):\n    return features.gone", ModelError, r"no attribute 'gone' \(.*line 2, in predict"),
-        ("def predict(patches, features):\n    return patches[:, 0, 0]", ModelError, r"shape \(50, 3\), expected 50 rows of power"),
+        ("def predict(p, f):\n    return p[:, 0, 0]", ModelError, r"mine.py: predict returned shape \(50, 3\), expected \(50, 2\)"),
+        ("class A:\n    def predict(self, p, f): return p[:, 0, 0, :2], p[:, 0, 0]", ModelError, r"A.predict returned covariances of"),
+        ("def predict(p, f):\n    return p[:, 0, 0, :2], p[:, :2, :2, 0] * 0 - 1", ModelError, "50 of 50 covariances that are none"),
         ("x = 1", UsageError, "has no a class with a method predict, or a function predict; expected one"),
         ("class A:\n    predict = 1\nclass B(A): pass", UsageError, r"has A, B; expected one: name it as .*mine.py:NAME"),
         ("def predict(patches, features):\n    return patches[:, 0, 0, :2] * float('nan')", ModelError, "no finite prediction of"),

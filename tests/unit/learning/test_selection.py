@@ -98,7 +98,7 @@ def test_curves_are_models_like_the_others(dataset, tmp_path, kind):
     split, features = data["train"], read_extra_features(data["train"])
     curves = fit_curves(kind, features.slope_rad, features.class_id, split.labels.astype(np.float64))
     there = read_extra_features(data["unseen"])
-    said = model.predict(data["unseen"].with_channels("height").patches, there)
+    said = model.predict(data["unseen"].with_channels("height").patches, there).mean
     assert said == pytest.approx(curves.predict(there.slope_rad, there.class_id), rel=1e-6)
     assert not model.takes_turns
 
@@ -115,7 +115,7 @@ def test_a_residual_network_learns_what_the_curve_leaves(dataset, labelled, tmp_
     assert errors["residual"] < 0.7 * errors["linear"]
     model, split = load_model(tmp_path / "residual"), open_dataset(dataset)["test"]
     features = read_extra_features(split)
-    said = model.predict(split.patches, features)
-    assert model.predict(split.patches[3:4], features.take(slice(3, 4))) == pytest.approx(said[3:4], rel=1e-4)
+    said = model.predict(split.patches, features).mean
+    assert model.predict(split.patches[3:4], features.take(slice(3, 4))).mean == pytest.approx(said[3:4], rel=1e-4)
     train(dataset, tmp_path / "again", config=FitConfig(model="residual"))
     assert (tmp_path / "again" / "weights.npz").read_bytes() == (tmp_path / "residual" / "weights.npz").read_bytes()

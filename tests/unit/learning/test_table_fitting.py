@@ -34,12 +34,11 @@ def test_it_predicts_what_it_was_made_of(trained, dataset):
     model, split = load_model(place), open_dataset(dataset)["train"]
     assert result.samples == {"fitted": len(split), "held out": len(split)}
     assert f"boosting of {len(split)} samples, best {result.best_epoch} of" in str(result)
-    said = model.predict(split.patches)
-    assert said.dtype == np.float32
+    said = model.predict(split.patches).mean
     errors = np.abs(said - split.labels).mean(axis=0)
     assert (errors < np.abs(split.labels - split.labels.mean(axis=0)).mean(axis=0)).all()
-    assert model.predict(split.patches[3:4]) == pytest.approx(said[3:4])
-    assert sum(model.class_counts.values()) == len(split)
+    assert model.predict(split.patches[3:4]).mean == pytest.approx(said[3:4])
+    assert sum(model.card.training_range.class_counts.values()) == len(split)
     assert verify(place).problems == ()
     assert "Kind boosting: a curve over the slope" in (place / README).read_text()
 
@@ -48,7 +47,7 @@ def test_every_sample_was_held_out_once(trained, dataset):
     residuals, split = load_model(trained[0]).residuals, open_dataset(dataset)["train"]
     assert sorted(residuals["sample_id"]) == sorted(split.column("sample_id"))
     assert residuals["power_watt"] == pytest.approx(split.labels[:, 0])
-    said = load_model(trained[0]).predict(split.patches)[:, 0]
+    said = load_model(trained[0]).predict(split.patches).mean[:, 0]
     seen, unseen = (np.square(found - split.labels[:, 0]).mean() for found in (said, residuals["power_predicted_watt"]))
     assert seen < unseen
 
@@ -63,7 +62,7 @@ def test_the_same_again_is_nothing_to_do_and_the_same_bytes(trained, dataset, tm
 def test_one_layer_one_output_and_weights(dataset, tmp_path):
     train(dataset, tmp_path / "height", config=CONFIG, variant=Variant(channels=("height",), energy_only=True))
     model = load_model(tmp_path / "height")
-    said = model.predict(open_dataset(dataset)["train"].with_channels("height").patches)
+    said = model.predict(open_dataset(dataset)["train"].with_channels("height").patches).mean
     assert said.shape[1] == 1
     train(dataset, tmp_path / "weighed", config=replace(CONFIG, inverse_variance_weights=True))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):
@@ -79,8 +78,8 @@ def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
     asked = np.arange(20) != 3
     ground = {name: split.column(name)[:20] for name in ("terrain_class", "slope_rad")}
     said = predict_patches(model, SimpleNamespace(pixels=pixels, **ground), asked)
-    assert np.isnan(said.power_watt[3])
-    assert said.power_watt[asked] == pytest.approx(model.predict(split.patches[:20])[asked, 0])
+    assert np.isnan(said.mean[3, 0])
+    assert said.mean[asked, 0] == pytest.approx(model.predict(split.patches[:20]).mean[asked, 0])
 
 
 def test_it_is_evaluated_without_networks(trained, dataset, tmp_path):

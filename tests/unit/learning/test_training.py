@@ -1,27 +1,25 @@
 """Training: seeded, stopped by a fold of train, gone on from a checkpoint as if nothing had happened."""
 
 import csv
-import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
-from tcpipe.formats.weights import read_arrays, write_arrays
+from tcpipe.formats.weights import read_arrays
 from tcpipe.learning import network_model
-from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.fitting import FitConfig, compute_loss_factors
 from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
-from tcpipe.learning.network_model import TrainingProgress, read_checkpoint, write_checkpoint
-from tcpipe.learning.training import Variant, find_training_range, make_training_task, train
+from tcpipe.learning.training import Variant, find_training_range, make_samples, select_train, train
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_NODATA
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 
 CONFIG = FitConfig(width=16, epochs=3, patience=3, learning_rate=1e-3)
 
@@ -57,16 +55,16 @@ def test_the_model_knows_what_it_was_trained_on(trained, dataset):
     place, _ = trained
     model, (fit, held) = load_model(place), open_dataset(dataset)["train"].fold(0)
     ids, counts = np.unique(fit.column("terrain_class"), return_counts=True)
-    assert model.class_counts == dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    assert model.card.training_range.class_counts == dict(zip(ids.tolist(), counts.tolist(), strict=True))
     slopes = fit.column("slope_rad")
-    assert model.training_range["slope_rad"] == (slopes.min(), slopes.max())
+    assert model.card.training_range.ranges["slope_rad"] == (slopes.min(), slopes.max())
     heights = fit.layers(np.arange(len(fit)))["height"].astype(float) * 0.0005
     reliefs = heights.max(axis=(1, 2)) - heights.min(axis=(1, 2))
-    assert model.training_range["relief_m"] == pytest.approx((reliefs.min(), reliefs.max()))
-    assert model.card.scale == pytest.approx(tuple(open_dataset(dataset)["train"].labels.max(axis=0)))
+    assert model.card.training_range.ranges["relief_m"] == pytest.approx((reliefs.min(), reliefs.max()))
+    assert model.card.inputs.scale == pytest.approx(tuple(open_dataset(dataset)["train"].labels.max(axis=0)))
     assert sorted(model.residuals["sample_id"]) == sorted(held.column("sample_id"))
     order = np.argsort(np.argsort(held.column("sample_id")))
-    said = model.predict(held.patches)[np.argsort(held.column("sample_id"))][order]
+    said = model.predict(held.patches).mean[np.argsort(held.column("sample_id"))][order]
     by_id = dict(zip(model.residuals["sample_id"], model.residuals["power_predicted_watt"], strict=True))
     assert said[:, 0] == pytest.approx([by_id[name] for name in held.column("sample_id")], rel=1e-4)
 
@@ -78,7 +76,7 @@ def test_intervals_can_rest_on_networks_without_each_fold(trained, dataset, tmp_
     samples = open_dataset(dataset)["train"]
     assert model.card.training.samples == {**alone.card.training.samples, "held out": len(samples)}
     assert all(np.array_equal(_weights(tmp_path / "model")[name], of) for name, of in _weights(trained[0]).items())
-    own = dict(zip(samples.column("sample_id"), model.predict(samples.patches)[:, 0], strict=True))
+    own = dict(zip(samples.column("sample_id"), model.predict(samples.patches).mean[:, 0], strict=True))
     said = model.residuals["power_predicted_watt"]
     is_own = np.isclose(said, [own[name] for name in model.residuals["sample_id"]], rtol=1e-4)
     is_stopping = model.residuals["fold"] == CONFIG.fold
@@ -93,8 +91,8 @@ def test_net_energy_can_be_trained_on(energy_only, dataset, tmp_path):
     card = load_model(tmp_path / "model").card
     split = open_dataset(dataset, label="net")["train"]
     names = ("net_energy_joule",) if energy_only else ("net_power_watt", "velocity_mps")
-    assert (card.label_energy, card.outputs) == ("net", names)
-    assert card.scale == pytest.approx(tuple(float(split.column(name).max()) for name in names))
+    assert (card.label_energy, card.inputs.outputs) == ("net", names)
+    assert card.inputs.scale == pytest.approx(tuple(float(split.column(name).max()) for name in names))
     assert "net of idle power" in (tmp_path / "model" / "MODEL.md").read_text()
 
 
@@ -113,28 +111,33 @@ def test_net_energy_can_be_trained_on(energy_only, dataset, tmp_path):
 )
 def test_the_rate_falls_where_nothing_gets_better_and_at_the_end(held, rate):
     history = [(number + 1, 1.0, float(loss)) for number, loss in enumerate(held)]
-    progress = network_model.TrainingProgress("key", len(history), history=history)
+    progress = network_model.TrainingProgress(len(history), history=history)
     config = replace(CONFIG, epochs=20, patience=4, learning_rate=1.0)
     assert network_model.compute_learning_rate(config, progress) == pytest.approx(rate)
 
 
 def _stopped(monkeypatch, at, dataset, place, config, **options):
     """Train until the checkpoint after epoch ``at`` is written; return the epochs whose checkpoints were."""
-    real, epochs = network_model.write_checkpoint, []
+    real, epochs = network_model._State.write, []
 
-    def write_and_stop(path, progress, parts):
-        real(path, progress, parts)
-        epochs.append(progress.epoch)
-        if progress.epoch == at:
+    def write_and_stop(state, path):
+        real(state, path)
+        epochs.append(state.progress.epoch)
+        if state.progress.epoch == at:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(network_model, "_STEPS_BETWEEN", 1)
-    monkeypatch.setattr(network_model, "write_checkpoint", write_and_stop)
+    monkeypatch.setattr(network_model._State, "write", write_and_stop)
     with pytest.raises(KeyboardInterrupt):
         train(dataset, place, config=config, **options)
-    monkeypatch.setattr(network_model, "write_checkpoint", real)
+    monkeypatch.setattr(network_model._State, "write", real)
     assert not place.exists()
     return epochs
+
+
+def _checkpoint(place):
+    (found,) = place.parent.glob(f"{place.name}.*.checkpoint")
+    return found
 
 
 def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happened(
@@ -144,7 +147,7 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
     assert _stopped(monkeypatch, 0, dataset, place, CONFIG) == [0]  # in the first epoch
     for epoch in (1, 2, 3):  # the last of them: all is trained, nothing is written
         assert _stopped(monkeypatch, epoch, dataset, place, CONFIG) == [epoch]
-    checkpoint = tmp_path / "model.checkpoint"
+    checkpoint = _checkpoint(place)
     state = checkpoint.read_bytes()
     assert train(dataset, place, config=CONFIG).status == "done"
     assert _same(_weights(whole), _weights(place))
@@ -157,9 +160,7 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
 def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
     """As many as have 32 steps of 64 samples together, of a training set of a step or two."""
     epochs = []
-    monkeypatch.setattr(
-        network_model, "write_checkpoint", lambda _path, progress, _parts: epochs.append(progress.epoch)
-    )
+    monkeypatch.setattr(network_model._State, "write", lambda state, _path: epochs.append(state.progress.epoch))
     monkeypatch.setattr(network_model, "_train_epoch", lambda *_, **__: 1.0)
     result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch_size=64))
     assert epochs == list(range(0, 46, 32 * 64 // result.samples["fitted"]))
@@ -173,29 +174,48 @@ def test_a_held_out_loss_that_is_no_number_is_gone_on_from(dataset, tmp_path, mo
     assert train(dataset, tmp_path / "model", config=config).best_epoch == 2
 
 
-def test_what_evaluation_trains_begins_anew_where_the_state_is_of_another_training(dataset, tmp_path, monkeypatch):
-    config = replace(CONFIG, epochs=1)
-    _stopped(monkeypatch, 0, dataset, tmp_path / "model", replace(config, seed=1))
-    assert train(dataset, tmp_path / "model", config=config, disposable=True).status == "done"
-
-
-def test_a_state_of_another_training_or_cut_short_is_told(dataset, tmp_path, monkeypatch):
-    _stopped(monkeypatch, 0, dataset, tmp_path / "other", CONFIG)
-    checkpoint = tmp_path / "other.checkpoint"
-    with pytest.raises(ModelError, match=r"other.checkpoint: of another dataset or other options; .* --no-resume"):
-        train(dataset, tmp_path / "other", config=replace(CONFIG, seed=1))
-    checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
+def test_a_state_of_another_training_is_kept_and_one_cut_short_is_told(dataset, tmp_path, monkeypatch):
+    place, config = tmp_path / "other", replace(CONFIG, epochs=1)
+    _stopped(monkeypatch, 0, dataset, place, config)
+    checkpoint = _checkpoint(place)
+    state = checkpoint.read_bytes()
+    assert train(dataset, place, config=replace(config, seed=1)).status == "done"
+    assert checkpoint.read_bytes() == state
+    checkpoint.write_bytes(state[:-1000])
     with pytest.raises(
-        ModelError, match=r"other.checkpoint: cut short or damaged .*; remove it, or start again with --no-resume"
+        ModelError, match=r"checkpoint: cut short or damaged .*; remove it, or start again with --no-"
     ) as told:
-        train(dataset, tmp_path / "other", config=CONFIG)
+        train(dataset, place, config=config)
     assert len(told.value.problems) == 1
+    assert train(dataset, place, config=config, no_resume=True).status == "done"
+
+
+def test_a_state_holds_the_folds_that_are_predicted(dataset, tmp_path, monkeypatch):
+    """Networks without a fold, for intervals, are not trained twice."""
+    config, folds = (
+        replace(CONFIG, epochs=1, cross_fit=True),
+        set(open_dataset(dataset)["train"].column("fold").tolist()),
+    )
+    place, real, count = tmp_path / "model", network_model.NetworkModel._fit_best_epochs, []
+
+    def stop_at_the_second(*given):
+        count.append(given)
+        if len(count) == 2:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(network_model.NetworkModel, "_fit_best_epochs", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, place, config=config)
+    train(dataset, place, config=config)
+    assert len(count) == len(folds)  # all but that which stopped the training, one of them twice
+    assert set(load_model(place).residuals["fold"].tolist()) == folds
 
 
 def test_a_place_that_cannot_be_written_is_found_before_the_first_epoch(dataset, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(network_model, "_train_epoch", lambda *_, **__: pytest.fail("an epoch was trained"))
-    with pytest.raises(StoreError, match=r"model.checkpoint: cannot be written"):
+    with pytest.raises(StoreError, match=r"model\..*\.checkpoint: cannot be written"):
         train(dataset, tmp_path / "file" / "model", config=CONFIG)
 
 
@@ -219,11 +239,12 @@ def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
 
 
 def test_a_variant_has_its_own_channels_classes_and_output(dataset):
-    task = make_training_task(open_dataset(dataset), 0, Variant(channels=("height",), classes=(4,), energy_only=True))
-    assert task.fit.channels == ("height",)
-    assert set(task.fit.column("terrain_class")) == {4}
-    assert task.outputs == ("energy_joule",)
-    batch = next(iter(task.fit.batches(8, features=("energy_joule",))))
+    variant = Variant(channels=("height",), classes=(4,), energy_only=True)
+    samples = make_samples(open_dataset(dataset), CONFIG, variant, network_model.NetworkModel)
+    assert samples.split.channels == ("height",)
+    assert set(samples.split.column("terrain_class")) == {4}
+    assert samples.inputs.outputs == ("energy_joule",)
+    batch = next(iter(samples.split.batches(8, features=("energy_joule",))))
     assert batch[0][0].shape == (8, 40, 40, 1)
 
 
@@ -231,7 +252,7 @@ def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
     with pytest.raises(DatasetError, match="fold 9 of train leaves"):
         train(dataset, tmp_path / "model", config=replace(CONFIG, fold=9))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):
-        make_training_task(open_dataset(dataset), 0, Variant(classes=(1,)))
+        select_train(open_dataset(dataset), Variant(classes=(1,)))
     real = Split.weights.func
     monkeypatch.setattr(Split, "weights", property(lambda split: real(split) * np.array([1.0, 0.0])))
     with pytest.raises(DatasetError, match="no sample has a standard deviation of velocity_mps to weigh it by"):
@@ -283,27 +304,20 @@ def test_pixels_without_data_are_not_seen(dataset, monkeypatch):
     assert holed.ranges["relief_m"] == pytest.approx(seen.ranges["relief_m"], abs=0.05)
 
 
-PARTS = {part: {"a": np.arange(6.0), "b/c": np.ones((2, 3), np.float32)} for part in ("now", "best", "optimizer")}
-LOSSES = st.floats()  # infinite and not a number, too
+def _make_state():
+    from tcpipe.learning.network import Trainer, make_resnet18
 
-
-@given(LOSSES, st.lists(st.tuples(LOSSES, LOSSES), max_size=4), st.data())
-def test_what_is_saved_is_read(tmp_path_factory, best_loss, losses, data):
-    path = tmp_path_factory.mktemp("state") / "model.checkpoint"
-    history = [(number + 1, *pair) for number, pair in enumerate(losses)]
-    best = data.draw(st.integers(0, len(history)))
-    progress = TrainingProgress("key", len(history), best, best_loss, history)
-    write_checkpoint(path, progress, PARTS)
-    found, parts = read_checkpoint(path, "key")
-    assert repr(found) == repr(progress)  # nan is not nan
-    assert parts.keys() == PARTS.keys()
-    assert all(np.array_equal(parts[part][name], array) for part in PARTS for name, array in PARTS[part].items())
+    trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), compute_loss_factors("nrmse", [1.0]))
+    return network_model._State(trainer, network_model.TrainingProgress(), trainer.copy_weights(), np.zeros((2, 1)))
 
 
 @given(st.data())
+@settings(max_examples=20, deadline=None)
 def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("state") / "model.checkpoint"
-    write_checkpoint(path, TrainingProgress("key"), PARTS)
+    state, again = _make_state(), _make_state()
+    state.progress = network_model.TrainingProgress(1, 0, float("inf"), [(1, 0.5, float("nan"))])
+    state.write(path)
     raw = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(raw) - 1))
     if data.draw(st.booleans()):
@@ -313,33 +327,13 @@ def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     path.write_bytes(raw)
     told = ""
     try:
-        found, parts = read_checkpoint(path, "key")
+        again.read(path)
     except ModelError as error:
         told = str(error)
     if told:
         assert told.startswith(f"{path}: ")
         assert "\n" not in told
         return
-    assert found == TrainingProgress("key")
-    assert all(np.array_equal(parts[part][name], array) for part in PARTS for name, array in PARTS[part].items())
-
-
-@pytest.mark.parametrize(
-    "state",
-    [
-        {},
-        {"best_loss": None},
-        {"epoch": 1},
-        {"epoch": 1, "history": [[1, 0.5]]},
-        {"epoch": 1, "history": [[2, 0.5, 0.5]]},
-        {"best_epoch": 1},
-        {"best_epoch": None},
-        {"more": 1},
-    ],
-)
-def test_a_foreign_one_is_told(tmp_path, state):
-    whole = {"key": "key", "epoch": 0, "best_epoch": 0, "best_loss": 1.0, "history": []}
-    text = json.dumps({**whole, **state} if state else []).encode()
-    write_arrays(tmp_path / "x.checkpoint", {"state": np.frombuffer(text, np.uint8)})
-    with pytest.raises(ModelError, match=r"x.checkpoint: not a checkpoint; remove it, or start again with --no-resume"):
-        read_checkpoint(tmp_path / "x.checkpoint", "key")
+    assert repr(again.progress) == repr(state.progress)
+    wanted = state.trainer.copy_weights()
+    assert all(torch.equal(array, wanted[name]) for name, array in again.trainer.copy_weights().items())

@@ -17,6 +17,7 @@ from tcpipe.pipeline import log_queue as claims_module
 from tcpipe.pipeline.calls import identify_process
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_queue import Claims, hold_claims
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
@@ -84,7 +85,7 @@ def test_an_array_with_late_and_killed_tasks_makes_the_store_of_one_call(root, d
     assert open_store(root).place.entries("spool") == []
     begun = [mark.name.partition("-")[0] for mark in marks.iterdir()]
     assert {name for name in begun if begun.count(name) > 1} <= {"2", "3"}, "only logs of killed tasks are begun twice"
-    assert find_status([drives], store=root, recipe=Recipe()).counts == {"done": 7}
+    assert find_status(IngestOptions([drives], store=root, recipe=Recipe(), min_age_s=600.0)).counts == {"done": 7}
 
 
 def test_a_task_lists_the_store_once_and_a_share_with_nothing_new_writes_nothing(tmp_path, drives, monkeypatch):

@@ -14,6 +14,7 @@ from tcpipe.pipeline import report as reporting
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
@@ -99,7 +100,7 @@ def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, t
         result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
         assert result.exit_code == 3
         assert [of.subject.name for of in select_findings(result.findings, "run-damaged", "run-gone")] == [name]
-        found = find_status([new], store=root, recipe=Recipe())
+        found = find_status(IngestOptions([new], store=root, recipe=Recipe(), min_age_s=600.0))
         assert (found.exit_code, [of.code for of in found.problems]) == (3, ["run-incomplete"])
         assert verify(root).problems
         assert list(inspect(root, recipe=Recipe()).damaged_runs)
@@ -127,7 +128,7 @@ def test_what_no_commit_names_is_seen_by_verify_alone_until_it_is_committed(plac
     new.write_bytes(b"to be ingested")
     shutil.rmtree(files / "log")
     assert store.ingestions().rows == {}
-    assert find_status([new], store=root, recipe=Recipe(), create=True).problems == ()
+    assert find_status(IngestOptions([new], store=root, recipe=Recipe(), min_age_s=600.0), create=True).problems == ()
     assert sum("no commit names it; ingest its log again" in line for line in verify(root).problems) == 3
     for run_id in ("a", "b", "twice"):
         commit_run(store, run_id)
@@ -157,9 +158,9 @@ def test_what_is_lost_is_made_again_from_the_log(tmp_path, lost):
     ingest([logs / "one.mcap"], store=root, recipe=Recipe(), tags={"load": "12"})
     for part in root.glob(lost):
         shutil.rmtree(part) if part.is_dir() else part.unlink()
-    (finding,) = find_status(store=root, recipe=Recipe()).problems
+    (finding,) = find_status(IngestOptions([], store=root, recipe=Recipe(), min_age_s=600.0)).problems
     assert finding.code == "run-incomplete"
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
-    found = find_status(store=root, recipe=Recipe())
+    found = find_status(IngestOptions([], store=root, recipe=Recipe(), min_age_s=600.0))
     assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
     assert verify(root).problems == ()

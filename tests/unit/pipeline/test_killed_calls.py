@@ -23,6 +23,7 @@ from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import status as status_module
 from tcpipe.pipeline.calls import commit_call, identify_process, list_begun_calls, open_log
 from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
@@ -73,7 +74,7 @@ def kill(logs, store, monkeypatch, **how):
 
 
 def told(store, *logs, **how):
-    return find_status(logs, store=store, **{"recipe": Recipe(), **how})
+    return find_status(IngestOptions(logs, store=store, **{"recipe": Recipe(), "min_age_s": 600.0, **how}))
 
 
 def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_it(tmp_path, logs):

@@ -2,6 +2,7 @@
 
 import hashlib
 import resource
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
@@ -54,6 +55,11 @@ def refused(store, name, error=MapError, **given):
     return caught.value.problems
 
 
+def picture_of(store):
+    opened = Store(store)
+    return Path(opened.place.below("maps").where(opened.map_document("m").picture))
+
+
 def test_a_second_identical_call_does_nothing_and_says_so(site, store):
     first = add(store, "m", **site)
     assert first.status == "done"
@@ -81,7 +87,7 @@ def test_what_differs_is_named_and_needs_force(site, store, tmp_path):
     )
     assert "height has another content (h2.tif)" in refused(store, "m", **{**site, "height": other})[0]
     assert add(store, "m", height=other, force=True).status == "done"
-    assert list(open_map(Store(store).map_path("m")).layers) == ["height"]
+    assert list(open_map(Store(store).map_files("m")[0]).layers) == ["height"]
 
 
 def test_what_lies_beside_a_raster_belongs_to_it(site, store, tmp_path):
@@ -99,13 +105,13 @@ def test_the_first_map_with_classes_sets_the_stores_table(site, store, tmp_path)
     table = classes_file(tmp_path)
     add(store, "one", height=site["height"], terrain=site["terrain"], classes=table)
     add(store, "two", height=site["height"], terrain=site["terrain"])  # takes the store's, with its values
-    one, two = (open_map(Store(store).map_path(name)) for name in ("one", "two"))
+    one, two = (open_map(Store(store).map_files(name)[0]) for name in ("one", "two"))
     assert one.classes == two.classes
     assert [entry.name for entry in two.classes.classes] == ["meadow", "bog", "gravel"]
     np.testing.assert_array_equal(one.read("terrain", 0, 60, 0, 60), two.read("terrain", 0, 60, 0, 60))
     other_values = classes_file(tmp_path, CLASSES.replace("\n5,", "\n50,"), "v.csv")
     add(store, "three", height=site["height"], terrain=site["terrain"], classes=other_values)
-    assert open_map(Store(store).map_path("three")).classes == one.classes
+    assert open_map(Store(store).map_files("three")[0]).classes == one.classes
 
 
 def test_classes_that_are_not_the_stores_are_refused_one_line_a_difference(site, store, tmp_path):
@@ -122,12 +128,12 @@ def test_classes_that_are_not_the_stores_are_refused_one_line_a_difference(site,
 def test_the_only_map_may_be_replaced_with_other_classes(site, store, tmp_path):
     add(store, "one", **site)
     add(store, "one", **site, classes=classes_file(tmp_path), force=True)
-    assert open_map(Store(store).map_path("one")).classes.count == 3
+    assert open_map(Store(store).map_files("one")[0]).classes.count == 3
 
 
 def test_a_map_that_cannot_be_read_is_replaced_by_force_and_asked_for_nothing(site, store, caplog):
     add(store, "old", **site)
-    (Store(store).map_path("old") / "zarr.json").write_text("{}")
+    (Store(store).map_files("old")[0] / "zarr.json").write_text("{}")
     assert "--force" in refused(store, "old", **site)[-1]
     add(store, "new", **site)
     assert "old cannot be read" in caplog.text
@@ -164,7 +170,7 @@ def test_the_command_prints_a_few_plain_lines(site, store):
     lines = result.stdout.splitlines()
     assert result.exit_code == 0
     assert lines[:2] == [
-        f"{Store(store).map_path('garden')} (quick look: garden.png)",
+        f"{Store(store).map_files('garden')[0]} (quick look: garden.png)",
         "60 x 60 px of 0.2 m (12 x 12 m) in EPSG:32633",
     ]
     assert lines[2].startswith("height   100 % covered, from height.tif: 6")
@@ -174,19 +180,19 @@ def test_the_command_prints_a_few_plain_lines(site, store):
 
 def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, store):
     add(store, "m", **site)
-    picture = matplotlib.image.imread(Store(store).map_picture("m"))[..., :3]
-    source = open_map(Store(store).map_path("m"))
+    picture = matplotlib.image.imread(picture_of(store))[..., :3]
+    source = open_map(Store(store).map_files("m")[0])
     grey, ids = (source.read(layer, 0, 60, 0, 60) for layer in ("ortho", "terrain"))
     assert picture.shape == (60, 60, 3)
     for class_id in np.unique(ids):  # within a class, the picture follows the grey
         of_class = ids == class_id
         slope = np.polyfit(grey[of_class] / 255.0, picture[of_class].mean(axis=1), 1)[0]
         assert slope == pytest.approx(0.65, abs=0.02)
-    before = Store(store).map_picture("m").read_bytes()
-    Store(store).map_picture("m").unlink()
+    before = picture_of(store).read_bytes()
+    picture_of(store).unlink()
     assert [line.rpartition(": ")[2] for line in verify(store).problems] == ["is missing"]
     assert add(store, "m", **site, force=True).status == "done"
-    assert Store(store).map_picture("m").read_bytes() == before
+    assert picture_of(store).read_bytes() == before
     assert verify(store).problems == ()
     assert Store(store).map_number("m") == 1, "what is as it was is no new generation"
 
@@ -198,7 +204,7 @@ def test_a_quick_look_without_photo_is_a_relief_lit_from_the_north_west_and_smal
     height[0, 1000:] = np.arange(900) * 0.2
     path = write_tif(tmp_path / "h.tif", height, WORLD.crs, Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000))
     add(store, "m", height=path)
-    picture = matplotlib.image.imread(Store(store).map_picture("m"))[..., 0]
+    picture = matplotlib.image.imread(picture_of(store))[..., 0]
     assert picture.shape == (500, 225)
     assert (picture[:49] == 1.0).all()
     assert picture[150, 50] == pytest.approx(np.sqrt(0.5), abs=0.005)
@@ -214,16 +220,16 @@ def other_height(directory):
 def test_map_and_picture_are_replaced_together(site, store, tmp_path, monkeypatch):
     """Killed between map and picture: the old ones are there, whole."""
     add(store, "m", **site)
-    old, other = Store(store).map_picture("m").read_bytes(), other_height(tmp_path)
+    old, other = picture_of(store).read_bytes(), other_height(tmp_path)
     with monkeypatch.context() as killed:
-        killed.setattr(maps, "write_quick_look", lambda *_: pytest.fail("killed"))
+        killed.setattr(maps, "write_overview", lambda *_: pytest.fail("killed"))
         with pytest.raises(pytest.fail.Exception):
             add(store, "m", height=other, force=True)
-    assert len(open_map(Store(store).map_path("m")).layers) == 3
-    assert Store(store).map_picture("m").read_bytes() == old
+    assert len(open_map(Store(store).map_files("m")[0]).layers) == 3
+    assert picture_of(store).read_bytes() == old
     assert verify(store).problems == ()
     add(store, "m", height=other, force=True)
-    assert (Store(store).map_number("m"), Store(store).map_picture("m").read_bytes() == old) == (2, False)
+    assert (Store(store).map_number("m"), picture_of(store).read_bytes() == old) == (2, False)
     assert verify(store).problems == ()
 
 
@@ -243,7 +249,7 @@ def test_a_map_that_another_process_adds_meanwhile_stays(site, store, tmp_path, 
     wanted = "another process has written it meanwhile" if force else r"made from something else.*--force"
     with pytest.raises(StoreError if force else MapError, match=wanted):
         add(store, "m", **site, force=force)
-    assert open_map(Store(store).map_path("m")).facts.sources == {"height": "h2.tif"}
+    assert open_map(Store(store).map_files("m")[0]).facts.sources == {"height": "h2.tif"}
     assert verify(store).problems == ()
 
 
@@ -273,7 +279,7 @@ def test_tiles_come_as_patterns_and_each_is_known_by_its_content(site, store, tm
     halves(site, tmp_path)
     added = add(store, "m", height=str(tmp_path / "*/dem.tif"))
     add(store, "whole", height=site["height"])
-    tiled, whole = (open_map(Store(store).map_path(name)) for name in ("m", "whole"))
+    tiled, whole = (open_map(Store(store).map_files(name)[0]) for name in ("m", "whole"))
     np.testing.assert_array_equal(tiled.read("height", 0, 60, 0, 60), whole.read("height", 0, 60, 0, 60))
     files = [tmp_path / "east/dem.tif", tmp_path / "west/dem.tif"]
     hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
@@ -287,7 +293,10 @@ def test_tiles_come_as_patterns_and_each_is_known_by_its_content(site, store, tm
 def test_a_tile_that_a_pattern_names_once_more_lies_where_it_is_named_last(site, store, tmp_path):
     halves(site, tmp_path)
     add(store, "m", height=[str(tmp_path / "*/dem.tif"), tmp_path / "east/dem.tif"])
-    assert list(open_map(Store(store).map_path("m")).facts.inputs.files["height"]) == ["west/dem.tif", "east/dem.tif"]
+    assert list(open_map(Store(store).map_files("m")[0]).facts.inputs.files["height"]) == [
+        "west/dem.tif",
+        "east/dem.tif",
+    ]
 
 
 def test_what_names_no_file_is_said(site, store, tmp_path):

@@ -14,8 +14,9 @@ from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.calls import LogWriter
-from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.ingest import ingest, run_ingest
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import find_status
@@ -218,7 +219,7 @@ def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost
     sha256 = run_id.rsplit("-", 1)[1].encode()
     contents = {"a digit": whole.replace(sha256, b"0" * 8), "half": whole[:40], "[]": b"[]", "nothing": b""}
     commit.write_bytes(contents[broken]) if broken in contents else commit.unlink()
-    found = find_status(store=store.root, recipe=Recipe(), min_age_s=0.0)
+    found = find_status(IngestOptions([], store=store.root, recipe=Recipe(), min_age_s=0.0))
     assert (found.exit_code, [of.code for of in found.problems]) == (
         3,
         ["commit-missing" if broken == "gone" else "commit-damaged"],
@@ -226,11 +227,11 @@ def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost
     assert any(str(commit) in line for line in verify(store.root).problems)
     assert [night()[0]["other.mcap"].status for _ in range(2)] == ["done", "unchanged"], "its manifest is found"
     assert counted(tmp_path) == {run_id}
-    assert find_status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 3, (
+    assert find_status(IngestOptions([], store=store.root, recipe=Recipe(), min_age_s=0.0)).exit_code == 3, (
         "what else it held nobody knows"
     )
     acknowledge([str(commit)], store=store.root)
-    assert find_status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 0
+    assert find_status(IngestOptions([], store=store.root, recipe=Recipe(), min_age_s=0.0)).exit_code == 0
 
 
 def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, monkeypatch):
@@ -308,11 +309,11 @@ def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, se
     store, logs, counts = "s3://tests/store", tmp_path / "logs", {"new log": [], "nothing new": [], "status": []}
     for number in range(4):
         drive_at(logs / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
-        calls = {"new log": ingest, "nothing new": ingest, "status": find_status}
+        calls = {"new log": run_ingest, "nothing new": run_ingest, "status": find_status}
         for what, call in calls.items():
             commits = Store(store).state().number
             served.requests = 0
-            assert call([logs], store=store, recipe=Recipe()).exit_code == 0
+            assert call(IngestOptions([logs], store=store, recipe=Recipe())).exit_code == 0
             counts[what].append(served.requests - commits)
     assert {what: len(set(of[1:])) for what, of in counts.items()} == dict.fromkeys(counts, 1), counts
 

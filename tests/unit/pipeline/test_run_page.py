@@ -26,7 +26,7 @@ def store(tmp_path_factory):
     add_map("site", store=here / "store", height=site.rasters["height"])
     add_map("damaged", store=here / "store", height=site.rasters["height"])
     store = Store(here / "store")
-    (store.map_path("damaged") / "zarr.json").write_text("{")
+    (store.map_files("damaged")[0] / "zarr.json").write_text("{")
     return store
 
 
@@ -53,7 +53,7 @@ def damage_pixels(map_path):
 def test_without_any_readable_map_the_path_stands_alone(store, tmp_path, damage):
     alone = tmp_path / "store"
     shutil.copytree(store.root, alone)
-    damage(Store(alone).map_path("site"))
+    damage(Store(alone).map_files("site")[0])
     _, html = page(Store(alone))
     assert data_of(html)["ground"] == []
     assert "east [m]" in html

@@ -17,6 +17,7 @@ from tcpipe.pipeline import calls
 from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe
@@ -49,7 +50,9 @@ def night(first_night, tmp_path):
 
 
 def where(root, *logs, **how):
-    return find_status(logs or [root / "logs"], store=root / "store", **{"recipe": Recipe(), **how})
+    return find_status(
+        IngestOptions(logs or [root / "logs"], store=root / "store", **{"recipe": Recipe(), "min_age_s": 600.0, **how})
+    )
 
 
 def states(found):
@@ -96,25 +99,32 @@ def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
 
 
 def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
-    assert find_status(store=first_night / "store", recipe=Recipe()).counts == where(first_night).counts
+    assert (
+        find_status(IngestOptions([], store=first_night / "store", recipe=Recipe(), min_age_s=600.0)).counts
+        == where(first_night).counts
+    )
     with pytest.raises(UsageError, match="no earlier call of ingest is known; give the logs"):
-        find_status(store=tmp_path, recipe=Recipe())
+        find_status(IngestOptions([], store=tmp_path, recipe=Recipe(), min_age_s=600.0))
 
 
 def test_a_log_that_is_gone_is_trouble_only_where_the_latest_call_was_given_it(first_night, tmp_path):
     stick = drive_at(tmp_path / "stick" / "one.mcap", seed=3)
     ingest([stick], store=tmp_path / "store", recipe=Recipe())
     stick.unlink()
-    found = find_status(store=tmp_path / "store", recipe=Recipe())
+    found = find_status(IngestOptions([], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0))
     assert (found.exit_code, [of.code for of in found.problems], found.gone) == (3, ["log-missing"], ())
     shutil.copytree(first_night / "logs", tmp_path / "logs", ignore=lambda *_: {"cut.mcap", "junk.bag"})
     ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
-    found = find_status(store=tmp_path / "store", recipe=Recipe())
+    found = find_status(IngestOptions([], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0))
     assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
     assert f"of earlier calls: {stick}: there is no such file or directory" in str(found)
-    assert find_status([stick], store=tmp_path / "store", recipe=Recipe()).exit_code == 3
+    assert (
+        find_status(IngestOptions([stick], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0)).exit_code == 3
+    )
     acknowledge([str(stick)], store=tmp_path / "store")
-    assert find_status([stick], store=tmp_path / "store", recipe=Recipe()).exit_code == 0
+    assert (
+        find_status(IngestOptions([stick], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0)).exit_code == 0
+    )
 
 
 def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
@@ -210,7 +220,9 @@ def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_n
     shutil.copytree(first_night / "store", tmp_path / "store", copy_function=shutil.copy2)
     (gone,) = (tmp_path / "store" / "runs").glob("whole-*/run-1.json")
     gone.unlink()
-    found = find_status([first_night / "logs"], store=tmp_path / "store", recipe=Recipe())
+    found = find_status(
+        IngestOptions([first_night / "logs"], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0)
+    )
     (group,) = [group for group in found.groups if group.state == "pending"]
     assert (group.cause, group.logs) == (
         "files of its run are missing",

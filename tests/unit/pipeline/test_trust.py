@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from synthetic_store import WORLD, add_run, box, commit_run, lanes, put_map, reg
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.commits import Entries, LogSnapshot
-from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_seal, seal_page, write_sealed
+from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_page, write_sealed
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
@@ -31,7 +31,7 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.report.pictures import draw_quick_look, write_quick_look
+from tcpipe.report.pictures import draw_quick_look, write_overview
 from tcpipe.store import Store
 from tcpipe.tables.levels import DATA_MODEL_VERSION, STREAMS, Sensor, Streams
 
@@ -65,7 +65,7 @@ def files(directory):
 def test_what_is_whole_verifies(made, name):
     found = verify(made / name)
     assert found.problems == ()
-    assert (found.kind, found.read["samples"], found.read["patches"]) == ("dataset", 448, 448)
+    assert (found.kind, found.read["samples"]) == ("dataset", 448)
     assert "no changes found" in str(found)
 
 
@@ -73,16 +73,16 @@ def test_a_store_its_runs_and_its_map_verify(made):
     found = verify(made / "store")
     assert (found.problems, found.kind, found.read["runs"], found.read["maps"]) == ((), "store", 2, 1)
     assert verify(made / "store" / "runs" / "north").kind == "run"
-    assert verify(Store(made / "store").map_path("site")).kind == "map"
+    assert verify(Store(made / "store").map_files("site")[0]).kind == "map"
 
 
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
     open_log(store).commit("seen", Entries(seen=(LogSnapshot(("/logs/north.mcap",), (), "north"),)))
     with store.new_map("site", after=1) as path:
-        shutil.copytree(store.map_path("site"), path)
-        write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), read_seal(path))
-    shutil.rmtree(store.map_path("site").parents[1] / replaced(store))
+        shutil.copytree(store.map_files("site")[0], path)
+        write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
+    shutil.rmtree(store.map_files("site")[0].parents[1] / replaced(store))
     (store.root / "maps" / "site-1.json").unlink()
     sensor = Sensor("/power", "x/msg/Power", "base", "the only one", None, None)
     for run in store.runs():
@@ -121,27 +121,19 @@ def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
     for path in set(whole) - set(listed):
         for place in (0.0, *rng.random(8), 1.0):
             flip(path, place, bit=int(rng.integers(8)))
-            problems = find_broken_seal(path) if place else "".join(verify(directory).problems)
+            problems = find_broken_seal(path.read_bytes(), path) if place else "".join(verify(directory).problems)
             assert str(path) in (problems or ""), (path, place)
             path.write_bytes(whole[path])
     assert verify(directory).problems == ()
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("samples", 7),
-        ("splits", {"train": 7}),
-        ("terrain", {}),
-        ("label_statistics_of_train", {}),
-        ("folds_of_train", [7]),
-    ],
-)
-def test_a_card_that_says_something_else_is_found(copy, key, value):
+@pytest.mark.parametrize(("key", "value"), [("samples", 7), ("splits", {"train": 7}), ("runs", [])])
+def test_a_card_that_counts_otherwise_is_found(copy, key, value):
     directory = copy("zarr")
     card = json.loads((directory / "dataset.json").read_text())
     write_sealed(directory / "dataset.json", {**card, key: value})
-    assert any(f"{key} is {value}, but the samples give" in problem for problem in verify(directory).problems)
+    told = f"{directory / 'dataset.json'}: {key} has {7 if value else 0} samples, but samples.parquet has 448"
+    assert verify(directory).problems == (told,)
 
 
 @pytest.mark.parametrize("key", ["runs", "maps", "checksums", "distance_by_reason_m", "layers", "format"])
@@ -152,49 +144,6 @@ def test_a_card_that_lacks_something_is_one_problem_and_no_traceback(copy, key):
     write_sealed(directory / "dataset.json", card)
     (problem,) = verify(directory).problems
     assert problem.endswith(f"dataset.json: is not what this version writes: {key} is missing")
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "said"),
-    [
-        ("robot", "warthog", "run north is of robot warthog, its samples of husky"),
-        ("samples", 7, "run north has 7 samples, 224 are there"),
-        ("recipe_id", "00000000", "run north is of recipe 00000000, the card's for robot husky is"),
-        ("driven_m", 7.0, "m, its runs drove "),
-        ("run_id", "north-00000000", "begins with north"),
-    ],
-)
-def test_what_a_card_copied_from_its_runs_is_compared(copy, key, value, said):
-    directory = copy("zarr")
-    card = json.loads((directory / "dataset.json").read_text())
-    card["runs"][0][key] = value
-    write_sealed(directory / "dataset.json", card)
-    problems = verify(directory).problems
-    assert any(said in problem for problem in problems), problems
-
-
-@pytest.mark.parametrize("name", ["zarr", "parquet"])
-def test_rows_that_are_joined_to_others_patches_are_found(copy, name):
-    """Every file is as the card has it, but the samples were sorted and the patches were not."""
-    directory = copy(name)
-    card = json.loads((directory / "dataset.json").read_text())
-    path = directory / "samples.parquet"
-    pq.write_table(pq.read_table(path).sort_by("start_ns"), path)
-    card["checksums"]["samples.parquet"] = asdict(compute_checksum(path))
-    write_sealed(directory / "dataset.json", card)
-    assert any("are not those of samples.parquet, in their order" in line for line in verify(directory).problems)
-
-
-def test_a_run_that_holds_anothers_segments_is_found(copy):
-    store = copy("store")
-    north, south = (Store(store).recipes_of(name)[0] for name in ("north", "south"))
-    shutil.copytree(table(north, "segments").parent, Path(south.where) / table(north, "segments").parent.name)
-    found = json.loads(manifest(south).read_text())
-    found["checksums"] = json.loads(manifest(north).read_text())["checksums"]
-    write_sealed(manifest(south), found)
-    problems = "\n".join(verify(store).problems)
-    assert "contains segments of run_id north; expected south" in problems
-    assert "its segment ids are not the run's id" in problems
 
 
 def test_files_that_went_or_came_are_found(copy):
@@ -209,12 +158,12 @@ def test_files_that_went_or_came_are_found(copy):
 
 def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
     store = copy("store")
-    layers = Store(store).map_path("site")
+    layers = Store(store).map_files("site")[0]
     flip(files(layers / "height" / "c")[0])
     shutil.rmtree(layers / "ortho" / "c")
     shutil.rmtree(Store(store).recipes_of("north")[0].where)
-    assert any("height, rows 0" in problem for problem in verify(layers).problems)
-    assert any("ortho covers 0.000000%" in problem for problem in verify(layers).problems)
+    assert any("height/c/0/0: its sha256" in problem for problem in verify(layers).problems)
+    assert any("ortho/c/0/0: is missing" in problem for problem in verify(layers).problems)
     problems = verify(store).problems
     for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is missing", "north: contains no finished run"):
         assert any(words in problem for problem in problems), words
@@ -225,16 +174,14 @@ def test_a_manifest_that_counts_otherwise_is_found(copy):
     path = manifest(Store(store).recipes_of("south")[0])
     found = json.loads(path.read_text())
     found["counts"]["segments"] += 1
-    found["distance_by_reason_m"]["kept"] += 1.0
     write_sealed(path, found)
     problems = verify(store).problems
     assert any("segments is 225, but segments.parquet has 224 rows" in problem for problem in problems)
-    assert any("the distance breakdown keeps 225.000 m" in problem for problem in problems)
 
 
 def test_strange_files_in_a_store_are_named_and_what_a_killed_command_left_behind(copy):
     store = copy("store")
-    stored, map_path = Store(store), Store(store).map_path("site").relative_to(store)
+    stored, map_path = Store(store), Store(store).map_files("site")[0].relative_to(store)
     recipe = Path(stored.recipes_of("south")[0].where).relative_to(store)
     strange = ("notes.txt", "maps/notes.txt", "runs/north/notes.txt", f"{recipe}/notes.txt")
     for name in (*strange, f"{map_path}/height/notes.txt"):

@@ -63,6 +63,10 @@ def test_its_numbers_are_the_cards(built, page):
         ]
 
 
+def test_it_has_eight_sections_at_most(page):
+    assert page.count("<h2>") <= 8
+
+
 def test_every_sample_is_there_as_the_table_has_it(built, page):
     table, data = pq.read_table(built / "samples.parquet"), data_of(page)
     told = data["samples"]["packed"]

@@ -178,9 +178,9 @@ def test_a_change_is_told_from_scatter():
     assert find_shift(scatter) is None
     assert find_shift(scatter[:11]) is None
     found = find_shift([*scatter[:15], *(scatter[15:] + 12.0)])
-    assert (found.earlier_count, found.latest_count) == (15, 5)
-    assert find_shift([*np.tile(scatter, 50), *(scatter + 12.0)]).latest_count == 20
-    assert found.after - found.before == pytest.approx(12.0, abs=1.0)
+    assert (found["earlier_count"], found["latest_count"]) == (15, 5)
+    assert find_shift([*np.tile(scatter, 50), *(scatter + 12.0)])["latest_count"] == 20
+    assert found["after"] - found["before"] == pytest.approx(12.0, abs=1.0)
     assert find_shift([5.0] * 20) is None
     assert find_shift([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
     assert find_shift([5.0] * 15 + [6.0] * 5) is not None
