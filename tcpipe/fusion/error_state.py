@@ -31,9 +31,9 @@ from tcpipe.fusion.filter_kernel import (
 from tcpipe.fusion.hypotheses import (
     POSSIBLE,
     ROLES,
-    UNCHANGED,
     EventCandidate,
     Hypothesis,
+    compute_weights,
     explain,
     find_fix_excursions,
     find_suspects,
@@ -83,6 +83,7 @@ _LEVELLING_S = 60.0
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50  # from so many on, their white noise is averaged out
 _JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose no better
+_UNCHANGED = Hypothesis((), 0.0)
 
 
 def make_tests(size: int) -> Tests:
@@ -153,16 +154,17 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     first_minute = filter_section(ticks, model, start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
     made = filter_section(ticks, model, start)
-    explained = (
-        section.explain(made, start, find_fix_excursions(residuals, noise)) if _is_judging_fixes(m) else UNCHANGED
-    )
-    if explained.changes:
-        made = section.filter(start, model, explained)
+    hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise)) if _is_judging_fixes(m) else []
+    if hypotheses:
+        made = section.filter(start, model, hypotheses[0])
     smoothed = smooth_section(made)
+    if len(hypotheses) > 1:
+        rivals = [smooth_section(section.filter(start, model, each)) for each in hypotheses[1:]]
+        widen(smoothed, rivals, compute_weights(hypotheses), made.ticks.inputs.period_s)
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
-    return _make_trajectory(m, noise, made, smoothed, std, output_ns, explained)
+    return _make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
 
 
 def _is_judging_fixes(m: Measurements) -> bool:
@@ -182,7 +184,7 @@ class _Section:
     ticks: Ticks
     gate_probability: float
 
-    def make_model(self, changes: Hypothesis = UNCHANGED, *, judges: bool = False) -> Model:
+    def make_model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
         """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
         std, walk, time_s = make_priors(self.measurements, changes.alter_noise(self.noise), self.ticks)
         return make_model(
@@ -203,8 +205,8 @@ class _Section:
         changed = self.make_model(hypothesis)
         return filter_section(hypothesis.alter_ticks(self.ticks), changed, expand_start(start, model, changed))
 
-    def explain(self, made: Pass, start: Memory, excursions: Sequence[EventCandidate]) -> Hypothesis:
-        """Return the hypothesis that explains where sensors contradict each other; one of no changes where they do not.
+    def explain(self, made: Pass, start: Memory, excursions: Sequence[EventCandidate]) -> list[Hypothesis]:
+        """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not.
 
         ``excursions`` are smooth errors of fixes, which the filter follows.
         """
@@ -223,6 +225,30 @@ class _Section:
         return explain(plain, run, frozenset(model.active.tolist()), jump)
 
 
+def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s: float) -> None:
+    """Mix the variances of estimates under several hypotheses about the best one: Σ w (P + d d')."""
+    best.variances[:] *= weights[0]
+    best.links[:] *= weights[0]
+    lags = [round(lag_s / period_s) for lag_s in DISPLACEMENT_LAGS_S]
+    for other, weight in zip(rivals, weights[1:], strict=True):
+        apart = np.column_stack(
+            (
+                other.states[:, 9:12] - best.states[:, 9:12],
+                _compute_yaw(other.states) - _compute_yaw(best.states),
+                other.states[:, state.U + 6] - best.states[:, state.U + 6],
+            )
+        )
+        apart[:, 3] = (apart[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
+        best.variances[:] += weight * (other.variances + apart**2)
+        for column, lag in enumerate(lags):
+            length = [np.hypot(*(x[lag:, 9:11] - x[:-lag, 9:11]).T) for x in (other.states, best.states)]
+            best.links[:-lag, column] += weight * (other.links[:-lag, column] + (length[0] - length[1]) ** 2)
+
+
+def _compute_yaw(states: Floats) -> Floats:
+    return np.arctan2(states[:, 3], states[:, 0])
+
+
 def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
     moving = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != IMU]
     return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
@@ -235,7 +261,7 @@ def _make_trajectory(  # noqa: PLR0917
     smoothed: Smoothed,
     std: Floats,
     output_ns: Ints,
-    explained: Hypothesis,
+    explained: Sequence[Hypothesis],
 ) -> Trajectory:
     """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
     ticks = made.ticks
@@ -407,9 +433,11 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     return tuple(sorted(found, key=lambda each: each.start_ns))
 
 
-def _correct_measurements(m: Measurements, made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Measurements:
+def _correct_measurements(
+    m: Measurements, made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]
+) -> Measurements:
     """Return fixes and odometry without what the estimate found to be wrong with them, as the audit compares them with the track."""
-    changes = [c for c in explained.changes if c.kind in {"useless", "offset", "wander"}]
+    changes = [c for each in explained for c in each.changes if c.kind in {"useless", "offset", "wander"}]
     rows, found = made.ticks.rows, {}
     for kind, name in ((state.FIX, "gnss"), (state.WHEELS, "wheels"), (state.VISUAL, "visual")):
         source = getattr(m, name)
@@ -440,9 +468,9 @@ def _correct_measurements(m: Measurements, made: Pass, smoothed: Smoothed, expla
     return replace(m, **found)
 
 
-def _list_changes(made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Iterator[ChangeFacts]:
+def _list_changes(made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
     """Yield the changes that explain the run best."""
-    for change in explained.changes:
+    for change in (c for each in explained for c in each.changes):
         last = change.last or made.states.shape[0] - 1
         size = 0.0 if change.kind == "gyroscope" else change.size
         if change.kind == "varies":
@@ -454,7 +482,7 @@ def _list_changes(made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Iter
 
 
 def _make_facts(  # noqa: PLR0917
-    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Hypothesis
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]
 ) -> StretchFacts:
     rows = _list_rows(m, made)
     tests = made.tests

@@ -5,7 +5,8 @@ are off by a constant, the antenna was moved, a clock stepped, a gyroscope's bia
 carried, the frame of a pose turned, a sensor is useless for a while. The scale of an odometry may also vary much, throughout. Fixes do not
 err for ever: where nothing tells when they did, their lasting error is taken to be larger around a step. Each hypothesis runs the filter
 over the same measurements, predicted whether they are used or not; its score is the log likelihood, with what lies beyond the gate counted
-as the gate, less a cost by kind. The changes that explain most are found one after the other.
+as the gate, less a cost by kind. The changes that explain most are found one after the other; hypotheses that are nearly as good widen the
+deviations where they differ.
 
 Blame is never what is left when a sensor is ignored: without fixes everything is explained.
 
@@ -64,6 +65,10 @@ _HORIZON_S = 60.0
 """How far the score looks beyond the last contradiction."""
 _SURELY = 20.0
 """Log likelihood by which a further change must explain more, beyond its cost."""
+_TEMPER = 8.0
+"""Errors of measurements last: so many of them tell as much as an independent one."""
+_NEAR = 2.5 * _TEMPER
+_MOST_RIVALS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +173,10 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Changes that together explain what is measured."""
+    """Changes, and their score against that of none, in nats."""
 
     changes: tuple[Change, ...]
+    score: float
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -195,9 +201,6 @@ class Hypothesis:
         return tuple(
             (c.role, c.first, 1 << 60 if c.last is None else c.last) for c in self.changes if c.kind == "useless"
         )
-
-
-UNCHANGED = Hypothesis(())
 
 
 def find_suspects(tests: Tests, period_s: float) -> list[Suspect]:
@@ -229,15 +232,15 @@ def compute_evidence(tests: Tests, gates: Floats, first: int, last: int) -> floa
 
 def explain(
     made: Pass, run: Callable[[Hypothesis, int, int], Pass], active: Collection[int], jump: TurnJump | None = None
-) -> Hypothesis:
-    """Return the hypothesis that explains best where sensors contradict each other; one of no changes where they do not.
+) -> list[Hypothesis]:
+    """Return the hypotheses that explain best where sensors contradict each other, the best first; none where they do not.
 
     ``made`` is the pass without any change, in which no rejected fix is followed; ``run`` makes that under a hypothesis between two ticks
     (its rows before the first mean nothing). Only errors that are ``active`` can change. A ``jump`` that the gyroscope's turns show is
     tried first; then one contradiction after the other is explained.
     """
     period_s, gates, size = made.ticks.inputs.period_s, made.model.gates, made.states.shape[0]
-    best, tests = UNCHANGED, made.tests
+    best, tests, found = Hypothesis((), 0.0), made.tests, [Hypothesis((), 0.0)]
     for number in range(_MOST_CHANGES + 1):
         suspects = find_suspects(tests, period_s)
         if number == 0:
@@ -248,17 +251,19 @@ def explain(
         else:
             break
         last = min(size, end + round(_HORIZON_S / period_s))
-        tried: list[tuple[float, Hypothesis]] = []
+        tried: list[Hypothesis] = []
         for change in changes:
             if _is_possible(change, best, active):
-                changed = Hypothesis((*best.changes, change))
+                changed = Hypothesis((*best.changes, change), 0.0)
                 first = min(c.first for c in changed.changes)
                 plain = compute_evidence(tests, gates, first, last)
                 gained = compute_evidence(run(changed, first, last).tests, gates, first, last) - plain - change.cost
-                tried.append((gained, changed))
-        most, top = max(tried, key=lambda each: each[0], default=(0.0, best))
+                tried.append(replace(changed, score=best.score + gained))
+        found += tried
+        top = max(tried, key=lambda each: each.score, default=best)
         # Fixes that are rejected have to be explained: the filter would follow them in the end.
-        if most >= _SURELY or (tried and number and suspects[0].role == state.FIX):
+        if top.score >= best.score + _SURELY or (tried and number and suspects[0].role == state.FIX):
+            found.remove(top)
             best = top
             if (change := top.changes[-1]).kind == "pose" and change.size < _CARRIED_M:
                 # Such a step is one of the fixes, which err before or after it; if neither is more likely, around it.
@@ -271,9 +276,11 @@ def explain(
         elif number > 0:
             break
     left = [each for each in find_suspects(tests, period_s) if each.role == state.FIX] if best.changes else []
+    rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
     off_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in left]
     errs = [next(_list_wanders(each.first, size_m, size, period_s)) for each, size_m in zip(left, off_m, strict=True)]
-    return replace(best, changes=(*best.changes, *errs))
+    best = replace(best, changes=(*best.changes, *errs))
+    return [best, *sorted(rivals, key=lambda each: -each.score)[:_MOST_RIVALS]] if best.changes or rivals else []
 
 
 def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> bool:
@@ -292,8 +299,8 @@ def _list_wanders(tick: int, off_m: float, size: int, period_s: float) -> Iterat
     yield Change("wander", state.FIX, tick, last, off_m, tick)
 
 
-def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> Hypothesis:
-    """Return the hypothesis that fixes err in the spans of candidates."""
+def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> list[Hypothesis]:
+    """Return the hypothesis that fixes err in the spans of candidates; none without candidates."""
     stamp_ns, size = made.ticks.stamp_ns, made.states.shape[0]
     changes: list[Change] = []
     for each in sorted(candidates, key=lambda each: each.start_ns):
@@ -303,7 +310,7 @@ def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> Hypothe
             before = changes.pop()
             first, last, off_m = before.first, max(last, before.last or size), max(off_m, before.size)
         changes.append(Change("wander", state.FIX, first, None if last >= size else last, off_m))
-    return Hypothesis(tuple(changes))
+    return [Hypothesis(tuple(changes), 0.0)] if changes else []
 
 
 def _make_jump(made: Pass, jump: TurnJump) -> Change:
@@ -311,6 +318,13 @@ def _make_jump(made: Pass, jump: TurnJump) -> Change:
     first = int(np.searchsorted(made.ticks.stamp_ns, jump.at_ns).clip(1, made.states.shape[0] - 1))
     before = float(made.states[first - 1, state.GYRO_BIAS + 8])
     return Change("gyroscope", state.FIX, first, size=before + jump.change, jump=jump)
+
+
+def compute_weights(hypotheses: Sequence[Hypothesis]) -> Floats:
+    """Return how likely each hypothesis is."""
+    scores = np.array([each.score for each in hypotheses]) / _TEMPER
+    weights = np.exp(scores - scores.max())
+    return np.asarray(weights / weights.sum())
 
 
 def _list_changes(suspect: Suspect, suspects: Sequence[Suspect], tests: Tests, period_s: float) -> Iterator[Change]:

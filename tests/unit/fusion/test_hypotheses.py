@@ -10,7 +10,7 @@ from unit.fusion.test_error_state import fuse, smoothed, truth
 from tcpipe.fusion import state
 from tcpipe.fusion.error_state import make_tests
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED
-from tcpipe.fusion.hypotheses import Change, Hypothesis, compute_evidence, find_suspects
+from tcpipe.fusion.hypotheses import Change, Hypothesis, compute_evidence, compute_weights, find_suspects
 
 
 def shift(m, start_s, end_s, offset_m, *, ramp_s=0.0):
@@ -134,12 +134,14 @@ def test_evidence_counts_what_is_beyond_the_gate_as_the_gate():
     assert compute_evidence(tests, gates, 2, 3) == pytest.approx(0.5)
 
 
-def test_events_are_in_order():
-    best = Hypothesis((Change("antenna", state.FIX, 50, 90), Change("clock", state.FIX, 20)))
+def test_weights_are_those_of_the_scores_and_events_are_in_order():
+    best = Hypothesis((Change("antenna", state.FIX, 50, 90), Change("clock", state.FIX, 20)), 30.0)
+    weights = compute_weights([best, Hypothesis((), 30.0), Hypothesis((), -1e6)])
+    assert weights == pytest.approx([0.5, 0.5, 0.0])
     assert [(event.tick, event.place) for event in best.events] == [
         (20, state.FIX_LAG),
         (50, state.ARM),
         (90, state.ARM),
     ]
-    useless = Hypothesis((Change("useless", state.VISUAL, 5, 8),))
+    useless = Hypothesis((Change("useless", state.VISUAL, 5, 8),), 0.0)
     assert (useless.events, useless.ignored) == ((), ((state.VISUAL, 5, 8),))
