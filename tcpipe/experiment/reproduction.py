@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -37,7 +37,8 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
-from tcpipe.report.page import Section, render_page
+from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.plots import draw_ratios
 from tcpipe.simulation import Scenario, SimulatedSite, find_scenario, simulate
 from tcpipe.simulation.scenarios import scale_hidden_variance
 
@@ -261,23 +262,24 @@ def _render_page(
 ) -> str:
     """Return the HTML page of the evaluations of all trainings; ``shares`` are of the variance of E, by what makes it."""
     verdicts = Counter(claim.verdict for claim in claims)
-    counts = ", ".join(f"{count} {name}" for name, count in verdicts.items())
     audits = (f"{split}: {format_leakage(part.leakage)}" for split, part in runs[0].splits.items())
     return render_page(
         title="The paper's experiment on a simulated site",
-        lead=f"Of {len(claims)} claims: {counts}; {len(runs)} training{'s' if len(runs) > 1 else ''}. {' '.join(audits)} "
-        "All tables of a training are in seed-N/evaluation/evaluation.html.",
-        numbers=[],
+        lead="All tables of a training are in seed-N/evaluation/evaluation.html.",
+        numbers=[
+            *(Number(f"{count} of {len(claims)}", f"claims {name}") for name, count in verdicts.items()),
+            Number(f"{len(runs)}", "training" if len(runs) == 1 else "trainings"),
+        ],
         warnings=[SIMULATED, *warnings],
         sections=[
-            _make_claims_section(claims),
+            _make_claims_section(claims, " ".join(audits)),
             _make_errors_section(runs),
             _make_variance_section(shares, hidden_variance),
         ],
     )
 
 
-def _make_claims_section(claims: Sequence[Claim]) -> Section:
+def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
     rows = [
         (
             claim.says, claim.split, claim.verdict, str(claim.ratio),
@@ -287,12 +289,15 @@ def _make_claims_section(claims: Sequence[Claim]) -> Section:
         for claim in claims
     ]  # fmt: skip
     text = (
-        "RMSE of E of the network over a baseline's, of the same samples, both centred by class: the mean of all trainings, with its 95 % "
-        "interval over trainings and test samples. Held if all of it is below 1, NOT held if above, open otherwise, and of fewer than "
-        f"{FEWEST_SEEDS} trainings. Height, class and slow ground matter by construction of the site, so they are no claims."
+        "RMSE of E of the network over a baseline's, of the same samples, with its 95 % interval: left of 1 the network is better.\n"
+        "Both are centred by class; the mean of all trainings, its interval over trainings and test samples. Held if all of it is below 1, "
+        f"NOT held if above, open otherwise, and of fewer than {FEWEST_SEEDS} trainings. Height, class and slow ground matter by "
+        f"construction of the site, so they are no claims. {audit}"
     )
     header = ("claim", "split", "", "here", "between trainings (1σ)", "the paper")
-    return Section("Claims of the paper", text, header=header, rows=rows, figures_from=3)
+    ratios = [(f"{claim.split}: {claim.says.rpartition(' beats ')[2]}", astuple(claim.ratio)) for claim in claims]
+    plot = draw_ratios("claims", "RMSE of E: network over baseline", ratios)
+    return Section("Claims of the paper", text, header=header, rows=rows, figures_from=3, plots=[plot])
 
 
 def _make_errors_section(runs: Sequence[Evaluation]) -> Section:

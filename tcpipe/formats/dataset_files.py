@@ -5,7 +5,7 @@
     dataset.json  croissant.json  README.md  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
     drive-next.geojson                                       where to drive for what is thin
-    excluded.csv                                             samples that a user excluded, and why
+    excluded.csv                                             ids that a user excluded, why, and whether they were samples
     report-patches/                                          pictures of all patches, after `tcpipe report --patches`
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
     data/<split>-00000-of-00001.parquet                      --format parquet: the same layers, a row a sample
@@ -467,6 +467,12 @@ def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDAr
 
 _ID_COLUMNS = ("sample_id", "segment_id")
 
+EXCLUDED_IDS = pa.schema([(name, pa.string()) for name in ("sample_id", "list", "reason", "outcome")])
+"""Columns of `EXCLUDED`."""
+
+IS_EXCLUDED = "excluded"
+"""Outcome of an id that would be a sample."""
+
 
 def read_sample_ids(path: Path) -> list[str]:
     """Return the ids of a list, each once, in its order: the column sample_id or segment_id of a CSV file, or the lines of a text.
@@ -496,5 +502,5 @@ def read_exclusion_reason(directory: Path, sample_id: str) -> str | None:
     if not path.is_file():
         return None
     with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["sample_id"] == sample_id]
+        rows = [row for row in csv.DictReader(file) if (row["sample_id"], row["outcome"]) == (sample_id, IS_EXCLUDED)]
     return f"{rows[0]['list']}: {rows[0]['reason']}" if rows else None

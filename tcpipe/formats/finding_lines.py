@@ -113,7 +113,7 @@ def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
     for remedy in (of for finding in findings for of in finding.remedies):
         if remedy not in remedies:
             remedies.append(remedy)
-    if remedies and len(remedies) <= _MOST_SUBJECTS:
+    if remedies and len(remedies) <= MOST_LINES:
         return [
             (
                 _find_purpose(findings[0], of),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,15 +55,16 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
     rows, splits = find_worst_rows(table, _WORST), to_texts(table.column("split"))
     first = [np.flatnonzero(splits == name)[:_MOST_SHOWN] for name in dict.fromkeys(splits.tolist())]
     shown, split = np.unique(np.concatenate([*first, rows])), splits[rows]
-    parts: list[dict[str, NDArray[np.generic]]] = []
+    plain = tuple(name for name, layer in data.card.layers.items() if "bands" not in layer)  # no picture of several bands
+    parts: list[dict[str, NDArray[Any]]] = []
     for name in dict.fromkeys(split.tolist()):
-        ids = table.column("sample_id").take(pa.array(rows[split == name]))
+        ids, view = table.column("sample_id").take(pa.array(rows[split == name])), data[name].view
         known = pa.array(data[name].column("sample_id").tolist(), pa.string())
-        parts.append(data[name].layers(pc.index_in(ids.combine_chunks(), value_set=known).to_numpy()))
+        at = pc.index_in(ids.combine_chunks(), value_set=known).to_numpy()
+        parts.append(view.stored.gather(view.at[at], plain))
     if not parts:
         return EvaluatedSamples(table, shown, None)
     step = choose_thinning(data.card.patch_px)
-    plain = [layer for layer, of in parts[0].items() if of.ndim == 3]  # no picture of several bands
     pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in plain}
     files = data[str(split[0])].view.stored.files
     return EvaluatedSamples(table, shown, make_sheets(np.searchsorted(shown, rows).tolist(), pixels, files))
@@ -102,29 +102,20 @@ def make_page_data(samples: EvaluatedSamples) -> Json:
     }
 
 
-def sample_sections(samples: EvaluatedSamples, splits: Sequence[str]) -> list[Section]:
-    """Return the sections on single samples, if any."""
-    if not samples.table.num_rows:
-        return []
-    worst = (
-        f"The {_WORST} samples of each split with the largest errors of E, largest first. Travel is to the right; click for details. "
-        "Look for a common cause: a wrong class in the map, a step missing in the heights, a label with a large σ."
-    )
-    return [
-        _draw_predictions(samples),
-        Section("Worst segments", worst, controls="gallery.html"),
-        *(_draw_errors_by_slope(samples.table, split) for split in splits),
-        _draw_calibration(samples.table),
-    ]
+WORST = Section(
+    "Worst segments",
+    f"The {_WORST} samples of each split with the largest errors of E, largest first; click for details.\n"
+    "Travel is to the right. Look for a common cause: a wrong class in the map, a step missing in the heights, a label with a large σ.",
+    controls="gallery.html",
+)
 
 
-def _draw_predictions(samples: EvaluatedSamples) -> Section:
-    text = (
-        "Each point is a segment; on the line the prediction is exact. Hover for values, click for σ, intervals and origin, "
-        "or draw a box; Next shows the next smaller error."
-    )
+def draw_predictions(samples: EvaluatedSamples, audit: str) -> Section:
+    """Return the section with a point for each sample; ``audit`` says how far they are from training."""
+    text = "Each point is a segment; on the line the prediction is exact. Click, draw a box, or step from the largest error."
     if samples.table.num_rows > len(samples.shown):
         text += f" {len(samples.shown)} of {samples.table.num_rows} are shown, drawn at random, and the worst."
+    text += f"\n{audit}"
     corners = {name: [0.0, 1.0] for name in ("measured", "predicted", "slope", "error")}
     start = {**corners, "fill": ["#ffffff"] * 2, "class": [""] * 2}  # until the page's script has unpacked the samples
     against, points = _draw_scatter("against", "samples", "measured", "predicted", start)
@@ -158,15 +149,18 @@ def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any
     return plot, points
 
 
-def _draw_errors_by_slope(table: pa.Table, split: str) -> Section:
-    """Return the RMSE of E by class and range of slope, as a heat map."""
-    part = table.filter(pc.and_(pc.equal(table.column("split"), split), pc.is_valid(table.column("slope_rad"))))
+def make_slope_section(table: pa.Table) -> Section:
+    """Return the RMSE of E by split, class and range of slope, as a heat map."""
+    part = table.filter(pc.is_valid(table.column("slope_rad")))
     off, ranges = compute_errors_joule(part), find_slope_ranges(to_floats(part, "slope_rad"))
     energy, low, high = (to_floats(part, make_column_name("E", of)) for of in ("", "predicted_low", "predicted_high"))
-    is_outside, classes = (energy < low) | (energy > high), to_texts(part.column("terrain_name"))
-    ids = sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
+    is_outside = (energy < low) | (energy > high)
+    splits, classes = (to_texts(part.column(name)) for name in ("split", "terrain_name"))
+    lines = list(dict.fromkeys(zip(splits.tolist(), classes.tolist(), strict=True)))
     columns = np.unique(ranges)
-    cells = {(name, at): (classes == name) & (ranges == at) for _, name in ids for at in columns}
+    cells = {
+        (*line, at): (splits == line[0]) & (classes == line[1]) & (ranges == at) for line in lines for at in columns
+    }
     errors = {cell: off[rows & np.isfinite(off)] for cell, rows in cells.items()}
     rmse = {cell: float(np.sqrt(np.mean(part**2))) for cell, part in errors.items() if len(part)}
     most = max(rmse.values(), default=1.0) or 1.0
@@ -175,26 +169,26 @@ def _draw_errors_by_slope(table: pa.Table, split: str) -> Section:
         read_threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction")
     )
 
-    def shade(cell: tuple[str, Any]) -> str | Shaded:
+    def shade(cell: tuple[str, str, Any]) -> str | Shaded:
         if cell not in rmse:
-            return "–"
-        count, mean = len(errors[cell]), float(errors[cell].mean())
+            return ""
+        count = len(errors[cell])
         is_doubtful = count >= enough and bool(is_outside[cells[cell]].mean() > 1.0 - least)
-        text = f"{rmse[cell]:.{digits}f}, {mean:+.{digits}f} ({count}){'*' if is_doubtful else ''}"
+        text = f"{rmse[cell]:.{digits}f} ({count}){'*' if is_doubtful else ''}"
         return Shaded(text, rmse[cell] / most, alarm=is_doubtful)
 
     text = (
-        "RMSE of E [J], mean error (predicted less measured), in brackets the number of segments; darker is worse. * and a dashed border: "
+        "RMSE of E [J], in brackets the number of segments; darker is worse. * and a dashed border: "
         f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them."
     )
-    header = ["class", *(SLOPE_NAMES[at] for at in columns)]
-    table_rows = [[name, *(shade((name, at)) for at in columns)] for _, name in ids]
-    return Section(f"Error by class and slope, {split}", text, header=header, rows=table_rows)
+    header = ["split", "class", *(SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]
+    rows = [[*line, *(shade((*line, at)) for at in columns)] for line in sorted(lines)]
+    return Section("Error by class and slope", text, header=header, rows=rows)
 
 
-def _draw_calibration(table: pa.Table) -> Section:
-    """Return the share of labels below each quantile that the model states."""
-    plots = []
+def draw_calibration(table: pa.Table) -> list[Plot]:
+    """Return for each split the share of labels below each quantile that the model states."""
+    plots: list[Plot] = []
     for split in pc.unique(table.column("split")).to_pylist():
         part = table.filter(pc.equal(table.column("split"), split))
         found = {q: shares for q in QUANTITIES if (shares := compute_calibration(part, q)) is not None}
@@ -204,7 +198,7 @@ def _draw_calibration(table: pa.Table) -> Section:
             f"calibration {split}",
             alt=f"Share of labels of {split} below each quantile that the model states; on the diagonal the model is calibrated.",
             axes=("share stated", f"share of {split} labels below"),
-            legend={_CALLED[q]: _COLOURS[q] for q in found},
+            legend={} if plots else {_CALLED[q]: _COLOURS[q] for q in found},
             height_px=320,
             tools="save,hover",
             waits=True,
@@ -219,10 +213,4 @@ def _draw_calibration(table: pa.Table) -> Section:
         ]  # fmt: skip
         plot.figure.hover.renderers = lines
         plots.append(plot)
-    text = (
-        "Share of labels below each quantile of the stated errors, assumed normal. On the diagonal the model is calibrated; "
-        "steeper in the middle: underconfident; flatter: overconfident; all above: predictions are too large."
-        if plots
-        else "The model states no uncertainty: too few samples were held out."
-    )
-    return Section("Calibration of the stated uncertainty", text, plots=plots)
+    return plots

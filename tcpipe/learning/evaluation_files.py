@@ -111,7 +111,7 @@ def run_evaluation(
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
     name = values.dataset.name
     of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
-    lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, compared with the paper."
+    lead = f"Model {Path(model).name} on dataset {name}: errors of time T and energy E{of}."
     samples = read_evaluated_samples(place, dataset)
     write_text(
         place / PAGE,

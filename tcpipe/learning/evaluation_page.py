@@ -6,15 +6,25 @@ The paper's own results (Eder and Steinbauer-Wagner, section V), to stand beside
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple
 from typing import Literal
 
+from tcpipe.cost.coverage import Coverage
 from tcpipe.learning.baselines import ALL_LAYERS_PER_CLASS, GRASS_ONLY, OURS, PER_CLASS
 from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, Evaluation, Leakage
-from tcpipe.learning.evaluation_figures import EvaluatedSamples, make_page_data, sample_sections
-from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
+from tcpipe.learning.evaluation_figures import (
+    WORST,
+    EvaluatedSamples,
+    draw_calibration,
+    draw_predictions,
+    make_page_data,
+    make_slope_section,
+)
+from tcpipe.learning.metrics import ALL, LEAST, UNITS, Errors
 from tcpipe.learning.predictor import find_kind
 from tcpipe.report.page import Number, Section, render_page, show_verdict
+from tcpipe.report.plots import draw_ratios
 from tcpipe.tables.findings import PREDICTED, judge_again
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
@@ -22,10 +32,8 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
 
-COUNTED = (
-    "A number in brackets after a MAPE counts its labels, if some are left out: all below "
-    + ", ".join(f"{least:g} {UNITS[quantity]} ({quantity})" for quantity, least in LEAST.items())
-    + ". "
+COUNTED = "In brackets after a MAPE: the labels that it counts, if some are below " + " or ".join(
+    f"{LEAST[quantity]:g} {UNITS[quantity]}" for quantity in "ET"
 )
 _DIGITS = {"w": 2, "v": 3, "T": 3, "E": 2}
 _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"}
@@ -35,23 +43,33 @@ def render_evaluation_page(
     found: Evaluation, samples: EvaluatedSamples, *, title: str, lead: str, warnings: Sequence[str] = ()
 ) -> str:
     """Return the HTML page of what `evaluate` found; ``warnings`` come first."""
-    sample_parts = sample_sections(samples, found.ordered_splits)
-    sections = [
-        _make_baselines_section(found),
-        _make_coverage_section(found),
-        *sample_parts,
+    has_samples = bool(samples.table.num_rows)
+    parts = [
         *_make_class_sections(found),
         _make_ablation_section(found),
         _make_energy_section(found),
         _make_time_section(found),
     ]
+    paper = Section(
+        "Beside the paper",
+        "The paper's five tables with the figures of this model.\n" + COUNTED,
+        parts=[part for part in parts if part.rows],
+    )
+    audits = (f"{split}: {format_leakage(found.splits[split].leakage)}" for split in found.ordered_splits)
+    sections = [
+        *([draw_predictions(samples, " ".join(audits))] if has_samples else []),
+        _make_baselines_section(found),
+        _make_coverage_section(found, samples),
+        *([make_slope_section(samples.table), WORST] if has_samples else []),
+        paper,
+    ]
     return render_page(
         title=title,
-        lead=f"{lead} {' '.join(f'{split}: {format_leakage(found.splits[split].leakage)}' for split in found.ordered_splits)}",
+        lead=lead,
         numbers=[
             Number(
                 f"{found.splits[name].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",
-                f"MAPE of {quantity}, {name}, {found.splits[name].errors[quantity][ALL].mape_count} labels",
+                f"MAPE of {quantity}, {name}",
             )
             for name in found.ordered_splits
             for quantity in ("E", "T")
@@ -59,8 +77,8 @@ def render_evaluation_page(
         verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=PREDICTED),
         warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
-        script="evaluation.js" if sample_parts else "",
-        data=make_page_data(samples) if sample_parts else None,
+        script="evaluation.js" if has_samples else "",
+        data=make_page_data(samples) if has_samples else None,
     )
 
 
@@ -88,51 +106,81 @@ def _format_measure(measure: str, quantity: str) -> str:
 
 def _make_baselines_section(found: Evaluation) -> Section:
     """Return the model and the baselines, with the ratio of their errors."""
-    title = "Comparison with baselines"
+    title, splits = "Comparison with baselines", found.ordered_splits
     if not found.baselines:
         return Section(title)
-    rows = []
-    for split in found.ordered_splits:
-        part = found.splits[split]
-        for quantity in ("E", "T"):
-            own = _format_figure(part.uncentred[quantity], "rmse", quantity)
-            rows.append(
-                (split, quantity, "the model", *_format_figures(part.errors[quantity][ALL], quantity), "", own, "")
-            )
-            for row in found.baselines:
-                if (row.split, row.quantity) == (split, quantity):
-                    own = _format_figure(row.uncentred, "rmse", quantity)
-                    figures = *_format_figures(row.errors, quantity), str(row.rmse_ratio), own
-                    rows.append(("", "", row.baseline, *figures, str(row.uncentred_rmse_ratio)))
-    header = ("", "", "", "RMSE", "MAPE [%]", "ratio of RMSE", "RMSE, not centred", "ratio, not centred")
+    by_cell = {(row.baseline, row.split, row.quantity): row for row in (*found.baselines, *found.networks)}
+    names = list(dict.fromkeys(row.baseline for row in found.baselines))
+    rows: list[tuple[str, ...]] = []
+    for quantity in ("E", "T"):
+        own = (found.splits[split].errors[quantity][ALL] for split in splits)
+        rows.append((quantity, "the model", *(_format_figure(error, "rmse", quantity) for error in own)))
+        for name in names:
+            of = (by_cell.get((name, split, quantity)) for split in splits)
+            cells = (_format_figure(None if row is None else row.errors, "rmse", quantity) for row in of)
+            rows.append(("", name, *cells))
+    header = ("", "", *(f"{split}, RMSE" for split in splits))
     text = (
-        "All use the same samples and are centred by class with the same rule, from their own held-out predictions; the last two columns "
-        "are without it. Ratios are the model's RMSE over the baseline's, with their 95 % interval (paired bootstrap over runs or "
-        f"blocks, ten at least): below 1 the model is better. Physics and boosting also know the turn of each segment. {COUNTED}"
+        "RMSE of the model over that of each baseline, on the same samples, with its 95 % interval: left of 1 the model is better.\n"
+        "All are centred by class with the same rule, from their own held-out predictions (evaluation.json has all ratios). "
+        "Intervals: paired bootstrap over runs or blocks, ten at least. Physics and boosting also know the turn of each segment."
     )
-    return Section(title, text, header=header, rows=rows, figures_from=3)
+    table = Section("RMSE", header=header, rows=rows, figures_from=2)
+    plots = [
+        draw_ratios(
+            f"ratio {quantity}",
+            f"RMSE of {quantity}: model over baseline",
+            [
+                (f"{split}: {name}", astuple(row.rmse_ratio))
+                for (name, split, of), row in by_cell.items()
+                if of == quantity
+            ],
+        )
+        for quantity in ("E", "T")
+    ]
+    return Section(title, text, plots=plots, parts=[table])
 
 
-def _make_coverage_section(found: Evaluation) -> Section:
-    """Return the share of labels that 90 % intervals cover, with its own interval, and the scores."""
+def _make_coverage_section(found: Evaluation, samples: EvaluatedSamples) -> Section:
+    """Return how well the model knows its errors: calibration, and the share of labels that 90 % intervals cover, with its own interval."""
     rows = [
-        (split, quantity, str(coverage), f"{error.nll:.2f}", f"{error.crps:.{_DIGITS[quantity]}f} {UNITS[quantity]}")
+        (
+            split,
+            quantity,
+            _format_coverage(coverage),
+            f"{error.nll:.2f}",
+            f"{error.crps:.{_DIGITS[quantity]}f} {UNITS[quantity]}",
+        )
         for split in found.ordered_splits
         for quantity, coverage in found.splits[split].coverage.items()
         if quantity in "ET"
         and (error := found.splits[split].errors[quantity][ALL]).nll is not None
         and error.crps is not None
     ]
+    if not rows:
+        return Section("Uncertainty", "The model states no uncertainty: too few samples were held out.")
     training = found.model.training
     count, config = training.samples["held out"], training.config
     is_network = find_kind(training.kind).stops_by_fold and not config.cross_fit
     text = (
-        f"Intervals rest on the model's errors on {count} samples of train "
-        f"{'that stopped it early, which makes them slightly too small' if is_network else ', each predicted by the other folds'}. The "
-        "95 % CI of the coverage is binomial, clustered by run."
+        "Share of labels below each quantile of the stated errors; on the diagonal the model is calibrated.\n"
+        "Steeper in the middle: underconfident; flatter: overconfident; all above: too large. Intervals rest on "
+        f"errors on {count} samples of train "
+        f"{'that stopped it early, which makes them slightly too small' if is_network else ', each predicted by the other folds'}. "
+        "The 95 % CI of a coverage, where there are enough runs, is binomial, clustered by run."
     )
     header = ("", "", "inside the 90 % interval", "NLL [nat]", "CRPS")
-    return Section("Coverage of the intervals", text if rows else "", header=header, rows=rows, figures_from=2)
+    plots = draw_calibration(samples.table) if samples.table.num_rows else []
+    return Section("Uncertainty", text, header=header, rows=rows, figures_from=2, plots=plots)
+
+
+def _format_coverage(coverage: Coverage) -> str:
+    interval = (
+        ""
+        if coverage.low is None or coverage.high is None
+        else f" ({100 * coverage.low:.0f}–{100 * coverage.high:.0f})"
+    )
+    return f"{100 * coverage.fraction:.1f} %{interval}"
 
 
 def _make_class_sections(found: Evaluation) -> list[Section]:
@@ -142,7 +190,7 @@ def _make_class_sections(found: Evaluation) -> list[Section]:
         if split not in found.splits:
             continue
         part = found.splits[split]
-        rows = [row for quantity in QUANTITIES for row in _iterate_class_rows(found, split, quantity)]
+        rows = [row for quantity in "ET" for row in _iterate_class_rows(found, split, quantity)]
         header = ("", "", *(f"{name} ({part.classes[name]})" for name in part.class_order), f"all ({part.samples})")
         sections.append(
             Section(f"Table {number}: {_CALLED[split]}", _TEXT[split], header=header, rows=rows, figures_from=2)
@@ -159,18 +207,18 @@ def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterato
         return first, second, *(_format_figure(by_class.get(name), measure, quantity) for name in classes)
 
     for measure in MEASURES:
-        yield make_row(f"{quantity}, {_format_measure(measure, quantity)}", "here", part.errors[quantity], measure)
+        yield make_row(f"{quantity}, {_format_measure(measure, quantity)}", "", part.errors[quantity], measure)
         of_paper = dict(zip(CLASSES, BY_CLASS[split, quantity, measure], strict=True))
-        yield ("", "the paper", *(_format_paper_figure(of_paper.get(name)) for name in classes))
+        yield ("", "paper", *(_format_paper_figure(of_paper.get(name)) for name in classes))
         if measure != "rmse":
             continue
         if split == "test" and found.blocks is not None:
-            yield make_row("", "held-out blocks of train", found.blocks[quantity], measure)
+            yield make_row("", "blocks of train", found.blocks[quantity], measure)
         for floor, errors in part.floors.items():
             yield make_row("", FLOORS[floor], errors[quantity], measure)
         if (repeats := found.repeatability[quantity]) is not None:
             blank = [""] * len(part.classes)
-            yield ("", "repeatability (driven twice)", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
+            yield ("", "repeatability", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
 
 
 def format_leakage(leakage: Leakage | None) -> str:
@@ -185,8 +233,7 @@ def format_leakage(leakage: Leakage | None) -> str:
 
 
 _TEXT = {
-    "test": "Held-out blocks of train: the model was not fitted on them (a network used them for early stopping). "
-    "Label noise alone: the error of a perfect prediction, from the part of their standard deviations that labels of a run do not share.",
+    "test": "Blocks of train are held out. Label noise alone: the error of a perfect prediction, by what labels of a run do not share.",
     "unseen": "The paper calls it validation; tcpipe uses it neither for tuning nor for early stopping.",
 }
 
@@ -195,13 +242,15 @@ def _make_ablation_section(found: Evaluation) -> Section:
     """Return table III, of E."""
     rows = []
     for row in found.ablation:
-        layers, how = f"{{{', '.join(row.layers)}}}", "retrained" if row.how == "retrained" else "here"
+        layers, how = "+".join(row.layers), "retrained" if row.how == "retrained" else ""
         cells = (cell for split in found.ordered_splits for cell in _format_figures(row.on(split)["E"], "E"))
         rows.append((layers, how, *cells))
         if row.how == "noise" and row.layers in ABLATION:
             of_paper = (value for split in found.ordered_splits for value in ABLATION[row.layers][SPLITS.index(split)])
-            rows.append(("", "the paper", *map(_format_paper_figure, of_paper)))
-    text = f"Layers not named are replaced by noise, mean of {found.config.noise_draws} draws; retrained: a network without these layers."
+            rows.append(("", "paper", *map(_format_paper_figure, of_paper)))
+    text = (
+        f"Layers not named are replaced by noise ({found.config.noise_draws} draws); retrained: a network without them."
+    )
     header = ("layers", "", *_name_measures(found, "E"))
     return Section("Table III: ablation, E", text, header=header, rows=rows, figures_from=2)
 
@@ -222,31 +271,24 @@ def _make_comparison_section(
     table = found.energy if quantity == "E" else found.time
     splits = found.ordered_splits
     rows: list[tuple[str, ...]] = []
-    for what in (OURS, ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY, EXPECTED):
+    for what in (*((OURS,) if quantity == "E" else ()), ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY, EXPECTED):
         if what not in table:
             continue
         by_split = [_format_figures(table[what].get(split), quantity) for split in splits]
-        rows.append((what, "here", *(cell for cells in by_split for cell in cells)))
+        rows.append((what, "", *(cell for cells in by_split for cell in cells)))
         if what in of_paper:
             cells = [map(_format_paper_figure, of_paper[what][SPLITS.index(split)]) for split in splits]
-            rows.append(("", "the paper", *(cell for part in cells for cell in part)))
+            rows.append(("", "paper", *(cell for part in cells for cell in part)))
     return Section(title, text, header=("", "", *_name_measures(found, quantity)), rows=rows, figures_from=2)
 
 
 def _make_energy_section(found: Evaluation) -> Section:
     text = (
-        "Beside the one network: one of each class with all layers, and Wei and Isler's, which predict E from heights alone, one for grass "
-        "or one per class. Each takes as many steps as ours and is centred by class. All rows are of the same samples. "
+        "Beside the one network: one of each class with all layers, and Wei and Isler's, which predict E from heights alone.\n"
+        "Each takes as many steps as ours and is centred by class; ratios stand among those of the baselines. "
     )
-    ratios = "; ".join(
-        f"{row.split}, {row.baseline}: {row.rmse_ratio}, not centred {row.uncentred_rmse_ratio}"
-        for row in found.networks
-    )
-    text += (
-        f"RMSE ratio, ours to theirs, with 95 % CI: {ratios}."
-        if ratios
-        else "They are trained only if the model is a network."
-    )
+    if not found.networks:
+        text += "They are trained only if the model is a network."
     return _make_comparison_section("Table IV: energy, one network or one per class", text, found, ENERGY, "E")
 
 
@@ -259,18 +301,10 @@ CLASSES = ("grass", "mud", "unpaved road", "paved road", "all")
 """Columns of `BY_CLASS`."""
 
 BY_CLASS = {
-    ("test", "w", "rmse"): (14.35, 13.92, 7.81, 16.09, 14.04),
-    ("test", "w", "mape_percent"): (9.96, 7.51, 5.74, 11.53, 9.39),
-    ("test", "v", "rmse"): (0.04, 0.05, 0.02, 0.05, 0.04),
-    ("test", "v", "mape_percent"): (3.32, 5.27, 1.78, 3.64, 3.41),
     ("test", "T", "rmse"): (0.06, 0.10, 0.03, 0.07, 0.06),
     ("test", "T", "mape_percent"): (3.26, 5.50, 1.74, 3.52, 3.37),
     ("test", "E", "rmse"): (18.22, 29.26, 10.98, 25.55, 21.51),
     ("test", "E", "mape_percent"): (11.06, 10.64, 6.15, 12.90, 10.77),
-    ("unseen", "w", "rmse"): (18.85, 29.20, 15.07, 16.15, 17.73),
-    ("unseen", "w", "mape_percent"): (11.29, 19.25, 8.42, 11.58, 10.74),
-    ("unseen", "v", "rmse"): (0.07, 0.06, 0.04, 0.07, 0.06),
-    ("unseen", "v", "mape_percent"): (5.60, 5.22, 2.90, 5.70, 5.14),
     ("unseen", "T", "rmse"): (0.09, 0.09, 0.04, 0.09, 0.08),
     ("unseen", "T", "mape_percent"): (5.74, 5.18, 2.91, 5.67, 5.04),
     ("unseen", "E", "rmse"): (27.50, 49.58, 19.24, 22.69, 26.63),

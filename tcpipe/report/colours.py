@@ -14,7 +14,7 @@ CURSOR = "#ff2d95"
 DOUBTED = "#e69f00"
 UNUSED = "#8fd3bd"
 """Kept rows that belong to no segment."""
-SEVERITY_COLOURS = {"error": "#c2185b", "warning": DOUBTED, "note": "#56b4e9"}
+SEVERITY_COLOURS = {"error": "#b3202a", "warning": DOUBTED, "note": "#56b4e9"}
 REASON_COLOURS = {
     DropReason.GAP: "#cc79a7",
     DropReason.STATIONARY: FAINT,

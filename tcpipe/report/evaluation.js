@@ -46,10 +46,10 @@ page.start(async () => {
       const sure = Number.isFinite(std) ? ` ± ${std.toPrecision(2)}` : "";
       const ends = ["low", "high"].map((end) => (said + c[`${key} ${end}`][i]).toFixed(digits));
       const interval = Number.isFinite(c[`${key} low`][i]) ? ` (90 %: ${ends[0]} to ${ends[1]})` : "";
-      return [called, `measured ${label.toFixed(digits)}${sure}, predicted ${said.toFixed(digits)}${interval} ${unit}`];
+      return [called, `measured ${label.toFixed(digits)}${sure}, predicted ${page.fixed(said, digits)}${interval} ${unit}`];
     });
     return [
-      ...rows, ["slope", Number.isFinite(c.slope[i]) ? `${c.slope[i].toFixed(1)}°` : "none"], ["ground", classOf(i).name], ["split", splitOf(i).name],
+      ...rows, ["slope", Number.isFinite(c.slope[i]) ? `${page.fixed(c.slope[i], 1)}°` : "none"], ["ground", classOf(i).name], ["split", splitOf(i).name],
       ["where from", page.explain(c.id[i])],
     ];
   }
@@ -67,7 +67,7 @@ page.start(async () => {
       const errors = places.map((place) => off(shown[place], key)), { mean } = page;
       const kind = told.classes.map((one) => [one.name, places.filter((place) => c.class[shown[place]] === one.id).length]).filter(([, count]) => count);
       left.append(make("b", `${places.length} chosen`), pairs([
-        ["mean error", `${mean(errors).toFixed(digits)} ${unit}`], ["RMSE", `${Math.sqrt(mean(errors.map((e) => e * e))).toFixed(digits)} ${unit}`],
+        ["mean error", `${page.fixed(mean(errors), digits)} ${unit}`], ["RMSE", `${Math.sqrt(mean(errors.map((e) => e * e))).toFixed(digits)} ${unit}`],
         ["ground", kind.map((pair) => pair.join(" ")).join(", ")]]), make("p", "The worst of them:"));
     }
     left.append(pairs(inWords(i)));
@@ -82,7 +82,7 @@ page.start(async () => {
   if (told.patches) {
     page.gallery(told.patches, (i) => ({
       kind: classOf(i).name, split: splitOf(i).name,
-      words: `${classOf(i).name} ${c.slope[i].toFixed(1)}°, ${c.E[i].toFixed(0)} J, predicted ${c["E predicted"][i].toFixed(0)} J, ${splitOf(i).name}`,
+      words: `${classOf(i).name} ${page.fixed(c.slope[i], 1)}°, ${page.fixed(c.E[i], 0)} J, predicted ${page.fixed(c["E predicted"][i], 0)} J, ${splitOf(i).name}`,
     }), (i) => {
       at("split").value = "";
       draw();

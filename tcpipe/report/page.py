@@ -92,14 +92,13 @@ class Shaded:
 
 @dataclass(frozen=True, slots=True)
 class ShownFinding:
-    """A finding, or those of one code: what its code means, what was observed, and what helps, with the lines to copy."""
+    """The findings of one code: what it means, what was observed and when, and what helps, with the lines to copy."""
 
     severity: Severity
     code: str
     title: str
-    text: str
+    observed: Sequence[tuple[str, tuple[float, float] | None]]
     remedies: Sequence[tuple[str, Sequence[str]]]
-    span_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,13 +119,16 @@ def show_verdict(
     labels: Sequence[Affected] = AFFECTED,
 ) -> VerdictBox:
     """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` as `describe_group` takes them."""
-    shown = [
-        ShownFinding(of.severity, of.code, describe_title(of), describe_finding(of), list_remedies([of]), of.span_s)
-        for of in sort_findings(findings)
-    ]
+    by_code: dict[tuple[Severity, str], list[Finding]] = {}
+    for finding in sort_findings(findings):
+        by_code.setdefault((finding.severity, finding.code), []).append(finding)
+    shown = []
+    for (severity, code), of_code in by_code.items():
+        observed = [(describe_finding(of), of.span_s) for of in of_code]
+        shown.append(ShownFinding(severity, code, describe_title(of_code[0]), observed, list_remedies(of_code)))
     for group, total, noun in groups:
         title, text = describe_title(group.findings[0]), describe_group(group, total, noun)
-        shown.append(ShownFinding(group.severity, group.code, title, text, list_remedies(group.findings)))
+        shown.append(ShownFinding(group.severity, group.code, title, [(text, None)], list_remedies(group.findings)))
     problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
     return VerdictBox(
         grades=tuple((name, getattr(verdict, name)) for name in labels),

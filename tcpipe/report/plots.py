@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import clean_line
 from tcpipe.formats.json_files import Json
-from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
+from tcpipe.report.colours import CURSOR, DROPPED, FAINT, KEPT, SPLIT_COLOURS
 from tcpipe.tables.columns import to_floats
 
 _TEX = re.compile(r"\$\$|\\\(|\\\[")
@@ -167,6 +167,44 @@ def draw_waterfall(distance_by_reason_m: Mapping[str, float]) -> Plot:
     )
     plot.figure.x_range.start = 0
     plot.figure.xaxis.formatter.use_scientific = False
+    plot.figure.ygrid.visible = False
+    return plot
+
+
+def draw_ratios(
+    name: str, label: str, rows: Sequence[tuple[str, tuple[float | None, float | None, float | None]]]
+) -> Plot:
+    """Return ratios as points with their intervals (value, low, high) and a line at 1; at the top the first of ``rows``.
+
+    The colour says on which side of 1 the whole interval lies.
+    """
+    known = [(text, value, low, high) for text, (value, low, high) in rows if value is not None]
+    ends = [(value, value if low is None else low, value if high is None else high) for _, value, low, high in known]
+    is_open = [low is None or low <= 1.0 <= (high or 0.0) for _, _, low, high in known]
+    plot = make_plot(
+        name,
+        alt=f"{label}, a point with its 95 % interval for each; the table lists the same.",
+        axes=(label, ""),
+        legend={"below 1": KEPT, "open": FAINT, "above 1": DROPPED},
+        height_px=90 + 20 * len(known),
+        tools="save",
+        x_axis_type="log",
+        y_range=[text for text, *_ in known][::-1],
+        tooltips=[("", "@name"), ("ratio", "@value{0.00} (@low{0.00} to @high{0.00})")],
+    )
+    value, low, high = (list(column) for column in zip(*ends, strict=True)) if ends else ([], [], [])
+    source: Any = {
+        "name": [text for text, *_ in known],
+        "value": value,
+        "low": low,
+        "high": high,
+        "colour": [FAINT if at else KEPT if of[0] < 1.0 else DROPPED for of, at in zip(ends, is_open, strict=True)],
+    }
+    plot.figure.line([1.0, 1.0], [0, max(len(known), 1)], color=FAINT, line_dash="dashed", line_width=2)
+    lines = plot.figure.segment("low", "name", "high", "name", color="colour", line_width=3, source=source)
+    points = plot.figure.scatter("value", "name", size=9, color="colour", source=lines.data_source)
+    plot.figure.hover.renderers = [points]
+    plot.figure.xaxis.ticker.desired_num_ticks = 5
     plot.figure.ygrid.visible = False
     return plot
 

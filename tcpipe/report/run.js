@@ -232,7 +232,7 @@ page.start(async () => {
         pairs(why.length ? why.map(([, name, words]) => [name, words]) : [["why", bitsAt(t) === null
           ? "no measurements that can be fused" : "steady, but too curved, or shorter than a segment"]]));
     }
-    right.append(make("b", `${t.toFixed(2)} s`), pairs([["time", clock(t)], ...values(t)]));
+    right.append(make("b", `${t.toFixed(2)} s`), pairs([["time", clock(t)], ...(i >= 0 ? [] : values(t))]));
     at("chosen").replaceChildren(left, right);
   }
   const pick = (k) => choose((s.start[k] + s.end[k]) / 2);

@@ -1,11 +1,11 @@
 """Pages in Chromium as a person has them: wide and on a phone, by day and by night (``make test-pages``; skipped without its parts)."""
 
 import shutil
-from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 
 import pytest
+from browser_page import quiet_page
 from synthetic_store import add_run, add_world, driven, lanes, make_noise_facts, segments
 
 import tcpipe
@@ -16,13 +16,9 @@ from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
 from tcpipe.store import open_store
-from tcpipe.tables.findings import Subject, make_finding
+from tcpipe.tables.findings import Remedy, Subject, make_finding
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: make test-pages")
 axe = pytest.importorskip("axe_core_python.sync_playwright", reason="axe-core-python is not installed: make test-pages")
-CHROMIUM = shutil.which("chromium")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed: apt-get install chromium")
-
 LOOKS = [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")]
 
 PLACE = """([name, x, y]) => {
@@ -47,33 +43,6 @@ def dataset(tmp_path_factory):
         add_run(store, run, table, findings=[make_finding("no-command", Subject("role", "command"))])
     build_dataset(here / "dataset", store=store.root)
     return here / "dataset"
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
-@contextmanager
-def quiet_page(chromium, path, look):
-    """A page, drawn; at the end it must have asked for nothing and complained of nothing."""
-    width, scheme = look
-    context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
-    context.set_default_timeout(120_000)  # a busy machine is no fault of a page
-    tab, complaints, asked = context.new_page(), [], []
-    tab.on("console", lambda said: complaints.append(said.text) if said.type in {"error", "warning"} else None)
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.on("request", lambda sent: asked.append(sent.url) if not sent.url.startswith(("data:", "blob:")) else None)
-    url = path.as_uri()
-    tab.goto(url)
-    tab.wait_for_selector("html[data-ready]")
-    yield tab
-    assert complaints == []
-    assert asked == [url]
-    context.close()
 
 
 def until(tab, holds):
@@ -110,8 +79,9 @@ def judged(request, chromium, evaluation):
 
 def fits_and_can_be_read_by_everyone(tab):
     assert tab.evaluate("document.documentElement.scrollWidth") <= tab.viewport_size["width"]
-    found = axe.Axe().run(tab)["violations"]
-    assert [(of["id"], [node["html"][:120] for node in of["nodes"]][:3]) for of in found] == []
+    found = axe.Axe().run(tab)
+    assert "color-contrast" in {of["id"] for of in found["passes"]}
+    assert [(of["id"], [node["html"][:120] for node in of["nodes"]][:3]) for of in found["violations"]] == []
 
 
 def test_it_fits_and_can_be_read_by_everyone(opened):
@@ -393,6 +363,16 @@ def test_a_patch_that_is_not_inside_the_page_comes_from_the_folder_beside_it(chr
     tab.close()
 
 
+def list_findings():
+    """A warning from the twelfth to the fourteenth second, and one with a remedy."""
+    step = make_finding(
+        "clock-step", Subject("log", "clock"), span_s=(12.0, 14.0), names={"topics": "/imu"}, step_s=2.0, at_s=12.0
+    )
+    remedy = Remedy("keep", recipe={"mask": {"require_full_speed": False}})
+    speeds = {"slow_fraction": 0.7, "limit_mps": 0.95, "top_mps": 0.6}
+    return [step, make_finding("driven-below-limit", Subject("role", "command"), remedies=[remedy], **speeds)]
+
+
 @pytest.fixture(scope="module")
 def run_page(tmp_path_factory):
     here = tmp_path_factory.mktemp("driven")
@@ -400,7 +380,15 @@ def run_page(tmp_path_factory):
     add_world(store, here)
     start, end = lanes((0.0,), -12.0, 12.0)
     table = segments("driven", start, end, start_ns=10**18)
-    add_run(store, "driven", table, track=driven(table), tags={"site": "<b>\x1b[31m'\"&"}, facts=make_noise_facts())
+    add_run(
+        store,
+        "driven",
+        table,
+        track=driven(table),
+        tags={"site": "<b>\x1b[31m'\"&"},
+        facts=make_noise_facts(),
+        findings=list_findings(),
+    )
     return Path(report(store.runs()[0].where)[0].path)
 
 
@@ -461,6 +449,76 @@ def test_the_noise_of_sensors_is_drawn_and_says_how_much_the_data_tell(driving):
         driving.wait_for_timeout(50)
 
 
+MAP_COLOURS = """() => Object.fromEntries(["track", "segments", "findings"].map((name) => {
+  const { colour } = page.model(name).data_source.data;
+  return [name, [colour.length, [...new Set(colour)].sort()]];
+}))"""
+"""How many lines of the map there are, and their colours."""
+
+
+def test_the_map_of_a_run_is_coloured_by_what_is_chosen(driving):
+    use = driving.evaluate(MAP_COLOURS)
+    seen = {}
+    for key in ("severity", "sigma", "v", "w", "E"):
+        driving.select_option("#colour", key)
+        seen[key] = driving.evaluate(MAP_COLOURS)
+    assert use["segments"][0] == 24
+    assert len(seen["severity"]["segments"][1]) == 2  # the spans of one finding lie over some segments, not over others
+    for key, unit in (("sigma", "m"), ("v", "m/s"), ("w", "W")):
+        assert seen[key]["segments"][0] == 0  # the whole track has the colour, standing robots too
+        assert seen[key]["track"][0] > use["track"][0]
+        driving.select_option("#colour", key)
+        assert f" {unit}" in driving.locator("#scale").inner_text()
+    assert len(seen["w"]["track"][1]) >= 2
+    assert len(seen["E"]["segments"][1]) > 2
+    assert driving.evaluate("page.fixed(-0.04, 1)") == "0.0"
+
+
+def test_a_finding_of_a_run_is_shown_on_map_and_time_axis_and_its_remedy_is_copied(driving):
+    assert driving.evaluate(MAP_COLOURS)["findings"][0] > 0
+    assert "clock-step" in driving.evaluate("page.model('gates').y_range.factors")
+    driving.locator(".show").focus()
+    driving.keyboard.press("Enter")
+    start, end = driving.evaluate(RANGE.replace("NAME", "gates"))
+    assert start == pytest.approx(10.0)
+    assert end == pytest.approx(16.0)
+    assert driving.evaluate("page.model('cursor gates').location") == pytest.approx(12.0)
+    driving.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    driving.locator(".copy").focus()
+    driving.keyboard.press("Enter")
+    until(driving, "document.querySelector('.copy').textContent === 'Copied'")
+    assert driving.evaluate("navigator.clipboard.readText()") == "[mask]\nrequire_full_speed = false"
+
+
+def find_page(kind, request, dataset):
+    if kind == "store":
+        report(dataset.parent / "store")
+    return {
+        "run": lambda: request.getfixturevalue("run_page"),
+        "dataset": lambda: dataset / "report.html",
+        "evaluation": lambda: request.getfixturevalue("evaluation"),
+        "store": lambda: dataset.parent / "store/report.html",
+    }[kind]()
+
+
+FIRST_PLOT = """() => {
+  const boxes = [...document.querySelectorAll(".plot")].map((one) => one.getBoundingClientRect());
+  const { top, height } = boxes.sort((a, b) => a.top - b.top)[0];
+  return [top, (innerHeight - top) / height];
+}"""
+
+
+@pytest.mark.parametrize("kind", ["run", "dataset", "evaluation", "store"])
+def test_the_verdict_and_a_plot_stand_on_the_first_screen(request, chromium, dataset, kind):
+    with quiet_page(chromium, find_page(kind, request, dataset), (1400, "light")) as tab:
+        top, share = tab.evaluate(FIRST_PLOT)
+        assert 0 < top < 300
+        assert share >= 0.6
+        grades = tab.locator(".verdict .grades").bounding_box()
+        assert grades["y"] + grades["height"] < 300
+        assert tab.locator("main h2").count() <= 8
+
+
 ON_PAPER = """() => matchMedia("print").addEventListener("change", () => {
   const every = (selector) => [...document.querySelectorAll(selector)].filter((one) => one.checkVisibility());
   const missing = every("figure").filter((figure) => {
@@ -491,14 +549,7 @@ ON_PAPER = """() => matchMedia("print").addEventListener("change", () => {
 @pytest.mark.parametrize("look", [LOOKS[0], LOOKS[3]], ids=by_look)
 @pytest.mark.parametrize("kind", ["run", "dataset", "evaluation", "store"])
 def test_a_page_prints_whole_as_soon_as_it_answers(request, chromium, dataset, kind, look):
-    if kind == "store":
-        report(dataset.parent / "store")
-    path = {
-        "run": lambda: request.getfixturevalue("run_page"),
-        "dataset": lambda: dataset / "report.html",
-        "evaluation": lambda: request.getfixturevalue("evaluation"),
-        "store": lambda: dataset.parent / "store/report.html",
-    }[kind]()
+    path = find_page(kind, request, dataset)
     with quiet_page(chromium, path, look) as tab:
         tab.evaluate(ON_PAPER)
         tab.pdf()

@@ -270,7 +270,7 @@ class Content:
     covariates: tuple[Covariate, ...]
     exclusions: tuple[Exclusion, ...]
     excluded: pa.Table
-    """Id, list and reason of each excluded sample."""
+    """Each id of these lists with its reason and outcome."""
     removal: Removal
     findings: tuple[Finding, ...]
 
@@ -351,7 +351,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         registrations=[registrations for registrations, _ in registered],
         covariates=covariates,
         exclusions=excluded.lists,
-        excluded=excluded.table(take_rows(segments.select(["segment_id"]), sampled.kept).column(0)),
+        excluded=excluded.ids,
         removal=removal,
         findings=(
             *inputs.findings,

@@ -16,7 +16,7 @@ from pyproj import CRS
 
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.dataset_card import Exclusion, KeptSplit, SplitResult
-from tcpipe.formats.dataset_files import read_sample_ids
+from tcpipe.formats.dataset_files import EXCLUDED_IDS, IS_EXCLUDED, read_sample_ids
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.formats.parquet import take_rows
@@ -33,8 +33,6 @@ from tcpipe.terrain.target_grid import MapGrid
 
 _ROWS = 1 << 16
 """Rows whose ids are in memory together."""
-_NAMED_IDS = 3
-"""So many ids that match nothing are named in a finding."""
 _MARGIN_DEG = 0.05
 """Regions are cut this far around the samples (3 km or more below 60° latitude)."""
 
@@ -58,6 +56,8 @@ def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Seq
             f"--exclude: {len(paths)} lists of samples and {len([text for text in texts if text])} reasons; "
             "give each list its --reason TEXT, in the same order"
         )
+    if len({path.name for path in paths}) < len(paths):
+        raise UsageError("--exclude: two lists have one name, by which the dataset names them; rename one")
     return tuple(
         ExcludedIds(path.name, compute_checksum(path), text, tuple(read_sample_ids(path)))
         for path, text in zip(paths, texts, strict=True)
@@ -66,49 +66,39 @@ def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Seq
 
 @dataclass(frozen=True, slots=True)
 class ExcludedSamples:
-    """What lists exclude: the number of its list for each of N samples (-1: none), the lists for the card, and findings."""
+    """What lists exclude: which of N samples, the lists for the card, each id with list, reason and outcome, and findings."""
 
-    number: NDArray[np.int64]
+    mask: NDArray[np.bool_]
     lists: tuple[Exclusion, ...]
+    ids: pa.Table
     findings: tuple[Finding, ...]
-
-    @property
-    def mask(self) -> NDArray[np.bool_]:
-        """Which samples are excluded, shape (N,)."""
-        return self.number >= 0
-
-    def table(self, ids: pa.ChunkedArray) -> pa.Table:
-        """Return id, list and reason of the excluded ones of N samples, by id."""
-        found = self.number[self.mask]
-        columns = [[getattr(self.lists[number], name) for number in found] for name in ("name", "reason")]
-        table = pa.table([ids.filter(pa.array(self.mask)), *map(pa.array, columns)], ["sample_id", "list", "reason"])
-        return table.sort_by("sample_id")
 
 
 def find_excluded(
     lists: Sequence[ExcludedIds], segment_ids: pa.ChunkedArray, kept: NDArray[np.int64]
 ) -> ExcludedSamples:
     """Return which samples the lists exclude; ``kept`` are the rows of ``segment_ids`` that are samples, (N,)."""
-    number, told, findings = np.full(len(kept), -1), list[Exclusion](), list[Finding]()
-    for at, of in enumerate(lists):
-        ids = pa.array(of.ids, pa.string())
-        listed = pc.is_in(segment_ids, value_set=ids).to_numpy()[kept] & (number < 0)
-        number[listed] = at
-        told.append(Exclusion(of.name, of.checksum, of.reason, len(of.ids), int(listed.sum())))
-        missing = ids.filter(pc.invert(pc.is_in(ids, value_set=segment_ids.combine_chunks())))
-        if len(missing):
-            names = {"example": ", ".join(missing[:_NAMED_IDS].to_pylist())}
-            subject = Subject("file", of.name)
+    mask, told, tables, findings = np.zeros(len(kept), np.bool_), list[Exclusion](), [EXCLUDED_IDS.empty_table()], []
+    known = segment_ids.combine_chunks() if lists else None
+    sample = np.full(len(segment_ids), -1)
+    sample[kept] = np.arange(len(kept))
+    for of in lists:
+        row = pc.index_in(pa.array(of.ids), value_set=known).fill_null(-1).to_numpy()
+        rows = sample[row[row >= 0]]
+        rows = rows[rows >= 0]
+        told.append(Exclusion(of.name, of.checksum, of.reason, len(of.ids), int((~mask[rows]).sum())))
+        mask[rows] = True
+        outcome = np.select([row < 0, sample[row] < 0], ["no segment", "no sample"], IS_EXCLUDED)
+        texts = [[of.name] * len(row), [of.reason] * len(row), outcome.tolist()]
+        tables.append(pa.table([of.ids, *texts], schema=EXCLUDED_IDS))
+        if missing := int((row < 0).sum()):
+            names, subject = {"example": of.ids[int(np.argmin(row))]}, Subject("file", of.name)
             findings.append(
                 make_finding(
-                    "exclusion-unmatched",
-                    subject,
-                    names=names,
-                    unmatched_count=len(missing),
-                    listed_count=len(ids),
+                    "exclusion-unmatched", subject, names=names, unmatched_count=missing, listed_count=len(row)
                 )
             )
-    return ExcludedSamples(number, tuple(told), tuple(findings))
+    return ExcludedSamples(mask, tuple(told), pa.concat_tables(tables), tuple(findings))
 
 
 def draw_splits(

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tcpipe.report.colours import CLASS_COLOURS, DROPPED, KEPT, SPLIT_COLOURS
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, KEPT, SEVERITY_COLOURS, SPLIT_COLOURS
 
 SEEN = {
     "trichromat": np.eye(3),
@@ -32,8 +32,13 @@ def lab(rgb):
 @pytest.mark.parametrize("eyes", SEEN)
 @pytest.mark.parametrize(
     ("colours", "least"),
-    [(SPLIT_COLOURS.values(), 24.0), (CLASS_COLOURS, 13.0), ((KEPT, DROPPED), 24.0)],
-    ids=["splits", "classes", "kept"],
+    [
+        (SPLIT_COLOURS.values(), 24.0),
+        (CLASS_COLOURS, 13.0),
+        ((KEPT, DROPPED), 24.0),
+        ((KEPT, *SEVERITY_COLOURS.values()), 13.0),
+    ],
+    ids=["splits", "classes", "kept", "severities"],
 )
 def test_colours_differ_for_every_reader(eyes, colours, least):
     seen = [lab(SEEN[eyes] @ linear(colour)) for colour in colours]

@@ -1,5 +1,6 @@
 """Samples that a list excludes: gone and counted, while all others keep their split, also when runs are added later."""
 
+import csv
 import json
 import math
 
@@ -61,6 +62,10 @@ def samples(tmp_path):
     return pq.read_table(tmp_path / "out/samples.parquet")
 
 
+def outcomes(tmp_path):
+    return list(csv.DictReader((tmp_path / "out/excluded.csv").read_text().splitlines()))
+
+
 def choose(plain):
     """Three samples of different splits, of which one is in the buffer."""
     return [
@@ -118,7 +123,10 @@ def test_it_survives_new_runs(store, plain, tmp_path):
 def test_ids_that_match_nothing_are_named(store, plain, tmp_path):
     result = build(store, tmp_path, ids=[*choose(plain), "b-7", "gone-1"])
     (found,) = select_findings(result.findings, "exclusion-unmatched")
-    assert found.names["example"] == "b-7, gone-1"
+    assert found.names["example"] == "b-7"
+    rows = outcomes(tmp_path)
+    assert [row["outcome"] for row in rows] == [*["excluded"] * 3, *["no segment"] * 2]
+    assert [row["sample_id"] for row in rows[3:]] == ["b-7", "gone-1"]
     assert (found.numbers["unmatched_count"], found.numbers["listed_count"]) == (2, 5)
     assert found.severity == "warning"
 
@@ -150,6 +158,14 @@ def test_two_lists_have_two_reasons_and_a_sample_counts_once(store, plain, tmp_p
     lists = [tmp_path / "ids.csv", tmp_path / "more.txt"]
     card = build(store, tmp_path, ids=ids, exclude=lists, reason=["one", "two"]).card
     assert [(of.reason, of.listed, of.samples) for of in card.exclusions] == [("one", 3, 3), ("two", 2, 1)]
+
+
+def test_a_segment_that_is_no_sample_is_said_to_be_none(store, plain, tmp_path):
+    add_run(store, "far", segments("far", *lanes(np.array([500.0]), 0.0, 2.0), start_ns=4 * 10**18))
+    add(store, "c", 6.0, 3 * 10**18)
+    card = build(store, tmp_path, ids=["far-4000000000000000000", "c-3000000000000000000"]).card
+    assert [(of.listed, of.samples) for of in card.exclusions] == [(2, 1)]
+    assert [row["outcome"] for row in outcomes(tmp_path)] == ["no sample", "excluded"]
 
 
 def test_a_redacted_dataset_tells_the_count_alone(store, plain, tmp_path):

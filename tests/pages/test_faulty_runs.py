@@ -1,0 +1,43 @@
+"""Who sees the first screen of a faulty run's page finds the fault and its remedy, as the command line names them."""
+
+from pathlib import Path
+
+import pytest
+from browser_page import quiet_page
+from faulty_drives import CODES, write_logs
+
+from tcpipe.formats.finding_lines import describe_finding, describe_title, list_remedies
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.report import report
+from tcpipe.store import open_store
+from tcpipe.tables.findings import select_findings
+
+
+@pytest.fixture(scope="module")
+def runs(chromium, tmp_path_factory):  # without a browser nothing is ingested
+    here = tmp_path_factory.mktemp("faulty")
+    ingest(write_logs(here), store=here / "store")
+    report(here / "store")
+    return {run.run_id.rpartition("-")[0]: run for run in open_store(here / "store").runs()}
+
+
+def test_there_are_twenty_faults(runs):
+    assert runs.keys() == CODES.keys()
+    assert len(CODES) == 20
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_the_first_screen_names_the_fault_and_its_remedy(chromium, runs, name):
+    run = runs[name]
+    found = select_findings(run.manifest.info.report.findings, CODES[name])
+    remedies = list_remedies(found)
+    with quiet_page(chromium, Path(run.where) / "report.html", (1400, "light")) as tab:
+        line = tab.locator(".verdict li", has_text=f"[{CODES[name]}]")
+        box, said = line.bounding_box(), " ".join(line.inner_text().split())
+        assert 0.0 < box["y"] < box["y"] + box["height"] < 900.0
+        assert describe_title(found[0]) in said
+        assert all(" ".join(describe_finding(finding).split()) in said for finding in found)
+        assert remedies
+        for purpose, changes in remedies:
+            assert purpose in said
+            assert all(" ".join(change.split()) in said for change in changes)
