@@ -21,39 +21,39 @@ from tcpipe.motion.row_sections import (
     fit_slope,
     make_mask,
 )
-from tcpipe.recipe import MaskConfig
 
 
-def find_stuck(rows: MotionRows, config: MaskConfig) -> Mask:
+def find_stuck(rows: MotionRows, *, stationary_velocity_mps: float, wheel_velocity_above_mps: float) -> Mask:
     """Return rows where the wheels turn but the ground speed is that of standing; never where the wheels are unknown."""
-    turning_wheels = np.abs(np.nan_to_num(rows.wheel_velocity_mps)) > config.stuck_wheel_velocity_mps
-    return turning_wheels & (np.abs(rows.velocity_mps) < config.stationary_velocity_mps)
+    turning_wheels = np.abs(np.nan_to_num(rows.wheel_velocity_mps)) > wheel_velocity_above_mps
+    return turning_wheels & (np.abs(rows.velocity_mps) < stationary_velocity_mps)
 
 
-def find_stationary(rows: MotionRows, config: MaskConfig) -> Mask:
+def find_stationary(rows: MotionRows, *, below_velocity_mps: float, below_yaw_rate_radps: float) -> Mask:
     """Return rows that move less than both limits, and the slower row of a change of direction that skips them.
 
     At 20 Hz a quick change between forward and backward may jump over the band around zero; the robot stood for an instant all the same.
     """
-    v, piece, below_mps = rows.velocity_mps, rows.piece, config.stationary_velocity_mps
-    still = (np.abs(v) < below_mps) & (np.abs(rows.yaw_rate_radps) < config.stationary_yaw_rate_radps)
-    jumps = (v[:-1] * v[1:] < 0.0) & (np.minimum(np.abs(v[:-1]), np.abs(v[1:])) >= below_mps)
+    v, piece = rows.velocity_mps, rows.piece
+    still = (np.abs(v) < below_velocity_mps) & (np.abs(rows.yaw_rate_radps) < below_yaw_rate_radps)
+    jumps = (v[:-1] * v[1:] < 0.0) & (np.minimum(np.abs(v[:-1]), np.abs(v[1:])) >= below_velocity_mps)
     flips = np.flatnonzero(jumps & (piece[:-1] == piece[1:]))
     still[np.where(np.abs(v[flips]) <= np.abs(v[flips + 1]), flips, flips + 1)] = True
     return still
 
 
-def find_turning_in_place(rows: MotionRows, config: MaskConfig) -> Mask:
-    """Return rows that turn on the spot for some time, or turn tighter than the smallest radius at any speed."""
+def find_turning_in_place(
+    rows: MotionRows, *, below_velocity_mps: float, above_yaw_rate_radps: float, min_radius_m: float, min_s: float
+) -> Mask:
+    """Return rows that turn on the spot for at least ``min_s`` [s], or turn tighter than ``min_radius_m`` at any speed."""
     speed, turn = np.abs(rows.velocity_mps), np.abs(rows.yaw_rate_radps)
-    spot = (speed < config.turning_velocity_mps) & (turn > config.turning_yaw_rate_radps)
-    lasting = drop_short_runs(spot, rows.piece, min_rows=rows.count(config.min_event_s))
-    return lasting | (speed < config.min_turn_radius_m * turn)
+    spot = (speed < below_velocity_mps) & (turn > above_yaw_rate_radps)
+    return drop_short_runs(spot, rows.piece, min_rows=rows.count(min_s)) | (speed < min_radius_m * turn)
 
 
-def find_reversing(rows: MotionRows, config: MaskConfig) -> Mask:
+def find_reversing(rows: MotionRows, *, stationary_velocity_mps: float) -> Mask:
     """Return rows driven backwards faster than standing."""
-    return rows.velocity_mps < -config.stationary_velocity_mps
+    return rows.velocity_mps < -stationary_velocity_mps
 
 
 def estimate_forward_acceleration_mps2(rows: MotionRows, *, window_s: float) -> Floats:
@@ -62,39 +62,40 @@ def estimate_forward_acceleration_mps2(rows: MotionRows, *, window_s: float) -> 
     return fit_slope(rows.velocity_mps, rows.piece, half_window=half, period_s=rows.period_s)
 
 
-def find_accelerating(rows: MotionRows, acceleration_mps2: Floats, config: MaskConfig) -> Mask:
+def find_accelerating(
+    rows: MotionRows, acceleration_mps2: Floats, *, above_mps2: float, min_s: float, dilate_s: float
+) -> Mask:
     """Return rows of lasting acceleration or braking, widened on both sides: for logs without a command topic."""
-    changes, widening = np.abs(acceleration_mps2) > config.max_acceleration_mps2, rows.count(config.dilate_s)
-    lasts = drop_short_runs(changes, rows.piece, min_rows=rows.count(config.min_event_s))
-    return dilate_mask(lasts, rows.piece, before=widening, after=widening)
+    lasts = drop_short_runs(np.abs(acceleration_mps2) > above_mps2, rows.piece, min_rows=rows.count(min_s))
+    return dilate_mask(lasts, rows.piece, before=rows.count(dilate_s), after=rows.count(dilate_s))
 
 
-def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, config: MaskConfig) -> Mask:
+def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mps2: float, min_s: float) -> Mask:
     """Return the rows beside halted ones over which the speed still grows after, or already falls before, the halt.
 
-    A ramp ends where the speed changes by less than ``ramp_acceleration_mps2`` for ``min_event_s``. It is marked with and without
-    commands: a robot whose commands simply end (dead man's switch, emergency stop) coasts to a halt while its last command stands.
-    ``halted`` rows are stationary or turn in place.
+    A ramp ends where the speed changes by less than ``above_mps2`` for ``min_s`` [s]. It is marked with and without commands: a robot
+    whose commands simply end (dead man's switch, emergency stop) coasts to a halt while its last command stands. ``halted`` rows are
+    stationary or turn in place.
     """
-    speeding_up, above_mps2 = np.sign(rows.velocity_mps) * acceleration_mps2, config.ramp_acceleration_mps2
+    speeding_up = np.sign(rows.velocity_mps) * acceleration_mps2
     halts = np.concatenate(([0], np.cumsum(halted)))
     found = np.zeros(len(halted), dtype=np.bool_)
     for changes in (speeding_up > above_mps2, speeding_up < -above_mps2):
-        going_on = ~drop_short_runs(~(changes | halted), rows.piece, min_rows=rows.count(config.min_event_s))
+        going_on = ~drop_short_runs(~(changes | halted), rows.piece, min_rows=rows.count(min_s))
         spans = find_runs(going_on, rows.piece)
         found |= make_mask(spans[halts[spans[:, 1] + 1] > halts[spans[:, 0]]], len(halted))
     return found & ~halted
 
 
-def find_command_changes(rows: MotionRows, config: MaskConfig) -> Mask:
-    """Return rows from the first to the last moment of each commanded change of speed, and for ``command_settle_s`` after it.
+def find_command_changes(rows: MotionRows, *, step_mps: float, window_s: float, settle_s: float) -> Mask:
+    """Return rows from the first to the last moment of each commanded change of speed, and for ``settle_s`` [s] after it.
 
     The mean command over the window ahead of a row is compared with the mean over the window from it on: a step or a ramp of more than
-    ``command_step_mps`` within one window shows at full size. The jitter of a joystick averages out; twice what its scatter leaves in the
+    ``step_mps`` within one window shows at full size. The jitter of a joystick averages out; twice what its scatter leaves in the
     difference of both means is allowed for.
     """
     part, command = _select_known_command(rows)
-    window, step_mps = max(1, rows.count(config.command_window_s)), config.command_step_mps
+    window = max(1, rows.count(window_s))
     before = compute_window_mean(command, part, before=window, after=-1)
     after = compute_window_mean(command, part, before=0, after=window - 1)
     allowed = step_mps + 2.0 * _estimate_jitter(command, part, window)
@@ -102,7 +103,7 @@ def find_command_changes(rows: MotionRows, config: MaskConfig) -> Mask:
     changing = np.isfinite(rows.commanded_mps) & (np.abs(after - before) > allowed)
     _, high = find_piece_bounds(rows.piece)
     spans = [
-        (first + begin, min(first + end + rows.count(config.command_settle_s), high[first]))
+        (first + begin, min(first + end + rows.count(settle_s), high[first]))
         for first, last in find_runs(changing, part)
         for begin, end in [_find_moment(command[first : last + 1], before[first], after[last], step_mps=step_mps)]
     ]
@@ -131,30 +132,30 @@ def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_m
     return begin, max(begin, int(unreached[-1]) + 1 if len(unreached) else 0)
 
 
-def find_below_full_speed(rows: MotionRows, limit_mps: float, config: MaskConfig) -> Mask:
+def find_below_full_speed(rows: MotionRows, *, limit_mps: float, window_s: float) -> Mask:
     """Return rows commanded slower than the limit, by their own command and by the mean around them (a joystick jitters)."""
-    speed, settled = _average_command(rows, config)
+    part, command = _select_known_command(rows)
+    speed = np.abs(command)
+    half = rows.count(window_s / 2)
+    settled = compute_window_mean(speed, part, before=half, after=half)
     return np.isfinite(rows.commanded_mps) & (speed < limit_mps) & (settled < limit_mps)
 
 
-def find_top_command(rows: MotionRows, config: MaskConfig) -> tuple[float, float]:
+def find_top_command(
+    rows: MotionRows, *, moving_above_mps: float, share_of_top: float, window_s: float
+) -> tuple[float, float]:
     """Return the speed [m/s] that a moving run was commanded at most (but for a hundredth of the time), and the share of it held there.
 
-    A row is held at the top where the mean command around it is at full speed against it: a joystick jitters. 0, 0 without commands.
+    A row is held at the top where the mean command around it is at least ``share_of_top`` of it: a joystick jitters. 0, 0 without commands.
     """
-    settled = _average_command(rows, config)[1]
-    moving = np.isfinite(rows.commanded_mps) & (np.abs(rows.velocity_mps) > config.turning_velocity_mps)
+    part, command = _select_known_command(rows)
+    half = rows.count(window_s / 2)
+    settled = compute_window_mean(np.abs(command), part, before=half, after=half)
+    moving = np.isfinite(rows.commanded_mps) & (np.abs(rows.velocity_mps) > moving_above_mps)
     if not moving.any():
         return 0.0, 0.0
     top = float(np.quantile(settled[moving], 0.99))
-    return top, float(np.mean(settled[moving] >= config.full_speed_fraction * top))
-
-
-def _average_command(rows: MotionRows, config: MaskConfig) -> tuple[Floats, Floats]:
-    """Return the size of each row's command, and its mean over the window around it."""
-    part, command = _select_known_command(rows)
-    speed, half = np.abs(command), rows.count(config.command_window_s / 2)
-    return speed, compute_window_mean(speed, part, before=half, after=half)
+    return top, float(np.mean(settled[moving] >= share_of_top * top))
 
 
 def _select_known_command(rows: MotionRows) -> tuple[NDArray[np.int64], Floats]:

@@ -60,7 +60,9 @@ def mask_track(
     limit_mps = limit.limit_mps
     slowest = limit_mps and config.full_speed_fraction * limit_mps
     if slowest is not None and config.require_full_speed:
-        found[DropReason.BELOW_FULL_SPEED] = masks.find_below_full_speed(rows, slowest, config)
+        found[DropReason.BELOW_FULL_SPEED] = masks.find_below_full_speed(
+            rows, limit_mps=slowest, window_s=config.command_window_s
+        )
     dropped_by = np.bitwise_or.reduce([np.uint32(reason) * mask for reason, mask in found.items()])
     outside, window_findings = find_outside_windows(track, config.windows)
     dropped_by = np.where(outside, np.uint32(DropReason.TIME_WINDOW), dropped_by)
@@ -97,14 +99,27 @@ def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[M
 
 
 def _find_motion_reasons(rows: MotionRows, config: MaskConfig) -> dict[DropReason, Mask]:
-    stuck, standing, turning = (
-        find(rows, config) for find in (masks.find_stuck, masks.find_stationary, masks.find_turning_in_place)
+    stuck = masks.find_stuck(
+        rows,
+        stationary_velocity_mps=config.stationary_velocity_mps,
+        wheel_velocity_above_mps=config.stuck_wheel_velocity_mps,
     )
+    standing = masks.find_stationary(
+        rows, below_velocity_mps=config.stationary_velocity_mps, below_yaw_rate_radps=config.stationary_yaw_rate_radps
+    )
+    turning = masks.find_turning_in_place(
+        rows,
+        below_velocity_mps=config.turning_velocity_mps,
+        above_yaw_rate_radps=config.turning_yaw_rate_radps,
+        min_radius_m=config.min_turn_radius_m,
+        min_s=config.min_event_s,
+    )
+    back = masks.find_reversing(rows, stationary_velocity_mps=config.stationary_velocity_mps)
     return {
         DropReason.STATIONARY: standing & ~stuck,
         DropReason.STUCK: stuck,
         DropReason.TURNING_IN_PLACE: turning & ~standing & ~stuck,
-        DropReason.REVERSING: masks.find_reversing(rows, config) & (not config.keep_reversing),
+        DropReason.REVERSING: back & (not config.keep_reversing),
         DropReason.ACCELERATING: _find_accelerating(rows, standing | turning, config),
     }
 
@@ -112,8 +127,14 @@ def _find_motion_reasons(rows: MotionRows, config: MaskConfig) -> dict[DropReaso
 def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Mask:
     """Mark commanded changes where there are commands, lasting accelerations where there are none, and ramps beside halts."""
     slope = masks.estimate_forward_acceleration_mps2(rows, window_s=config.acceleration_window_s)
-    lasting = masks.find_accelerating(rows, slope, config) & np.isnan(rows.commanded_mps)
-    return masks.find_command_changes(rows, config) | lasting | masks.find_ramps(rows, slope, halted, config)
+    lasting = masks.find_accelerating(
+        rows, slope, above_mps2=config.max_acceleration_mps2, min_s=config.min_event_s, dilate_s=config.dilate_s
+    )
+    changed = masks.find_command_changes(
+        rows, step_mps=config.command_step_mps, window_s=config.command_window_s, settle_s=config.command_settle_s
+    )
+    beside = masks.find_ramps(rows, slope, halted, above_mps2=config.ramp_acceleration_mps2, min_s=config.min_event_s)
+    return changed | (lasting & np.isnan(rows.commanded_mps)) | beside
 
 
 _MOST = 0.5
@@ -136,7 +157,12 @@ class SpeedLimit:
 
 def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
     """Return the limit of a run, of a robot whose profile says ``max_velocity_mps`` [m/s]; the recipe's goes first."""
-    top, held = masks.find_top_command(rows, config)
+    top, held = masks.find_top_command(
+        rows,
+        moving_above_mps=config.turning_velocity_mps,
+        share_of_top=config.full_speed_fraction,
+        window_s=config.command_window_s,
+    )
     if config.max_velocity_mps is not None or max_velocity_mps is None or not config.require_full_speed:
         return SpeedLimit(config.max_velocity_mps or max_velocity_mps, top, held)
     if held <= _MOST or top >= config.full_speed_fraction * max_velocity_mps:

@@ -7,7 +7,6 @@ import pytest
 
 from tcpipe.motion import masks
 from tcpipe.motion.row_sections import MotionRows, fit_slope
-from tcpipe.recipe import MaskConfig
 
 PERIOD = 0.05
 
@@ -25,40 +24,38 @@ def seconds(mask):
 
 
 def test_standing_needs_both_limits():
-    limits = {"stationary_velocity_mps": 0.05, "stationary_yaw_rate_radps": 0.05}
-    assert masks.find_stationary(rows([0.04] * 3), MaskConfig(**limits)).all()
-    assert not masks.find_stationary(rows([0.04] * 3, yaw_rate=0.06), MaskConfig(**limits)).any()
-    assert not masks.find_stationary(rows([0.06] * 3), MaskConfig(**limits)).any()
+    limits = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
+    assert masks.find_stationary(rows([0.04] * 3), **limits).all()
+    assert not masks.find_stationary(rows([0.04] * 3, yaw_rate=0.06), **limits).any()
+    assert not masks.find_stationary(rows([0.06] * 3), **limits).any()
 
 
 def test_a_change_of_direction_stands_for_an_instant():
-    got = masks.find_stationary(
-        rows([0.6, 0.3, -0.2, -0.6]), MaskConfig(stationary_velocity_mps=0.05, stationary_yaw_rate_radps=0.05)
-    )
+    got = masks.find_stationary(rows([0.6, 0.3, -0.2, -0.6]), below_velocity_mps=0.05, below_yaw_rate_radps=0.05)
     assert got.tolist() == [False, False, True, False]
 
 
 def test_stuck_is_wheels_without_ground():
-    limits = {"stationary_velocity_mps": 0.05, "stuck_wheel_velocity_mps": 0.2}
-    assert masks.find_stuck(rows([0.01] * 4, wheel=0.5), MaskConfig(**limits)).all()
-    assert not masks.find_stuck(rows([0.3] * 4, wheel=0.5), MaskConfig(**limits)).any()
-    assert not masks.find_stuck(rows([0.01] * 4), MaskConfig(**limits)).any()
+    limits = {"stationary_velocity_mps": 0.05, "wheel_velocity_above_mps": 0.2}
+    assert masks.find_stuck(rows([0.01] * 4, wheel=0.5), **limits).all()
+    assert not masks.find_stuck(rows([0.3] * 4, wheel=0.5), **limits).any()
+    assert not masks.find_stuck(rows([0.01] * 4), **limits).any()
 
 
-TURNING = {"turning_velocity_mps": 0.1, "turning_yaw_rate_radps": 0.1, "min_turn_radius_m": 0.5, "min_event_s": 0.2}
+TURNING = {"below_velocity_mps": 0.1, "above_yaw_rate_radps": 0.1, "min_radius_m": 0.5, "min_s": 0.2}
 
 
 def test_turning_on_the_spot_must_last():
     yaw = np.zeros(20)
     yaw[2:5] = 0.15  # 0.15 s
     yaw[10:14] = 0.15  # 0.20 s
-    got = masks.find_turning_in_place(rows(np.full(20, 0.09), yaw_rate=yaw), MaskConfig(**TURNING))
+    got = masks.find_turning_in_place(rows(np.full(20, 0.09), yaw_rate=yaw), **TURNING)
     assert np.flatnonzero(got).tolist() == [10, 11, 12, 13]
 
 
 @pytest.mark.parametrize(("radius_m", "turning"), [(0.45, True), (0.55, False)])
 def test_turning_tighter_than_the_radius_at_any_speed(radius_m, turning):
-    got = masks.find_turning_in_place(rows([0.9], yaw_rate=-0.9 / radius_m), MaskConfig(**TURNING))
+    got = masks.find_turning_in_place(rows([0.9], yaw_rate=-0.9 / radius_m), **TURNING)
     assert got.tolist() == [turning]
 
 
@@ -66,11 +63,7 @@ def test_acceleration_is_the_slope_of_a_noisy_velocity():
     t = np.arange(0, 20, PERIOD)
     v = np.where(t < 10, 0.5, np.minimum(0.5 + 0.5 * (t - 10), 1.0)) + np.random.default_rng(0).normal(0, 0.01, len(t))
     acceleration = masks.estimate_forward_acceleration_mps2(rows(v), window_s=0.45)
-    got = seconds(
-        masks.find_accelerating(
-            rows(v), acceleration, MaskConfig(max_acceleration_mps2=0.3, min_event_s=0.2, dilate_s=0.25)
-        )
-    )
+    got = seconds(masks.find_accelerating(rows(v), acceleration, above_mps2=0.3, min_s=0.2, dilate_s=0.25))
     assert got.min() == pytest.approx(10 - 0.25, abs=0.15)
     assert got.max() == pytest.approx(11 + 0.25, abs=0.15)
     assert len(got) * PERIOD == pytest.approx(1.5, abs=0.3)
@@ -79,9 +72,7 @@ def test_acceleration_is_the_slope_of_a_noisy_velocity():
 def test_noise_alone_is_no_acceleration():
     v = 0.9 + np.random.default_rng(1).normal(0, 0.02, 10_000)
     acceleration = masks.estimate_forward_acceleration_mps2(rows(v), window_s=0.45)
-    assert not masks.find_accelerating(
-        rows(v), acceleration, MaskConfig(max_acceleration_mps2=0.3, min_event_s=0.2, dilate_s=0.25)
-    ).any()
+    assert not masks.find_accelerating(rows(v), acceleration, above_mps2=0.3, min_s=0.2, dilate_s=0.25).any()
 
 
 def test_ramps_beside_a_halt_end_where_the_speed_settles():
@@ -90,10 +81,7 @@ def test_ramps_beside_a_halt_end_where_the_speed_settles():
     made = rows(v)
     halted = v < 0.05
     got = masks.find_ramps(
-        made,
-        masks.estimate_forward_acceleration_mps2(made, window_s=0.45),
-        halted,
-        MaskConfig(ramp_acceleration_mps2=0.1, min_event_s=0.2),
+        made, masks.estimate_forward_acceleration_mps2(made, window_s=0.45), halted, above_mps2=0.1, min_s=0.2
     )
     found = seconds(got)
     start, stop = found[found < 15], found[found > 15]
@@ -106,20 +94,16 @@ def test_a_slowdown_far_from_any_halt_is_no_ramp():
     v = 0.9 - 0.4 * np.exp(-(((t - 10) / 1.5) ** 2))
     made = rows(v)
     acceleration = masks.estimate_forward_acceleration_mps2(made, window_s=0.45)
-    assert not masks.find_ramps(
-        made, acceleration, np.zeros(len(t), dtype=bool), MaskConfig(ramp_acceleration_mps2=0.1, min_event_s=0.2)
-    ).any()
+    assert not masks.find_ramps(made, acceleration, np.zeros(len(t), dtype=bool), above_mps2=0.1, min_s=0.2).any()
 
 
-CHANGE = {"command_step_mps": 0.1, "command_window_s": 0.5, "command_settle_s": 2.0}
+CHANGE = {"step_mps": 0.1, "window_s": 0.5, "settle_s": 2.0}
 
 
 @pytest.mark.parametrize("step", [-1.0, -0.5, 0.12, 0.5, 1.0])
 def test_a_commanded_step_is_dropped_from_its_moment_for_two_seconds(step):
     t = np.arange(0, 20, PERIOD)
-    got = seconds(
-        masks.find_command_changes(rows(0 * t, commanded=np.where(t < 10, 1.0, 1.0 + step)), MaskConfig(**CHANGE))
-    )
+    got = seconds(masks.find_command_changes(rows(0 * t, commanded=np.where(t < 10, 1.0, 1.0 + step)), **CHANGE))
     assert got.min() == pytest.approx(10, abs=1e-9)
     assert got.max() == pytest.approx(12, abs=1e-9)
     assert len(got) == 41
@@ -127,7 +111,7 @@ def test_a_commanded_step_is_dropped_from_its_moment_for_two_seconds(step):
 
 def test_a_commanded_ramp_is_dropped_until_two_seconds_after_its_end():
     t = np.arange(0, 20, PERIOD)
-    got = seconds(masks.find_command_changes(rows(0 * t, commanded=np.clip(0.5 * (t - 5), 0, 1)), MaskConfig(**CHANGE)))
+    got = seconds(masks.find_command_changes(rows(0 * t, commanded=np.clip(0.5 * (t - 5), 0, 1)), **CHANGE))
     assert got.min() == pytest.approx(5.2, abs=0.15)
     assert got.max() == pytest.approx(7 + 2, abs=0.25)
 
@@ -138,77 +122,70 @@ def test_a_slow_ramp_and_the_jitter_of_a_joystick_are_no_change():
     jitter = 0.95 + np.random.default_rng(0).uniform(-0.1, 0.1, len(t))
     alternating = np.where(np.arange(len(t)) % 2, 0.8, 1.0)
     for commanded in (slow, jitter, alternating):
-        assert not masks.find_command_changes(rows(0 * t, commanded=commanded), MaskConfig(**CHANGE)).any()
+        assert not masks.find_command_changes(rows(0 * t, commanded=commanded), **CHANGE).any()
 
 
 def test_two_changes_are_both_found_and_an_unknown_command_is_none():
     t = np.arange(0, 20, PERIOD)
     commanded = np.where(t < 5, 0.0, np.where(t < 6, 1.0, 0.0))
-    got = seconds(masks.find_command_changes(rows(0 * t, commanded=commanded), MaskConfig(**CHANGE)))
+    got = seconds(masks.find_command_changes(rows(0 * t, commanded=commanded), **CHANGE))
     assert (got.min(), got.max()) == (pytest.approx(5), pytest.approx(8))
     commanded = np.where(t < 10, np.nan, 1.0)
-    assert not masks.find_command_changes(rows(0 * t, commanded=commanded), MaskConfig(**CHANGE)).any()
+    assert not masks.find_command_changes(rows(0 * t, commanded=commanded), **CHANGE).any()
 
 
 def test_below_limit_follows_the_command_not_its_jitter():
     t = np.arange(0, 20, PERIOD)
     commanded = np.where(t < 10, 1.0, 0.8)
     commanded[::7] -= 0.06  # jitter: 0.94 now and then
-    got = seconds(masks.find_below_full_speed(rows(0 * t, commanded=commanded), 0.95, MaskConfig(command_window_s=0.5)))
+    got = seconds(masks.find_below_full_speed(rows(0 * t, commanded=commanded), limit_mps=0.95, window_s=0.5))
     assert got.min() == pytest.approx(10, abs=0.05)
     assert len(got) == pytest.approx(200, abs=1)
-    assert not masks.find_below_full_speed(rows(0 * t), 0.95, MaskConfig(command_window_s=0.5)).any()
+    assert not masks.find_below_full_speed(rows(0 * t), limit_mps=0.95, window_s=0.5).any()
 
 
 def test_reversing_at_full_speed_is_not_below_the_limit():
-    assert not masks.find_below_full_speed(
-        rows([-1.0] * 20, commanded=-1.0), 0.95, MaskConfig(command_window_s=0.5)
-    ).any()
-    assert masks.find_reversing(rows([-0.06, -0.04, 0.3]), MaskConfig(stationary_velocity_mps=0.05)).tolist() == [
+    assert not masks.find_below_full_speed(rows([-1.0] * 20, commanded=-1.0), limit_mps=0.95, window_s=0.5).any()
+    assert masks.find_reversing(rows([-0.06, -0.04, 0.3]), stationary_velocity_mps=0.05).tolist() == [
         True,
         False,
         False,
     ]
 
 
-STANDING = {"stationary_velocity_mps": 0.05, "stationary_yaw_rate_radps": 0.05}
+STANDING = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
 
 
 def test_a_limit_itself_is_not_below_nor_above_it():
     assert not masks.find_stuck(
-        rows([0.05], wheel=0.5), MaskConfig(stationary_velocity_mps=0.05, stuck_wheel_velocity_mps=0.2)
+        rows([0.05], wheel=0.5), stationary_velocity_mps=0.05, wheel_velocity_above_mps=0.2
     ).any()
     assert not masks.find_stuck(
-        rows([0.01], wheel=0.2), MaskConfig(stationary_velocity_mps=0.05, stuck_wheel_velocity_mps=0.2)
+        rows([0.01], wheel=0.2), stationary_velocity_mps=0.05, wheel_velocity_above_mps=0.2
     ).any()
-    assert not masks.find_stationary(rows([0.05]), MaskConfig(**STANDING)).any()
-    assert not masks.find_stationary(rows([0.0], yaw_rate=0.05), MaskConfig(**STANDING)).any()
-    assert not masks.find_turning_in_place(rows([0.1] * 9, yaw_rate=0.15), MaskConfig(**TURNING)).any()
-    assert not masks.find_turning_in_place(rows([0.06] * 9, yaw_rate=0.1), MaskConfig(**TURNING)).any()
-    assert not masks.find_turning_in_place(rows([0.5] * 9, yaw_rate=1.0), MaskConfig(**TURNING)).any()
-    assert not masks.find_reversing(rows([-0.05]), MaskConfig(stationary_velocity_mps=0.05)).any()
+    assert not masks.find_stationary(rows([0.05]), **STANDING).any()
+    assert not masks.find_stationary(rows([0.0], yaw_rate=0.05), **STANDING).any()
+    assert not masks.find_turning_in_place(rows([0.1] * 9, yaw_rate=0.15), **TURNING).any()
+    assert not masks.find_turning_in_place(rows([0.06] * 9, yaw_rate=0.1), **TURNING).any()
+    assert not masks.find_turning_in_place(rows([0.5] * 9, yaw_rate=1.0), **TURNING).any()
+    assert not masks.find_reversing(rows([-0.05]), stationary_velocity_mps=0.05).any()
     acceleration = np.full(9, 0.25)
-    assert not masks.find_accelerating(
-        rows([0.5] * 9), acceleration, MaskConfig(max_acceleration_mps2=0.25, min_event_s=0.2, dilate_s=0.0)
-    ).any()
-    assert not masks.find_below_full_speed(rows([0.0] * 9, commanded=0.5), 0.5, MaskConfig(command_window_s=0.1)).any()
+    assert not masks.find_accelerating(rows([0.5] * 9), acceleration, above_mps2=0.25, min_s=0.2, dilate_s=0.0).any()
+    assert not masks.find_below_full_speed(rows([0.0] * 9, commanded=0.5), limit_mps=0.5, window_s=0.1).any()
     mean_is_the_limit = rows([0.0] * 3, commanded=[0.75, 0.25, 0.5])
-    assert not masks.find_below_full_speed(mean_is_the_limit, 0.5, MaskConfig(command_window_s=0.1)).any()
+    assert not masks.find_below_full_speed(mean_is_the_limit, limit_mps=0.5, window_s=0.1).any()
 
 
 def test_a_fast_turn_of_a_wide_arc_is_driving():
-    assert not masks.find_turning_in_place(rows([0.9] * 9, yaw_rate=0.15), MaskConfig(**TURNING)).any()
+    assert not masks.find_turning_in_place(rows([0.9] * 9, yaw_rate=0.15), **TURNING).any()
 
 
 def test_which_row_of_a_change_of_direction_stands():
-    assert masks.find_stationary(rows([0.2, -0.3]), MaskConfig(**STANDING)).tolist() == [True, False]
-    assert masks.find_stationary(rows([0.05, -0.05]), MaskConfig(**STANDING)).tolist() == [
-        True,
-        False,
-    ]  # of two as slow, the first
-    assert not masks.find_stationary(rows([0.04, -0.3], yaw_rate=1.0), MaskConfig(**STANDING)).any()
+    assert masks.find_stationary(rows([0.2, -0.3]), **STANDING).tolist() == [True, False]
+    assert masks.find_stationary(rows([0.05, -0.05]), **STANDING).tolist() == [True, False]  # of two as slow, the first
+    assert not masks.find_stationary(rows([0.04, -0.3], yaw_rate=1.0), **STANDING).any()
     apart = replace(rows([0.2, -0.3]), piece=np.array([0, 1]))
-    assert not masks.find_stationary(apart, MaskConfig(**STANDING)).any()
+    assert not masks.find_stationary(apart, **STANDING).any()
 
 
 @pytest.mark.parametrize(("window_s", "half"), [(0.05, 1), (0.40, 4), (0.45, 4), (0.50, 4)])
@@ -221,9 +198,7 @@ def test_the_slope_is_over_the_window_that_is_asked_for(window_s, half):
 def ramp_rows(acceleration, halted):
     acceleration = np.array(acceleration, dtype=float)
     halted = np.isin(np.arange(len(acceleration)), halted)
-    got = masks.find_ramps(
-        rows([0.5] * len(acceleration)), acceleration, halted, MaskConfig(ramp_acceleration_mps2=0.25, min_event_s=0.1)
-    )
+    got = masks.find_ramps(rows([0.5] * len(acceleration)), acceleration, halted, above_mps2=0.25, min_s=0.1)
     return np.flatnonzero(got).tolist()
 
 
@@ -238,9 +213,7 @@ def test_a_ramp_begins_at_a_halt_of_one_row_on_either_side():
 def changed(commanded, *, window_s=0.5, piece=None):
     made = rows(np.zeros(len(commanded)), commanded=commanded)
     made = made if piece is None else replace(made, piece=np.array(piece))
-    found = masks.find_command_changes(
-        made, MaskConfig(command_step_mps=0.1, command_window_s=window_s, command_settle_s=0.0)
-    )
+    found = masks.find_command_changes(made, step_mps=0.1, window_s=window_s, settle_s=0.0)
     return np.flatnonzero(found).tolist()
 
 
@@ -280,6 +253,4 @@ def test_the_moment_of_a_change():
 def test_a_short_dip_does_not_bring_the_mean_below_the_limit():
     commanded = np.ones(25)
     commanded[10:15] = 0.5  # over eleven rows the mean is 0.77, over seven 0.64
-    assert not masks.find_below_full_speed(
-        rows(0 * commanded, commanded=commanded), 0.75, MaskConfig(command_window_s=0.5)
-    ).any()
+    assert not masks.find_below_full_speed(rows(0 * commanded, commanded=commanded), limit_mps=0.75, window_s=0.5).any()
