@@ -203,7 +203,9 @@ CASES = (
     Case("cost-map", command("cost-map", MODEL, "costs", "--cell-size", "4", *STORE, "--quiet"), wants=_MODEL),
     Case(
         "predict-path",
-        command("predict-path", MODEL, "--path", f"{INPUTS}/path.geojson", "--out", "pieces.csv", *STORE, "--quiet"),
+        command(
+            "predict-path", MODEL, "--path", f"{INPUTS}/path.geojson", "--out", "path-segments.csv", *STORE, "--quiet"
+        ),
         wants=_MODEL,
     ),
     Case(

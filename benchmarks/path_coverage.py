@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, format_adaptations
+from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, format_adaptations, predict
 from tcpipe.cost.coverage import measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.learning.fitting import FitConfig
@@ -29,7 +29,7 @@ from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
-from tcpipe.planning.drives import collect_run
+from tcpipe.planning.drives import collect_runs
 from tcpipe.planning.path_files import RISK, choose_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
@@ -70,8 +70,8 @@ def measure(here: Path, seed: int, *, given: argparse.Namespace) -> tuple[Model,
     model = load_model(here / "model")
     further = drive(here / "further" / "site", given.further, given.metres, payload_kg=given.payload, seed=seed + 1000)
     store = store_of(here / "further", further)
-    source = choose_map(store, None)
-    return model, [collect_run(model, source, run) for run in open_store(store).runs()]
+    source, opened = choose_map(store, None), open_store(store)
+    return model, collect_runs(model, source, opened, [run.run_id for run in opened.runs()])
 
 
 Found = list[tuple[dict[str, Errors], Run]]
@@ -91,11 +91,8 @@ def coverage_line(quantity: str, length: int, found: Found) -> str:
     """Return how many paths of a length are inside their interval, and how wide that is."""
     inside, names, widths = [], [], []
     for name, errors, of in list_paths(found, quantity, length):
-        alone, total = (
-            errors.compute_intervals(of.predicted, of.class_id),
-            errors.compute_sum(of.predicted, of.class_id),
-        )
-        low, high = (float(end[0]) for end in alone) if length == 1 else total.interval
+        said = predict(errors, of)
+        low, high = (float(said.low[0]), float(said.high[0])) if length == 1 else said.total.interval
         inside.append(low <= float(of.measured.sum()) <= high)
         names.append(name)
         widths.append((high - low) / 2.0 / float(np.abs(of.predicted).sum()))
@@ -113,9 +110,8 @@ def budget_line(found: Found, length: int = 30) -> str:
     """Return for how many ways there and back of a drive a budget suffices that `plan-path --budget --return` calls enough at 95 %."""
     is_enough, names = [], []
     for name, errors, of in list_paths(found, "energy", 2 * length):
-        sums = [
-            errors.compute_sum(of.predicted[way], of.class_id[way]) for way in (slice(0, length), slice(length, None))
-        ]
+        at = np.arange(2 * length)
+        sums = [predict(errors, of.take(way)).total for way in (at < length, at >= length)]
         is_enough.append(float(of.measured.sum()) <= (sums[0] + sums[1]).compute_quantile(RISK))
         names.append(name)
     if not is_enough:

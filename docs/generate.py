@@ -22,7 +22,7 @@ from tcpipe.cli.site_commands import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
-from tcpipe.planning.path_cost import PIECES
+from tcpipe.planning.path_cost import PATH_SEGMENTS
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import Entry, read_catalogue, read_sections
 from tcpipe.tables.levels import (
@@ -151,7 +151,7 @@ def _columns() -> str:
     common = [column for column in streams[0].columns if all(column in stream.columns for stream in streams)]
     parts.append(f"## Every stream (L1)\n\nEach of the streams below has these columns too.\n{_column_rows(common)}")
     own = [replace(stream, columns=tuple(c for c in stream.columns if c not in common)) for stream in streams]
-    tables = (*own, MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
+    tables = (*own, MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PATH_SEGMENTS)
     parts += [_table(table, tables[:number]) for number, table in enumerate(tables)]
     return "\n".join(parts)
 

@@ -23,7 +23,7 @@ from tcpipe.pipeline.dataset.build import BuildResult
 from tcpipe.pipeline.ingest import IngestSummary
 from tcpipe.pipeline.maps import AddedMap
 from tcpipe.planning.drives import DrivesResult
-from tcpipe.planning.path_cost import PIECES
+from tcpipe.planning.path_cost import PATH_SEGMENTS
 from tcpipe.planning.path_files import PathResult, PlanResult
 from tcpipe.tables.levels import LABELLED_SEGMENTS, MASKED_TRACK, REJECTIONS, SAMPLES, STREAMS
 from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_COLUMNS, EARLIER_KEYS
@@ -32,7 +32,7 @@ FILE = Path(__file__).parent / "reference" / "stable.json"
 _RESULTS = (
     AddedMap, BuildResult, Dataset, DrivesResult, EvaluationResult, IngestSummary, Log, PathResult, PlanResult, Split, TrainResult,
 )  # fmt: skip
-_TABLES = (*STREAMS.values(), MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
+_TABLES = (*STREAMS.values(), MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PATH_SEGMENTS)
 _LOST = (
     "version 1.x keeps every name in docs/reference/stable.json, and these are gone:\n{names}\nKeep each of them, as a hidden alias if it "
     "is renamed. A removal belongs into the next major version: delete the file, run 'make docs' and state it in the changelog."

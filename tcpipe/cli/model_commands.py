@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, RenamedOption, add_options, jobs_option, json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, add_options, jobs_option, json_option, quiet_option
 from tcpipe.cli.output import print_json, print_lines, print_result, show_progress
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions, RouteGraphOptions
@@ -78,10 +78,6 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 )
 @jobs_option("Logs read")
 @click.option(
-    "--hidden-variance", cls=RenamedOption, earlier="--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
-    help="Factor on the variance of the rolling resistance that no input shows (1: the default site).",
-)  # fmt: skip
-@click.option(
     "--baselines/--no-baselines", default=True,
     help="Train networks of each class alone, with all layers and as Wei and Isler, which take most of the time.",
 )  # fmt: skip
@@ -94,7 +90,6 @@ def reproduce(
     quick: bool,
     seeds: int,
     jobs: int,
-    hidden_variance: float,
     baselines: bool,
     as_json: bool,
     quiet: bool,
@@ -108,14 +103,7 @@ def reproduce(
     from tcpipe.experiment.reproduction import reproduce as run
 
     with show_progress("reproduce", quiet=quiet):
-        result = run(
-            directory,
-            size="quick" if quick else size,
-            seeds=seeds,
-            jobs=jobs,
-            hidden_variance=hidden_variance,
-            baselines=baselines,
-        )
+        result = run(directory, size="quick" if quick else size, seeds=seeds, jobs=jobs, baselines=baselines)
     print_result(result, as_json=as_json)
 
 

@@ -53,9 +53,6 @@ _BLOCK, _FEWEST_BLOCKS = 20, 20  # consecutive segments that may err alike, and 
 _MOST_ROWS = 20_000  # that are fitted, evenly taken of more: coefficients are sure to a few per mille by then
 
 _FOLDS = 5  # contiguous: neighbours of a held-out metre are held out, too
-_DRAWN_TOGETHER = 10  # consecutive segments
-_DRAWS = 2000
-_SEED = 20260101
 _LEAST_JPM = 10.0  # a percentage of less says nothing, as in `tcpipe.learning.metrics`
 
 _ALWAYS = ("idle", "drivetrain")  # are paid on any grade, and never given back
@@ -295,14 +292,6 @@ def _estimate_covariance(
     return out
 
 
-@dataclass(frozen=True, slots=True)
-class _HeldOut:
-    """Energy per metre [J/m], and its prediction by fits on the other folds, shape (M,)."""
-
-    true: Floats
-    predicted: Floats
-
-
 def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> PhysicsFit | None:
     """Fit the segments of one robot, in the order of driving; None without a plausible fit.
 
@@ -316,8 +305,6 @@ def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> 
     kinds = list(dict.fromkeys(term for term, _ in found.terms))
     whole = float(np.nansum(known.power_watt / known.velocity_mps))
     share = {kind: float(np.nansum(parts[:, [term == kind for term, _ in found.terms]])) / whole for kind in kinds}
-    scored = _predict_held_out(known, idle_watt, turning=True)
-    without = _predict_held_out(known, idle_watt, turning=False) if "turning" in kinds else None
     return PhysicsFit(
         segments=found.segments,
         terms=tuple(
@@ -332,10 +319,8 @@ def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> 
         recovered_downhill=found.recovered,
         residual_watt=found.residual_watt,
         energy_share=share,
-        held_out=None if scored is None else _score(scored),
-        without_turning=None if without is None else _score(without),
+        held_out=_score_held_out(known, idle_watt),
         mean_turn_radpm=_compute_mean_turn(known),
-        gain_of_turning=_compare_held_out(scored, without),
     )
 
 
@@ -345,44 +330,27 @@ def _compute_mean_turn(metres: FitSamples) -> float:
     return float(turned[np.isfinite(turned)].mean()) if np.isfinite(turned).any() else 0.0
 
 
-def _predict_held_out(metres: FitSamples, idle_watt: float | None, *, turning: bool) -> _HeldOut | None:
-    """Return energies of every fifth of the drive by a fit on the others; None with too few segments to fit."""
+def _score_held_out(metres: FitSamples, idle_watt: float | None) -> PhysicsScore | None:
+    """Return the score of energies of every fifth of the drive by a fit on the others; None with too few segments to fit."""
     count = len(metres.power_watt)
     fold = np.arange(count) * _FOLDS // max(count, 1)
-    predicted = np.full(count, np.nan)
+    predicted, true = np.full(count, np.nan), metres.power_watt / metres.velocity_mps
     for number in range(_FOLDS):
         mine = fold == number
-        found = fit_physics(metres.take(~mine), idle_watt=idle_watt, turning=turning)
+        found = fit_physics(metres.take(~mine), idle_watt=idle_watt)
         if found is None or mine.sum() < FEWEST // _FOLDS:
             return None
         here = metres.take(mine)
         predicted[mine] = found.power_watt(here) / here.velocity_mps
-    true = metres.power_watt / metres.velocity_mps
     known = np.isfinite(true + predicted)
-    return _HeldOut(true[known], predicted[known])
+    return score_energies(true[known], predicted[known])
 
 
-def _score(held: _HeldOut) -> PhysicsScore:
-    off = held.true - held.predicted
-    spread = float(np.square(held.true - held.true.mean()).sum())
+def score_energies(true: Floats, predicted: Floats) -> PhysicsScore:
+    """Return how well energies [J/m], shape (M,), are predicted; the mean error is of those that are not about zero."""
+    off = true - predicted
+    spread = float(np.square(true - true.mean()).sum())
     r2 = 1.0 - float(np.square(off).sum()) / spread if spread > 0.0 else 0.0
-    enough = np.abs(held.true) >= _LEAST_JPM
-    counted = enough if enough.any() else held.true != 0.0
-    return PhysicsScore(r2, float(np.mean(np.abs(off[counted] / held.true[counted]))) if counted.any() else 0.0)
-
-
-def _compare_held_out(scored: _HeldOut | None, without: _HeldOut | None) -> tuple[float, float] | None:
-    """Return the 90 % interval of the gain in R² by turning: block bootstrap of consecutive segments (Künsch 1989)."""
-    if scored is None or without is None or len(scored.true) != len(without.true):
-        return None
-    starts = np.arange(0, len(scored.true), _DRAWN_TOGETHER)
-    better = np.add.reduceat(
-        np.square(without.true - without.predicted) - np.square(scored.true - scored.predicted), starts
-    )
-    spread = np.add.reduceat(np.square(scored.true - scored.true.mean()), starts)
-    rng, gain = np.random.default_rng(_SEED), np.empty(_DRAWS)
-    for turn in range(_DRAWS):  # one after the other: all at once are 3 kB a metre
-        drawn = rng.integers(0, len(starts), len(starts))
-        gain[turn] = better[drawn].sum() / max(spread[drawn].sum(), 1e-12)
-    low, high = np.quantile(gain, [0.05, 0.95]).tolist()
-    return low, high
+    enough = np.abs(true) >= _LEAST_JPM
+    counted = enough if enough.any() else true != 0.0
+    return PhysicsScore(r2, float(np.mean(np.abs(off[counted] / true[counted]))) if counted.any() else 0.0)

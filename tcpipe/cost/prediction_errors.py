@@ -145,14 +145,14 @@ class Errors:
     def compute_intervals(
         self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
     ) -> tuple[Floats, Floats]:
-        """Return the interval of each piece, shape (N,) each."""
+        """Return the interval of each path segment, shape (N,) each."""
         spread = self.compute_std(predicted, class_id, stated)
         return predicted + self.low * spread, predicted + self.high * spread
 
     def compute_sum(
         self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
     ) -> SumDistribution:
-        """Return the distribution of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
+        """Return the distribution of the sum over segments of about a metre, in order along the path; shape (N,), NaN counts as none."""
         known = np.isfinite(predicted)
         values = np.where(known, predicted, 0.0)
         spread = np.where(known, self.compute_std(values, class_id, stated), 0.0)
@@ -168,7 +168,7 @@ class Errors:
         return SumDistribution(middle, std * below, std * above, self.common_share * float(size.sum()))
 
     def compute_variance(self, spread: Floats, of_run: float) -> float:
-        """Return the variance sum_ij a_i a_j rho_ij of a sum over pieces of about a metre by their spreads, shape (N,).
+        """Return the variance sum_ij a_i a_j rho_ij of a sum over path segments of about a metre by their spreads, shape (N,).
 
         ``of_run`` is the variance of a run's own error: all beyond the least correlation, that of a run, is of the metres.
         """

@@ -7,24 +7,14 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from tcpipe.dataset import Split, open_dataset
+from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError, clean_lines
-from tcpipe.experiment.simulation_floor import (
-    CLASS_AND_SLOPE,
-    FEWEST_SEEDS,
-    Claim,
-    check_claims,
-    compute_true_costs,
-    compute_variance_shares,
-    remove_hidden_variation,
-)
+from tcpipe.experiment.simulation_floor import FEWEST_SEEDS, Claim, check_claims, compute_true_costs
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
@@ -40,15 +30,11 @@ from tcpipe.recipe import Recipe
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.plots import draw_ratios
 from tcpipe.simulation import Scenario, SimulatedSite, find_scenario, simulate
-from tcpipe.simulation.scenarios import scale_hidden_variance
 
 logger = logging.getLogger("tcpipe")
 
 JSON, PAGE = "reproduction.json", "reproduction.html"
 SIMULATION_SEED = 1
-
-_ENOUGH = 2000
-"""Samples that tell the shares of a variance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +78,9 @@ RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout=
 class SampleCounts:
     """Driven distance by class: samples by split, by class of each split, and all."""
 
-    splits: Mapping[str, int] = field(default_factory=dict)
-    terrain: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    segments: int = 0
+    splits: Mapping[str, int]
+    terrain: Mapping[str, Mapping[str, int]]
+    segments: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,56 +91,37 @@ class ReproductionSummary:
     simulated: bool = True
     scenario: str
     plan: Experiment
-    hidden_variance: float
-    """Variance of the hidden resistance, over that of the frozen site."""
     counts: SampleCounts
-    variance_shares: Mapping[str, float]
-    """Of measured E on the unseen area, by what makes it."""
     claims: tuple[Claim, ...]
     seeds: tuple[Mapping[str, SplitErrors], ...]
     """Errors by split, of each training."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Reproduction:
     """What was found; ``str`` of it is what the command prints."""
 
     directory: Path
-    scenario: str
-    claims: list[Claim] = field(default_factory=list)
-    runs: list[Evaluation] = field(default_factory=list)
-    """One a training."""
-    counts: SampleCounts = field(default_factory=SampleCounts)
-    variance_shares: dict[str, float] = field(default_factory=dict)
-    """Of measured E on the unseen area, by what makes it."""
-    seconds: dict[str, float] = field(default_factory=dict)
+    values: ReproductionSummary
+    seconds: Mapping[str, float]
     """Of the stages, of this call."""
 
     def __str__(self) -> str:
         """Return every claim and how it stands, as plain lines."""
-        verdicts = Counter(claim.verdict for claim in self.claims)
-        shares = (f"{100.0 * share:.2f} % of the variance of E: {name}" for name, share in self.variance_shares.items())
-        spent = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
+        claims = self.values.claims
         return clean_lines(
             (
                 "the data are simulated: compare the pattern with the paper, not the numbers",
-                *shares,
-                *(str(claim) for claim in self.claims),
-                f"of {len(self.claims)} claims: " + ", ".join(f"{count} {name}" for name, count in verdicts.items()),
-                f"spent: {spent}",
+                *map(str, claims),
+                f"of {len(claims)} claims: {_count_verdicts(claims)}",
+                "spent: " + ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items()),
                 f"open {self.directory / PAGE}",
             )
         )
 
 
 def reproduce(
-    directory: str | Path,
-    *,
-    size: Size = "full",
-    seeds: int = 1,
-    jobs: int = 1,
-    hidden_variance: float = 1.0,
-    baselines: bool = True,
+    directory: str | Path, *, size: Size = "full", seeds: int = 1, jobs: int = 1, baselines: bool = True
 ) -> Reproduction:
     """Simulate the paper's site, build the dataset, train, evaluate, and compare with the paper's claims.
 
@@ -164,46 +131,38 @@ def reproduce(
     size : the paper's; the small site, for claims over many trainings; or the same with few epochs, to see it run.
     seeds : trainings; claims are decided by five or more.
     jobs : logs read side by side.
-    hidden_variance : variance of the resistance that nothing shows, over that of the frozen site.
     baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
-
-    Raises
-    ------
-    UsageError : ``directory`` holds something else.
     """
     place, plan = Path(directory), SIZES[size]
     plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))
     clear(place)
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
         raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
-    frozen, result = find_scenario(plan.scenario), Reproduction(place, plan.scenario)
-    made = replace(frozen, world=scale_hidden_variance(frozen.world, hidden_variance))
-    with _measure_time(result, "simulate"):
+    made, seconds = find_scenario(plan.scenario), Counter[str]()
+    with _measure_time(seconds, "simulate"):
         site = simulate(place / "site", scenario=made, seed=SIMULATION_SEED)
-    with _measure_time(result, "ingest and build"):
+    with _measure_time(seconds, "ingest and build"):
         _build(place, site, jobs)
-    data = open_dataset(place / "dataset")
-    result.counts = SampleCounts(data.card.splits, data.card.terrain, data.card.samples)
-    result.variance_shares = _compute_variance_shares(data["unseen"], made)
-    for seed in range(seeds):
-        result.runs.append(_train_and_evaluate(place, made, plan, seed, result))
-    result.claims = check_claims(result.runs)
-    _write(result, plan, hidden_variance)
-    return result
+    runs = [_train_and_evaluate(place, made, plan, seed, seconds) for seed in range(seeds)]
+    card = open_dataset(place / "dataset").card
+    values = ReproductionSummary(
+        scenario=plan.scenario, plan=plan, counts=SampleCounts(card.splits, card.terrain, card.samples),
+        claims=tuple(check_claims(runs)), seeds=tuple(run.splits for run in runs),
+    )  # fmt: skip
+    write_json(place / JSON, values)
+    write_text(place / PAGE, _render_page(values, runs))
+    return Reproduction(place, values, dict(seconds))
 
 
-def _compute_variance_shares(split: Split, made: Scenario) -> dict[str, float]:
-    some = split.take(np.arange(min(len(split), _ENOUGH)))  # rows stand in random order
-    return compute_variance_shares(
-        made.world, made.drives[0].robot, some, some.column("energy_joule").astype(np.float64)
-    )
+def _count_verdicts(claims: Sequence[Claim]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in Counter(claim.verdict for claim in claims).items())
 
 
 @contextmanager
-def _measure_time(result: Reproduction, stage: str) -> Iterator[None]:
+def _measure_time(seconds: Counter[str], stage: str) -> Iterator[None]:
     began = time.perf_counter()
     yield
-    result.seconds[stage] = result.seconds.get(stage, 0.0) + time.perf_counter() - began
+    seconds[stage] += round(time.perf_counter() - began)
 
 
 def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
@@ -218,49 +177,19 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
     logger.info("%s", str(built).splitlines()[0])
 
 
-def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, result: Reproduction) -> Evaluation:
+def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, seconds: Counter[str]) -> Evaluation:
     here, dataset = place / f"seed-{seed}", place / "dataset"
-    with _measure_time(result, "train"):
+    with _measure_time(seconds, "train"):
         train(dataset, here / "model", config=replace(plan.fitting, seed=seed))
-    with _measure_time(result, "evaluate"):
-        known = partial(compute_true_costs, remove_hidden_variation(made.world), made.drives[0].robot)
+    with _measure_time(seconds, "evaluate"):
+        known = partial(compute_true_costs, replace(made.world, resistance=()), made.drives[0].robot)
         config = replace(plan.evaluating, seed=seed)
         return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
 
 
-def _write(result: Reproduction, plan: Experiment, hidden_variance: float) -> None:
-    """Write the page, and the same as JSON."""
-    summary = ReproductionSummary(
-        scenario=result.scenario,
-        plan=plan,
-        hidden_variance=hidden_variance,
-        counts=result.counts,
-        variance_shares=result.variance_shares,
-        claims=tuple(result.claims),
-        seeds=tuple(run.splits for run in result.runs),
-    )
-    write_json(result.directory / JSON, summary)
-    write_text(
-        result.directory / PAGE,
-        _render_page(
-            result.runs,
-            result.claims,
-            shares=result.variance_shares,
-            hidden_variance=hidden_variance,
-            warnings=[plan.warning] if plan.warning else [],
-        ),
-    )
-
-
-def _render_page(
-    runs: Sequence[Evaluation],
-    claims: Sequence[Claim],
-    *,
-    shares: Mapping[str, float],
-    hidden_variance: float,
-    warnings: Sequence[str],
-) -> str:
-    """Return the HTML page of the evaluations of all trainings; ``shares`` are of the variance of E, by what makes it."""
+def _render_page(values: ReproductionSummary, runs: Sequence[Evaluation]) -> str:
+    """Return the HTML page of all trainings."""
+    claims = values.claims
     verdicts = Counter(claim.verdict for claim in claims)
     audits = (f"{split}: {format_leakage(part.leakage)}" for split, part in runs[0].splits.items())
     return render_page(
@@ -270,12 +199,8 @@ def _render_page(
             *(Number(f"{count} of {len(claims)}", f"claims {name}") for name, count in verdicts.items()),
             Number(f"{len(runs)}", "training" if len(runs) == 1 else "trainings"),
         ],
-        warnings=[SIMULATED, *warnings],
-        sections=[
-            _make_claims_section(claims, " ".join(audits)),
-            _make_errors_section(runs),
-            _make_variance_section(shares, hidden_variance),
-        ],
+        warnings=[SIMULATED, *([values.plan.warning] if values.plan.warning else [])],
+        sections=[_make_claims_section(claims, " ".join(audits)), _make_errors_section(runs)],
     )
 
 
@@ -315,19 +240,3 @@ def _make_errors_section(runs: Sequence[Evaluation]) -> Section:
     text = "The floor knows the simulator, map, path and turn without error; hidden variation and the noise of the labels remain."
     header = ("", "", "floor", *(f"seed {number}" for number in range(len(runs))))
     return Section("RMSE and MAPE of every training", text, header=header, rows=rows, figures_from=2)
-
-
-def _make_variance_section(shares: Mapping[str, float], hidden_variance: float) -> Section:
-    """Return the parts of E's variance, and their shares of what class and slope leave."""
-    rest = sum(share for name, share in shares.items() if name != CLASS_AND_SLOPE)
-    rows = []
-    for name, share in shares.items():
-        of_rest = "–" if name == CLASS_AND_SLOPE else f"{100.0 * share / rest if rest else float('nan'):.0f} %"
-        rows.append((name, f"{100.0 * share:.2f} %", of_rest))
-    text = (
-        "Of measured E on the unseen area: what a spline over the slope of each class explains; then what such splines leave of what "
-        "changes where a part of the simulated world is taken out. They add up to one only as far as they are independent. "
-        f"The hidden resistance has {hidden_variance:g} times the variance of the frozen site."
-    )
-    header = ("source", "of the variance of E", "share of the rest")
-    return Section("Variance of E by source", text, header=header, rows=rows, figures_from=1)

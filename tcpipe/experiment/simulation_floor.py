@@ -1,7 +1,7 @@
 """The errors that the simulator itself implies: those of a predictor that knows its plant and reads the world without error.
 
 It sees what a map shows along the chord of a sample, where the pipeline believes the chord to be, and how much the robot turned. Of a
-world without hidden resistance (`remove_hidden_variation`) it says what could be predicted at best: what remains is the labels' noise, that
+world without hidden resistance it says what could be predicted at best: what remains is the labels' noise, that
 resistance, its fluctuation in time, and the lag of the wheels.
 
 Claims of the paper (section V) that the simulated site can refute, as ratios of errors.
@@ -11,20 +11,18 @@ The importance of height, class, several classes and slow ground is built into t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from scipy.special import stdtrit
 
 from tcpipe.dataset import Split
-from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.learning.baselines import ALL_LAYERS_PER_CLASS, CURVES, OURS, PER_CLASS, TREES
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult, Evaluation
-from tcpipe.learning.evaluation_page import ENERGY
+from tcpipe.learning.evaluation_page import PAPER
 from tcpipe.learning.metrics import Array, Ratio, compute_costs
-from tcpipe.learning.physics_model import fit_curves
 from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance
 from tcpipe.simulation.world import World
 
@@ -70,68 +68,6 @@ def compute_true_costs(world: World, robot: SimulatedRobot, split: Split) -> dic
     seconds_per_m = np.mean(1.0 / velocity, axis=1)
     joule_per_m = np.mean(power / velocity, axis=1)
     return compute_costs(joule_per_m / seconds_per_m, 1.0 / seconds_per_m, 1.0)
-
-
-def remove_hidden_variation(world: World) -> World:
-    """Return a world without what nothing shows."""
-    return replace(world, resistance=())
-
-
-CLASS_AND_SLOPE, REST = "class and slope", "left: fluctuation in time, lag of the wheels, the labels' noise"
-
-
-def compute_variance_shares(world: World, robot: SimulatedRobot, split: Split, energy_joule: Array) -> dict[str, float]:
-    """Return the share of the variance of measured E, shape (N,), that each part of the simulated world makes.
-
-    That of class and slope is what a spline of each class explains; that of a part, what such splines leave of what changes where it
-    alone is missing; the rest, what they leave of what the plant with everything in it misses. A part's mean over a class and slope is thus
-    class and slope. They add up to one only as far as the parts are independent.
-    """
-    extra_features, known = read_extra_features(split), np.isfinite(energy_joule)
-    slope_rad, class_id = extra_features.slope_rad[known], extra_features.class_id[known]
-
-    def left(joule: Array) -> float:
-        values = joule[known][:, None]
-        return float(np.var(values - fit_curves("spline", slope_rad, class_id, values).predict(slope_rad, class_id)))
-
-    def energy(world: World, robot: SimulatedRobot) -> Array:
-        return compute_true_costs(world, robot, split)["E"]
-
-    whole, total = energy(world, robot), float(np.var(energy_joule[known]))
-    missing = {name: whole - energy(*remove(world, robot)) for name, remove in _PARTS.items()}
-    missing[REST] = energy_joule - whole
-    return {CLASS_AND_SLOPE: 1.0 - left(energy_joule) / total} | {
-        name: left(of) / total for name, of in missing.items()
-    }
-
-
-def _remove_visible(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
-    if world.surface is None:
-        return world, robot
-    looks = {
-        name: replace(look, wet_resistance=0.0, cover_resistance=0.0) for name, look in world.surface.looks.items()
-    }
-    return replace(world, surface=replace(world.surface, looks=looks)), robot
-
-
-def _change_wheels(robot: SimulatedRobot, **changes: float) -> SimulatedRobot:
-    return replace(robot, wheels=robot.wheels and replace(robot.wheels, **changes))
-
-
-_PARTS: Mapping[str, Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]]] = {
-    "the orthophoto alone: wetness, cover": _remove_visible,
-    "heights within the patch: bumps and ridges under the wheels": lambda world, robot: (
-        world,
-        _change_wheels(robot, bump_loss=0.0),
-    ),
-    "heights within the patch: slope across": lambda world, robot: (
-        world,
-        _change_wheels(robot, cornering_per_rad=np.inf),
-    ),
-    "the path: turning": lambda world, robot: (world, replace(robot, scrub_torque_nm=0.0)),
-    "nothing: hidden resistance": lambda world, robot: (remove_hidden_variation(world), robot),
-}
-"""What shows a part of the world, and the world and robot without it."""
 
 
 def _mean_over(values: Array, count: int) -> Array:
@@ -232,4 +168,4 @@ def _find_verdict(ratio: Ratio, seeds: int) -> Verdict:
 def _read_paper_value(baseline: str, split: str) -> float | None:
     """Return the same ratio of the paper's table IV."""
     at = SPLITS.index(split)
-    return ENERGY[OURS][at][0] / ENERGY[baseline][at][0] if baseline in ENERGY else None
+    return PAPER[OURS][at][0] / PAPER[baseline][at][0] if baseline in PAPER else None

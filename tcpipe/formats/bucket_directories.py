@@ -115,14 +115,21 @@ class FetchedShards:
 
 def fetch_directory(path: str | Path) -> Path:
     """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs."""
-    return Path(path) if not is_url(path) else _fetch_copy(str(path).rstrip("/"), lambda _: True)[0]
+    return fetch_directory_by_range(path, by_range=lambda _: False)[0]
 
 
 def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
     """Return a directory as `fetch_directory`, without the files that are ``by_range``, and where these are read; None on this machine."""
-    return (
-        (Path(path), None) if not is_url(path) else _fetch_copy(str(path).rstrip("/"), lambda name: not by_range(name))
-    )
+    if not is_url(path):
+        return Path(path), None
+    url = str(path).rstrip("/")
+    card = require_card(url)
+    root = _make_subdirectory(_make_copy_directory(url, card.data), url)
+    (root / card.name).write_bytes(card.data)
+    for unlisted in _UNLISTED:
+        if (page := card.place.read(unlisted)) is not None:
+            (root / unlisted).write_bytes(page)
+    return root, _fetch_others(card.place, root, _read_checksums(card), by_range)
 
 
 def has_card(url: str) -> bool:
@@ -203,17 +210,6 @@ def _read_checksums(card: FoundCard) -> Mapping[str, Checksum]:
     return checksums
 
 
-def _fetch_copy(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
-    card = require_card(url)
-    checksums = _read_checksums(card)
-    root = _make_subdirectory(_make_copy_directory(url, card.data), url)
-    (root / card.name).write_bytes(card.data)
-    for unlisted in _UNLISTED:
-        if (page := card.place.read(unlisted)) is not None:
-            (root / unlisted).write_bytes(page)
-    return root, _fetch_wanted(card.place, root, checksums, wanted)
-
-
 def fetch_files(
     place: Place, checksums: Mapping[str, Checksum], *, by_range: Callable[[str], bool]
 ) -> tuple[Path, FetchedShards | None]:
@@ -223,17 +219,16 @@ def fetch_files(
     """
     if place.path is not None:
         return place.path, None
-    root = _make_subdirectory(
-        _make_copy_directory(place.where(), repr(sorted(checksums.items())).encode()), place.where()
-    )
-    return root, _fetch_wanted(place, root, checksums, lambda name: not by_range(name))
+    copies = _make_copy_directory(place.where(), repr(sorted(checksums.items())).encode())
+    root = _make_subdirectory(copies, place.where())
+    return root, _fetch_others(place, root, checksums, by_range)
 
 
-def _fetch_wanted(
-    place: Place, root: Path, checksums: Mapping[str, Checksum], wanted: Callable[[str], bool]
+def _fetch_others(
+    place: Place, root: Path, checksums: Mapping[str, Checksum], by_range: Callable[[str], bool]
 ) -> FetchedShards:
-    """Bring what is wanted of a place's files below ``root``; return where the others are read."""
-    absent = [(file, checksum) for file, checksum in checksums.items() if wanted(file) and not (root / file).exists()]
+    """Bring what is not read ``by_range`` of a place's files below ``root``; return where the others are read."""
+    absent = [(name, of) for name, of in checksums.items() if not (by_range(name) or (root / name).exists())]
     place.map(lambda of: _fetch_one(place, *of, root / of[0]), absent)
     return FetchedShards(place, root, checksums)
 

@@ -31,8 +31,8 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 logger = logging.getLogger("tcpipe")
 
 LOG = "log"
-_COMMIT = re.compile(r"(\d{10})\.json")
-_SNAPSHOT = "snapshot-"
+COMMIT = re.compile(r"(\d{10})\.json")
+SNAPSHOT = "snapshot-"
 _EVERY, _EVERY_BYTES = 64, 4 << 20
 """After so many commits, or so many bytes of them, the next snapshot is written."""
 _SEAL_BYTES = 64
@@ -114,7 +114,7 @@ def read_newest_commit(store: Place) -> Commit | None:
 
 def _list_commits(log: Place, after: int) -> list[int]:
     """Return the numbers of the commits after one, rising."""
-    found = (_COMMIT.fullmatch(name) for name in log.files(after=commit_name(after)))
+    found = (COMMIT.fullmatch(name) for name in log.files(after=commit_name(after)))
     return sorted(int(of[1]) for of in found if of)
 
 
@@ -145,7 +145,7 @@ def commit_name(number: int) -> str:
 
 def make_snapshot_name(number: int) -> str:
     """Return the name of the file of a snapshot."""
-    return f"{_SNAPSHOT}{number:010}.json.zst"
+    return f"{SNAPSHOT}{number:010}.json.zst"
 
 
 def read_commit(log: Place, number: int) -> ReadCommit:
@@ -195,7 +195,7 @@ def _keep_snapshot(log: Place, state: State, stamp: Stamp) -> State:
 
 
 def _list_snapshots(log: Place) -> list[str]:
-    return [name for name in log.files(after=_SNAPSHOT) if name.startswith(_SNAPSHOT)]
+    return [name for name in log.files(after=SNAPSHOT) if name.startswith(SNAPSHOT)]
 
 
 def _encode_snapshot(state: State, stamp: Stamp) -> bytes:

@@ -29,9 +29,9 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
-from tcpipe.formats.json_files import parse_typed, read_document
+from tcpipe.formats.json_files import Json, parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
-from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
+from tcpipe.formats.parquet import read_column_names, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
@@ -280,7 +280,7 @@ def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> Datase
         raise DatasetError(*problems) from None
 
 
-def _describe_outdated(directory: Path | str, version: object) -> str:
+def _describe_outdated(directory: Path | str, version: Json) -> str:
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
     return f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}"
 
@@ -314,12 +314,6 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
         absent = later.intersection(asked).difference(read_column_names(directory / SAMPLES))
         there = None if columns is None else [name for name in columns if name not in absent]
         return SAMPLES_SCHEMA.select_columns(*asked).add_missing_columns(read_table(directory / SAMPLES, there))
-
-
-def sample_count(directory: Path) -> int:
-    """Return the rows of a dataset's samples table, from its footer; `DatasetError` if that cannot be read."""
-    with _convert_errors():
-        return read_row_count(directory / SAMPLES)
 
 
 def sample_columns(directory: Path) -> list[str]:
@@ -376,21 +370,20 @@ class PatchFiles:
         rows = int(self.starts[piece + 1] - self.starts[piece])
         into = {layer: self.make_room(layer, self.piece_rows) for layer in layers} if out is None else out
         try:
-            if self.arrays:
-                for layer in layers:
-                    array = self.arrays[layer]
-                    array.chunk((piece, *(0 for _ in array.shape[1:])), out=into[layer][: self.piece_rows])
-            else:
-                name, group = self.groups[piece]
-                path = self.directory / name
-                table = read_row_group(
-                    path if self.fetched is None else self.fetched.fetch_file(path), group, list(layers)
-                )
-                for layer in layers:
-                    flat = table.column(layer).combine_chunks().flatten().to_numpy()
-                    into[layer][:rows] = flat.reshape(rows, *into[layer].shape[1:])
-        except StoreError as error:
-            raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
+            with _convert_errors(_AGAIN):
+                if self.arrays:
+                    for layer in layers:
+                        array = self.arrays[layer]
+                        array.chunk((piece, *(0 for _ in array.shape[1:])), out=into[layer][: self.piece_rows])
+                else:
+                    name, group = self.groups[piece]
+                    path = self.directory / name
+                    table = read_row_group(
+                        path if self.fetched is None else self.fetched.fetch_file(path), group, list(layers)
+                    )
+                    for layer in layers:
+                        flat = table.column(layer).combine_chunks().flatten().to_numpy()
+                        into[layer][:rows] = flat.reshape(rows, *into[layer].shape[1:])
         except (KeyError, ValueError):
             raise DatasetError(
                 f"{self.directory}: piece {piece} of its patches contradicts the card; build it again"

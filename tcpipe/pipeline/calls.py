@@ -227,28 +227,14 @@ class Estimate:
         return f"{amount}: about {format_duration(self.wall_s)} and {format_bytes(self.written_bytes)} ({self.source})"
 
 
-@dataclass(frozen=True, slots=True)
-class Stopwatch:
-    """When a call began: by the wall [ns since 1970], by a clock that only runs, and in CPU seconds."""
-
-    begin_ns: int
-    running_s: float
-    cpu_s: float
-
-
-def start_stopwatch() -> Stopwatch:
-    """Return that a call begins now."""
-    return Stopwatch(time.time_ns(), time.monotonic(), _read_cpu_s())
-
-
-def measure_call(watch: Stopwatch, call: CallRecord) -> CallRecord:
-    """Return a call with what it took."""
-    begin = datetime.fromtimestamp(watch.begin_ns / 1e9, UTC)
-    return replace(
+def start_stopwatch() -> Callable[[CallRecord], CallRecord]:
+    """Return what adds to a call when it began, which is now, and what it took until then."""
+    begin, running_s, cpu_s = datetime.now(UTC), time.monotonic(), _read_cpu_s()
+    return lambda call: replace(
         call,
         begin=begin.isoformat(timespec="milliseconds"),
-        wall_s=round(time.monotonic() - watch.running_s, 3),
-        cpu_s=round(_read_cpu_s() - watch.cpu_s, 3),
+        wall_s=round(time.monotonic() - running_s, 3),
+        cpu_s=round(_read_cpu_s() - cpu_s, 3),
     )
 
 

@@ -33,7 +33,6 @@ from tcpipe.pipeline.calls import (
     commit_call,
     find_settled_calls,
     make_call,
-    measure_call,
     open_log,
     start_stopwatch,
     stored_bytes,
@@ -98,7 +97,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one log or path stands
     in its result.
     """
-    watch = start_stopwatch()
+    measure = start_stopwatch()
     ruling, shard = resolve_recipe(options.recipe), options.shard
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := load_profiles(ruling).robots):
@@ -140,7 +139,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
                     summary = tell(_iterate_left(log, queue.plan(at for at in own if at not in results)))
                     call.is_whole = queue.is_done
                     record = _make_call_record(opened, summary, given, tasks, options.jobs)
-                    call.end = Entries(calls=(measure_call(watch, record),))
+                    call.end = Entries(calls=(measure(record),))
             queue.remove_expired_claims()
         if log.state.number != before.number and log.state.runs:
             opened.write_index(log.state, before=before)

@@ -141,7 +141,7 @@ def _make_waiting_problem(name: str, state: State) -> list[Problem]:
 
 
 def _describe_no_match(
-    name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: object
+    name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: Path | str
 ) -> str:
     if found:
         return f"{name}: {len(found)} logs have this name; give the path of one: {_format_list(found)}"

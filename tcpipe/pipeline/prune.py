@@ -14,16 +14,16 @@ from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, clear_scratch, is_abandoned
 from tcpipe.formats.commits import Dataset, Entries, State
-from tcpipe.formats.dataset_files import CARD, read_card
+from tcpipe.formats.dataset_files import CARD, REPORT, read_card
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.run_documents import SPOOL, find_highest_numbers, read_sealed_at, split_number
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.calls import LogWriter, format_bytes
-from tcpipe.pipeline.verify_store import find_strangers
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.levels import STREAMS
 
 _CONTENT = re.compile(r"(?:^|/)[0-9a-f]{16}/")
 """In the name of a file: a directory that is named after its content."""
@@ -160,8 +160,19 @@ def _find_reason_to_stay(
         return "--keep names it"
     if why := next((referred[part] for part in parts if part in referred), None):
         return why
-    strange = next(find_strangers(place), None)
+    strange = next(_find_strangers(place), None)
     return None if strange is None else f"{strange} is no file of this store"
+
+
+def _find_strangers(place: Place) -> Iterator[str]:
+    """Yield what no call of tcpipe has written into the directory of a run, or of one of its ingestions."""
+    known = (
+        {f"{role}.parquet" for role in STREAMS}
+        | {f"{name}.parquet" for name in ("track", "segments", "rejections")}
+        | {REPORT}
+    )
+    names = ((entry.name, entry.name.rpartition("/")[2]) for entry in place.entries())
+    yield from (place.where(name) for name, last in names if last not in known and not split_number(last))
 
 
 def _forget(log: LogWriter, names: Sequence[str], *, dry_run: bool) -> None:

@@ -17,7 +17,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
@@ -97,7 +97,7 @@ class CellCounts:
     trusted: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CostMapCard:
     """All of cost-map.json but its seal."""
 
@@ -108,17 +108,21 @@ class CostMapCard:
     """The model's checksum."""
     robot: str
     grid: MapGrid
-    courses_deg: tuple[float, ...]
-    bands: Mapping[str, tuple[str, ...]]
-    units: Mapping[str, str]
-    reasons: Mapping[str, str]
+    courses_deg: tuple[float, ...] = tuple(ANGLES_DEG.tolist())
+    bands: Mapping[str, tuple[str, ...]] = field(
+        default_factory=lambda: dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course", "std"))
+    )
+    units: Mapping[str, str] = field(default_factory=lambda: _QUANTITIES)
+    reasons: Mapping[str, str] = field(
+        default_factory=lambda: {str(int(reason)): flag_name(reason) for reason in Reason}
+    )
     """Name of each bit of reasons.tif."""
     nav2_scale: Mapping[str, Nav2Scale]
     cells: CellCounts
     reason_share: Mapping[str, float]
     """Of cells and courses."""
-    barred_by: tuple[str, ...]
-    aggregation: str
+    barred_by: tuple[str, ...] = tuple(flag_name(reason) for reason in Reason if reason & BARRED)
+    aggregation: str = AGGREGATION
     """Of the courses of a cell, in its bands and in the Nav2 maps."""
     checksums: Mapping[str, Checksum]
     origin_deg: tuple[float, float] | None = None
@@ -203,11 +207,15 @@ def make_cost_map(
                 return CostMapResult(str(out), "unchanged", found)
             costs = open_cost_map(out, found)
         else:
-            spool = _open_spool(place, key, grid)
-            _predict_missing(model, source, spool, step)
-            costs = spool.costs
+            costs = _predict_cells(model, source, place, key, grid, step)
         with write_atomic_directory(out) as directory:
-            card = replace(_write_files(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
+            strips = _Strips(costs, model.errors, read_classes(source, grid))
+            scales = _write_files(directory, strips, origin_m)
+            cells, shares = _compute_shares(costs)
+            card = CostMapCard(
+                key=key, map=source.name, model=model.checksum, robot=model.card.robot, label_energy=model.card.label_energy, grid=grid,
+                nav2_scale=scales, cells=cells, reason_share=shares, checksums=compute_checksums(directory), origin_deg=origin_deg,
+            )  # fmt: skip
             write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(str(out), "done", card)
@@ -235,21 +243,6 @@ def open_cost_map(path: Path, card: CostMapCard) -> CostGrid:
 _ARRAYS = ("power_watt", "velocity_mps", "reasons", "height_m")
 
 
-@dataclass(frozen=True, slots=True)
-class _Spool:
-    """Costs in files that outlive an interruption, and which cells are done, (rows · cols,)."""
-
-    costs: CostGrid
-    done: NDArray[np.uint8]
-    files: tuple[np.memmap[Any, Any], ...]
-
-    def keep(self, cells: Cells) -> None:
-        """Put on disk what is known, then that these cells are done."""
-        for file in self.files:
-            file.flush()
-        self.done[cells] = 1
-
-
 @contextmanager
 def _claim_spool(out: Path) -> Iterator[Path]:
     """Yield the directory beside ``out`` where its costs wait, for one process at a time; it stays when that is interrupted."""
@@ -266,24 +259,47 @@ def _claim_spool(out: Path) -> Iterator[Path]:
         place.rmdir()
 
 
-def _open_spool(place: Path, key: str, grid: MapGrid) -> _Spool:
-    """Return the costs so far, or new files without any."""
+def _predict_cells(  # noqa: PLR0917
+    model: Model, source: MapFile, place: Path, key: str, grid: MapGrid, step: Step
+) -> CostGrid:
+    """Return the costs of all cells, in files of ``place`` that outlive an interruption; what is done of ``key`` is not done again."""
     if _read_job(place) != key:
-        for file in place.iterdir():
-            file.unlink()
-        nothing = make_empty_grid(replace(grid, rows=1, cols=1))
-        for name in _ARRAYS:
-            one = getattr(nothing, name)
-            shape = (*one.shape[:-2], grid.rows, grid.cols)
-            array = np.lib.format.open_memmap(place / f"{name}.npy", "w+", one.dtype, shape)
-            _allocate(place / f"{name}.npy", array.offset + array.nbytes)
-            array[...] = one
-        np.save(place / "done.npy", np.zeros(grid.rows * grid.cols, np.uint8))
-        write_json(place / "job.json", {"key": key})
+        _make_spool(place, key, grid)
     held = {name: np.load(place / f"{name}.npy", mmap_mode="r+") for name in (*_ARRAYS, "done")}
-    files = tuple(held.values())
-    done = held.pop("done")
-    return _Spool(CostGrid(grid, **held), done, files)
+    files, done = tuple(held.values()), held.pop("done")
+    costs, frames = CostGrid(grid, **held), CellFrames(grid, where=f"map {source.name}")
+    missing = (done == 0).reshape(grid.rows, grid.cols)
+    todo = list(iterate_blocks(source, model, grid, missing))
+    if not missing.all():
+        logger.info("resuming: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
+    ready: list[Cells] = []
+    answers = iterate_predictions(model, source, (frames.of(cells) for cells in todo))
+    for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
+        costs.put(cells, found)
+        ready.append(cells)
+        if len(ready) == _BLOCKS_KEPT or number == len(todo):
+            for file in files:  # what is known, then that it is done
+                file.flush()
+            done[np.concatenate(ready)] = 1
+            ready = []
+        step(number, len(todo))
+    return costs
+
+
+def _make_spool(place: Path, key: str, grid: MapGrid) -> None:
+    """Write files of costs of which none is known."""
+    for file in place.iterdir():
+        file.unlink()
+    nothing = make_empty_grid(replace(grid, rows=1, cols=1))
+    for name in _ARRAYS:
+        one = getattr(nothing, name)
+        array = np.lib.format.open_memmap(
+            place / f"{name}.npy", "w+", one.dtype, (*one.shape[:-2], grid.rows, grid.cols)
+        )
+        _allocate(place / f"{name}.npy", array.offset + array.nbytes)
+        array[...] = one
+    np.save(place / "done.npy", np.zeros(grid.rows * grid.cols, np.uint8))
+    write_json(place / "job.json", {"key": key})
 
 
 def _allocate(path: Path, size_bytes: int) -> None:
@@ -302,52 +318,7 @@ def _read_job(place: Path) -> str | None:
         return None
 
 
-def _predict_missing(model: Model, source: MapFile, spool: _Spool, step: Step) -> None:
-    """Ask the model about every cell that is not done."""
-    costs = spool.costs
-    frames = CellFrames(costs.grid, where=f"map {source.name}")
-    missing = (spool.done == 0).reshape(costs.grid.rows, costs.grid.cols)
-    todo = list(iterate_blocks(source, model, costs.grid, missing))
-    if not missing.all():
-        logger.info("resuming: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
-    ready: list[Cells] = []
-    answers = iterate_predictions(model, source, (frames.of(cells) for cells in todo))
-    for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
-        costs.put(cells, found)
-        ready.append(cells)
-        if len(ready) == _BLOCKS_KEPT or number == len(todo):
-            spool.keep(np.concatenate(ready))
-            ready = []
-        step(number, len(todo))
-
-
-def _write_files(
-    model: Model, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
-) -> CostMapCard:
-    """Write all files but the card; return it."""
-    scales = _write(directory, _Strips(costs, model.errors, read_classes(source, costs.grid)), origin_m)
-    cells, shares = _compute_shares(costs)
-    return CostMapCard(
-        key=key,
-        map=source.name,
-        model=model.checksum,
-        robot=model.card.robot,
-        label_energy=model.card.label_energy,
-        grid=costs.grid,
-        courses_deg=tuple(ANGLES_DEG.tolist()),
-        bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course", "std")),
-        units=_QUANTITIES,
-        reasons={str(int(reason)): flag_name(reason) for reason in Reason},
-        nav2_scale=scales,
-        cells=cells,
-        reason_share=shares,
-        aggregation=AGGREGATION,
-        barred_by=tuple(flag_name(reason) for reason in Reason if reason & BARRED),
-        checksums=compute_checksums(directory),
-    )
-
-
-def _write(directory: Path, strips: _Strips, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
+def _write_files(directory: Path, strips: _Strips, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
     """Write all files but the card; return the scales of the Nav2 maps."""
     costs, grid = strips.costs, strips.costs.grid
     layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}

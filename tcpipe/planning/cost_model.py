@@ -10,11 +10,12 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntFlag
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import BiasCorrection, fit_bias_correction, propagate_stated
+from tcpipe.cost.prediction_errors import fit_bias_correction, propagate_stated
 from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.errors import ModelError
 from tcpipe.learning.models import Model
@@ -63,36 +64,11 @@ def check_model(model: Model, source: MapReader) -> None:
         raise ModelError(*problems)
 
 
-def predict_patches(
-    model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats | None = None
-) -> Prediction:
-    """Return what the model says of the patches that it is asked about, shape (N,); tensors are formed batch by batch.
-
-    ``turn_radpm`` is how far a metre of each turns; NaN, or nothing, is as usual, and so is the speed that is commanded.
-
-    Raises
-    ------
-    ModelError : it gives something else than power and velocity.
-    """
-    form = model.card.layout
-    pixels = {layer: patches.pixels[layer] for layer in form.layers}
-    out, unknown = Prediction.without_covariance(np.full((asked.size, 2), np.nan)), np.full(asked.size, np.nan)
-    turns = unknown if turn_radpm is None else turn_radpm
-    extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
-    chosen = np.flatnonzero(asked)
-    for rows in (chosen[first : first + form.batch_rows] for first in range(0, chosen.size, form.batch_rows)):
-        said = model.ask(form.form(pixels, rows), extra_features.take(rows))
-        if said.mean.shape[1] != 2:
-            raise ModelError(
-                f"{model.name}: gives {said.mean.shape[1]} numbers a patch, expected two: power and velocity; train it on both labels"
-            )
-        out.mean[rows], out.covariance[rows] = said.mean, said.covariance
-    out.mean[~(np.isfinite(out.mean).all(axis=1) & (out.mean[:, 1] > 0.0))] = np.nan
-    return out
-
-
 LANE_M = 0.7
 """Width of the strip that a robot needs, about the paper's Husky (0.67 m) [m]."""
+
+_ROUNDED = 1.0 + 1e-6
+"""Factor up to which a distance is that of training."""
 
 _STRAY = 0.05
 """Share of a lane's pixels that may be wrongly classed."""
@@ -121,6 +97,8 @@ class Reason(IntFlag):
     """More than 5 % of the strip that the robot drives over (0.7 m wide) is not traversable, though the middle is."""
     CURVED = 1 << 9
     """The path is more curved here than any training segment (its recipe's `max_arc_to_chord`)."""
+    LAYER_OUTSIDE_TRAINING = 1 << 10
+    """The mean of a band of a layer of yours, or the share of a class of it, is farther from that of training than in any sample."""
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION
@@ -136,14 +114,7 @@ def count_reasons(bits: Bits) -> dict[str, int]:
 
 
 def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, source: MapReader) -> Bits:
-    """Return the reasons of each patch, shape (N,).
-
-    Parameters
-    ----------
-    patches : N sampled patches.
-    on_map : whether each lies wholly on the map, shape (N,).
-    model, source : who is to judge them, and the map that they are from.
-    """
+    """Return the reasons of each patch of a map, shape (N,); ``on_map`` says whether it lies wholly on it, shape (N,)."""
     bits = np.zeros(on_map.size, np.uint16)
     bits[patches.valid_fraction < 1.0] |= np.uint16(Reason.NODATA)
     ranges = {
@@ -154,6 +125,9 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, sour
     for reason, (values, name) in ranges.items():
         low, high = model.card.training_range.ranges[name]
         bits[~((values >= low) & (values <= high))] |= np.uint16(reason)
+    for name, known in model.card.training_range.layers.items():
+        values = model.card.layout.known[name].compute_means(patches.pixels[name])
+        bits[known.compute_distance(values) > known.largest * _ROUNDED] |= np.uint16(Reason.LAYER_OUTSIDE_TRAINING)
     if "terrain" in patches.pixels:
         bits |= _find_class_reasons(patches, patches.pixels["terrain"], model, source)
     bits[~on_map] = Reason.OUTSIDE_MAP
@@ -221,62 +195,70 @@ def iterate_predictions(
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
     after another; without it all turn as usual.
     """
-    source = source.select({*PAPER_LAYERS, *model.card.layout.layers})
-    centring, tiles = (
-        fit_bias_correction(model.residuals),
-        TilePool(choose_level(source, model.card.inputs.patch_m / model.card.inputs.patch_px)),
+    source, side, px = (
+        source.select({*PAPER_LAYERS, *model.card.layout.layers}),
+        model.card.inputs.patch_m,
+        model.card.inputs.patch_px,
     )
+    correction, tiles = fit_bias_correction(model.residuals), TilePool(choose_level(source, side / px))
 
-    def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
+    def sample(frames: PatchFrames) -> tuple[Patches, NDArray[np.bool_]]:
         chord_m = np.full(len(frames.centre_xy_m), model.card.chord_m)
-        on_map = count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)) == 4
-        patch_m, patch_px = model.card.inputs.patch_m, model.card.inputs.patch_px
-        found = sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles)
-        return found, on_map, None if turn_radpm is None else turn_radpm[first : first + len(chord_m)]
+        on_map = count_corners_on(source.grid, compute_footprints(frames, side)) == 4
+        return sample_patches(source, frames, chord_m, patch_m=side, patch_px=px, pool=tiles), on_map
 
+    def judge(patches: Patches, on_map: NDArray[np.bool_], first: int) -> SegmentPredictions:
+        bits = find_reasons(patches, on_map, model, source)
+        asked = (bits & NO_COST == 0) & ask
+        turns = np.full(on_map.size, np.nan) if turn_radpm is None else turn_radpm[first : first + on_map.size]
+        said = predict_patches(model, patches, asked, turns)
+        power_watt, velocity_mps = correction.apply(said.mean[:, 0], said.mean[:, 1], patches.terrain_class)
+        stated = propagate_stated(said.mean, said.covariance)
+        bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
+        known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
+        horizontal = np.cos(patches.slope_rad) if model.card.label_velocity == "fused" else 1.0
+        middle = patches.pixels["height"][:, px // 2, px // 2] * HEIGHT_STEP_M
+        return SegmentPredictions(
+            reasons=bits,
+            power_watt=power_watt,
+            velocity_mps=velocity_mps * horizontal,
+            duration_std_s=stated["duration"] / horizontal,
+            energy_std_joule=stated["energy"] / horizontal,
+            terrain_class=patches.terrain_class,
+            slope_rad=np.where(known, patches.slope_rad, np.nan),
+            cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),
+            height_m=np.where(known, patches.height_min_m + middle, np.nan),
+        )
+
+    rest, first = iter(batches), 0
     with ThreadPoolExecutor(max_workers=1) as ahead:
-        waiting, first = None, 0
-        for frames in batches:
-            following, first = ahead.submit(sampled, frames, first), first + len(frames.centre_xy_m)
-            if waiting is not None:
-                yield _predict_batch(model, source, *waiting.result(), centring=centring, ask=ask)
-            waiting = following
-        if waiting is not None:
-            yield _predict_batch(model, source, *waiting.result(), centring=centring, ask=ask)
+        waiting = [ahead.submit(sample, frames) for frames in islice(rest, 1)]
+        while waiting:
+            patches, on_map = waiting.pop().result()
+            waiting = [ahead.submit(sample, frames) for frames in islice(rest, 1)]
+            yield judge(patches, on_map, first)
+            first += on_map.size
 
 
-def _predict_batch(
-    model: Model,
-    source: MapReader,
-    patches: Patches,
-    on_map: NDArray[np.bool_],
-    turn_radpm: Floats | None,
-    *,
-    centring: BiasCorrection,
-    ask: bool,
-) -> SegmentPredictions:
-    bits = find_reasons(patches, on_map, model, source)
-    asked = (bits & NO_COST == 0) & ask
-    said = predict_patches(model, patches, asked, turn_radpm)
-    power_watt, velocity_mps = centring.apply(said.mean[:, 0], said.mean[:, 1], patches.terrain_class)
-    stated = propagate_stated(said.mean, said.covariance)
-    bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
-    known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
-    horizontal = np.cos(patches.slope_rad) if model.card.label_velocity == "fused" else 1.0
-    middle = (
-        patches.pixels["height"][:, model.card.inputs.patch_px // 2, model.card.inputs.patch_px // 2] * HEIGHT_STEP_M
-    )
-    return SegmentPredictions(
-        reasons=bits,
-        power_watt=power_watt,
-        velocity_mps=velocity_mps * horizontal,
-        duration_std_s=stated["duration"] / horizontal,
-        energy_std_joule=stated["energy"] / horizontal,
-        terrain_class=patches.terrain_class,
-        slope_rad=np.where(known, patches.slope_rad, np.nan),
-        cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),
-        height_m=np.where(known, patches.height_min_m + middle, np.nan),
-    )
+def predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats) -> Prediction:
+    """Return what the model says of the patches that it is asked about, shape (N,), else NaN; tensors are formed in batches.
+
+    ``turn_radpm`` is how far a metre of each turns; NaN is as usual, and so is the speed that is commanded.
+    """
+    form = model.card.layout
+    pixels = {layer: patches.pixels[layer] for layer in form.layers}
+    out, unknown = Prediction.without_covariance(np.full((asked.size, 2), np.nan)), np.full(asked.size, np.nan)
+    extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turn_radpm, unknown)
+    chosen = np.flatnonzero(asked)
+    for rows in (chosen[first : first + form.batch_rows] for first in range(0, chosen.size, form.batch_rows)):
+        said = model.ask(form.form(pixels, rows), extra_features.take(rows))
+        if said.mean.shape[1] != 2:
+            raise ModelError(
+                f"{model.name}: gives {said.mean.shape[1]} numbers a patch, expected two: power and velocity; train it on both labels"
+            )
+        out.mean[rows], out.covariance[rows] = said.mean, said.covariance
+    out.mean[~(np.isfinite(out.mean).all(axis=1) & (out.mean[:, 1] > 0.0))] = np.nan
+    return out
 
 
 def predict_segments(

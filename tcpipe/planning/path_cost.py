@@ -1,4 +1,4 @@
-"""The cost of a path: cut into pieces of a metre, one prediction each, and summed (paper, section III)."""
+"""The cost of a path: cut into segments of a metre, one prediction each, and summed (paper, section III)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathTotals:
-    """What a path costs in all, over the pieces that have a cost, by which model, on which map, for which robot."""
+    """What a path costs in all, over the path segments that have a cost, by which model, on which map, for which robot."""
 
     model: str
     map: str
@@ -51,8 +51,8 @@ class PathTotals:
     adapted_by: str | None = field(default=None, metadata=LEFT_OUT)
     """Run whose metres adapted the model."""
     length_m: float
-    pieces: int
-    pieces_without_cost: int
+    path_segments: int
+    path_segments_without_cost: int
     duration_s: float
     energy_joule: float
     turn_rad: float = 0.0
@@ -71,16 +71,16 @@ class PathTotals:
     held_out_runs: int = 0
     """Samples that determine the intervals."""
     reasons: Mapping[str, int]
-    """Pieces by reason; a piece may have several."""
+    """By reason; a path segment may have several."""
     complete: bool
-    """Whether all pieces have a cost."""
+    """Whether all path segments have a cost."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathCost:
-    """What a path costs; ``pieces`` is a checked table (`PIECES`), one row a piece in order."""
+    """What a path costs; ``path_segments`` is a checked table (`PATH_SEGMENTS`), one row a path segment in order."""
 
-    pieces: pa.Table
+    path_segments: pa.Table
     totals: PathTotals
     errors: Mapping[str, SumDistribution] | None
     """Of ``duration`` [s] and ``energy`` [J] in all; None without held-out samples."""
@@ -127,26 +127,26 @@ def compute_path_cost(
     lonlat_deg : the path's points, WGS 84, shape (P, 2).
     where : what the path is called in errors.
     known : metres of a run of the robot that is to drive the path.
-    shortest_m : the least length of a path, without it that of a piece.
+    shortest_m : the least length of a path, without it that of a path segment.
     """
     check_model(model, source)
-    pieces = _cut_into_pieces(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
-    frames = pieces.frames(model.card.chord_m)
+    segments = _cut_into_segments(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
+    frames = segments.frames(model.card.chord_m)
     if not count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
-    turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
-    turn_radpm = turn_rad / pieces.arc_m
+    turn_rad = compute_turns(segments.start_xy_m, segments.end_xy_m)
+    turn_radpm = turn_rad / segments.arc_m
     usual_radpm = 0.0 if model.card.physics is None else model.card.physics.mean_turn_radpm
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
     said = predict_segments(model, source, frames, turn_radpm)
-    said.reasons[pieces.arc_m > model.card.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
-    return _sum_costs(model, source, pieces, said, turn_rad, known)
+    said.reasons[segments.arc_m > model.card.max_arc_to_chord * segments.chord_m] |= np.uint16(Reason.CURVED)
+    return _sum_costs(model, source, segments, said, turn_rad, known)
 
 
-def _cut_into_pieces(
+def _cut_into_segments(
     source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None
-) -> Pieces:
-    """Return the pieces of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
+) -> PathSegments:
+    """Return the path segments of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
     projection = find_projection(source)
     xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
@@ -155,13 +155,13 @@ def _cut_into_pieces(
     scale = float(np.mean(np.sqrt(np.abs(np.linalg.det(make_metres_from_plane(projection.target, xy_m))))))
     if not length_m:
         raise PathError(f"{where}: is one point; expected a path of at least {chord_m:g} m")
-    pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)
-    if not pieces.chord_m.size or pieces.chord_m[0] < (shortest_m or chord_m) * (1.0 - 1e-6):
+    segments = cut_path(xy_m, chord_m=chord_m, scale=scale)
+    if not segments.chord_m.size or segments.chord_m[0] < (shortest_m or chord_m) * (1.0 - 1e-6):
         raise PathError(
             f"{where}: is {length_m * scale:.2f} m long and never {chord_m:g} m from where it starts; "
             f"expected a path of at least {chord_m:g} m"
         )
-    return pieces
+    return segments
 
 
 def find_added_turning(model: Model) -> Turning | None:
@@ -172,15 +172,15 @@ def find_added_turning(model: Model) -> Turning | None:
 def _sum_costs(  # noqa: PLR0917
     model: Model,
     source: MapReader,
-    pieces: Pieces,
+    segments: PathSegments,
     said: SegmentPredictions,
     turn_rad: Floats,
     known: Run | None,
 ) -> PathCost:
     class_id, errors, turning = said.terrain_class, model.errors, find_added_turning(model)
     nothing = np.full(len(class_id), np.nan)
-    duration = pieces.arc_m / said.velocity_mps
-    turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
+    duration = segments.arc_m / said.velocity_mps
+    turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, segments.arc_m, class_id)
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
     found = {
@@ -190,17 +190,17 @@ def _sum_costs(  # noqa: PLR0917
     if known is not None and errors is None:
         raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
     if errors is not None:
-        begin_m, rise_m = ELSEWHERE_M + np.cumsum(pieces.arc_m), pieces.arc_m * np.tan(said.slope_rad)
+        begin_m, rise_m = ELSEWHERE_M + np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
         for name, of in found.items():
-            std = pieces.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
-            there = Metres(of.value, nothing, class_id, begin_m, pieces.arc_m, duration, rise_m, turn_rad, std)
+            std = segments.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
+            there = Metres(of.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std)
             found[name] = (
                 predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
             )
     time, joule = found["duration"], found["energy"]
-    table = PIECES.table(
-        piece=np.arange(len(class_id)),
-        **_locate_pieces(source, pieces),
+    table = PATH_SEGMENTS.table(
+        path_segment=np.arange(len(class_id)),
+        **_locate_segments(source, segments),
         terrain_class=class_id,
         terrain_name=source.classes.names()[class_id].tolist(),
         slope_rad=said.slope_rad,
@@ -226,9 +226,9 @@ def _sum_costs(  # noqa: PLR0917
         robot=model.card.robot,
         label_energy=model.card.label_energy,
         adapted_by=None if known is None else known.name,
-        length_m=float(pieces.arc_m.sum()),
-        pieces=table.num_rows,
-        pieces_without_cost=without_cost,
+        length_m=float(segments.arc_m.sum()),
+        path_segments=table.num_rows,
+        path_segments_without_cost=without_cost,
         duration_s=float(np.nansum(time.value)),
         energy_joule=float(np.nansum(joule.value)),
         turn_rad=float(turn_rad.sum()),
@@ -244,19 +244,19 @@ def _sum_costs(  # noqa: PLR0917
     return PathCost(table, totals, sums)
 
 
-def _locate_pieces(source: MapReader, pieces: Pieces) -> dict[str, Floats]:
-    """Return where the pieces lie, as columns."""
+def _locate_segments(source: MapReader, segments: PathSegments) -> dict[str, Floats]:
+    """Return where the path segments lie, as columns."""
     projection = find_projection(source)
-    start, end = (projection.inverse(xy_m) for xy_m in (pieces.start_xy_m, pieces.end_xy_m))
+    start, end = (projection.inverse(xy_m) for xy_m in (segments.start_xy_m, segments.end_xy_m))
     azimuth_deg, _, _ = Geod(ellps="WGS84").inv(start[:, 0], start[:, 1], end[:, 0], end[:, 1])
     return {
         "start_lon_deg": start[:, 0],
         "start_lat_deg": start[:, 1],
         "end_lon_deg": end[:, 0],
         "end_lat_deg": end[:, 1],
-        "distance_m": np.cumsum(pieces.arc_m) - pieces.arc_m,
-        "chord_m": pieces.chord_m,
-        "arc_length_m": pieces.arc_m,
+        "distance_m": np.cumsum(segments.arc_m) - segments.arc_m,
+        "chord_m": segments.chord_m,
+        "arc_length_m": segments.arc_m,
         "course_rad": wrap_to_pi(np.radians(90.0 - np.asarray(azimuth_deg))),
     }
 
@@ -277,12 +277,12 @@ def describe_off_map(source: MapReader, where: str, lonlat_deg: Floats) -> str:
 
 _F, _WGS84 = pa.float64(), "WGS84"
 
-PIECES = TableSchema(
-    "pieces",
+PATH_SEGMENTS = TableSchema(
+    "path segments",
     "path",
     "Segments of a path in order, with their costs (tcpipe predict-path).",
     (
-        Column("piece", pa.int64(), "", "Number of the path segment, from 0."),
+        Column("path_segment", pa.int64(), "", "Number of the path segment, from 0."),
         Column("start_lon_deg", _F, "deg", "Longitude of its start.", _WGS84),
         Column("start_lat_deg", _F, "deg", "Latitude of its start.", _WGS84),
         Column("end_lon_deg", _F, "deg", "Longitude of its end.", _WGS84),
@@ -321,21 +321,21 @@ def check_ending(path: Path) -> None:
         raise UsageError(f"{path}: is a directory, expected a file")
 
 
-def write_pieces(path: Path, table: pa.Table) -> None:
+def write_path_segments(path: Path, table: pa.Table) -> None:
     """Write the table in the format of the file's ending, whole or not at all."""
     match path.suffix.lower():
         case ".parquet":
             write_table(table, path)
         case ".json":
-            write_json(path, {"pieces": table.to_pylist()})
+            write_json(path, {"path_segments": table.to_pylist()})
         case _:
             with write_atomic_file(path) as temporary:
                 csv.write_csv(table, temporary)
 
 
 @dataclass(frozen=True, slots=True)
-class Pieces:
-    """N pieces of a path, in order.
+class PathSegments:
+    """N path segments of a path, in order.
 
     Attributes
     ----------
@@ -351,14 +351,14 @@ class Pieces:
     scale: float
 
     def frames(self, chord_m: float) -> PatchFrames:
-        """Return the patch of each piece; that of a shorter last one ends with it and reaches back over the piece before."""
+        """Return the patch of each path segment; that of a shorter last one ends with it and reaches back over the one before."""
         along = (self.end_xy_m - self.start_xy_m) / np.linalg.norm(self.end_xy_m - self.start_xy_m, axis=1)[:, None]
         start = self.end_xy_m - along * (chord_m / self.scale)
         return make_patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))
 
 
-def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
-    """Return the pieces of a polyline.
+def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> PathSegments:
+    """Return the path segments of a polyline.
 
     Parameters
     ----------
@@ -371,4 +371,4 @@ def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
     ends = np.array([(x, y) for x, y, _ in cuts]).reshape(-1, 2)
     arc = np.diff(np.array([length for _, _, length in cuts])) * scale
     chord = np.linalg.norm(np.diff(ends, axis=0), axis=1) * scale
-    return Pieces(ends[:-1], ends[1:], chord, arc, scale)
+    return PathSegments(ends[:-1], ends[1:], chord, arc, scale)

@@ -23,10 +23,16 @@ from tcpipe.formats.json_files import convert_record, digest, read_as, write_jso
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.learning.models import Model
-from tcpipe.planning.cost_grid import make_survey, read_survey
+from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import check_model
-from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, find_added_turning, write_pieces
+from tcpipe.planning.path_cost import (
+    PathTotals,
+    check_ending,
+    compute_path_cost,
+    find_added_turning,
+    write_path_segments,
+)
 from tcpipe.planning.path_options import PlanPathOptions
 from tcpipe.planning.plan import OBJECTIVES, Objective, Plan, PlanTotals, plan_paths
 from tcpipe.store import open_store
@@ -52,7 +58,7 @@ _PATH_VERSION = "1.2"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableTotals(PathTotals):
-    """All of ``<table>.summary.json`` but its seal: what a table of pieces is made from, and what the path costs in all."""
+    """All of ``<table>.summary.json`` but its seal: what a table of path segments is made from, and what the path costs in all."""
 
     key: str
     """Hash of the path, the model and the map."""
@@ -81,7 +87,7 @@ class PathResult(PathTotals):
         lines = [f"{self.path}: {format_cost(self)}{above}", *findings]
         if self.out is not None:
             same = "; nothing to do: it is made from the same path, model and map"
-            lines.append(f"{self.out}: {self.pieces} path segments{same if self.status == 'unchanged' else ''}")
+            lines.append(f"{self.out}: {self.path_segments} path segments{same if self.status == 'unchanged' else ''}")
         return clean_lines(lines)
 
 
@@ -89,7 +95,7 @@ def format_cost(of: PathTotals) -> str:
     """Return length, time and energy with their intervals, as one line."""
     duration = _format_quantity(of.duration_s, of.duration_interval_s, "s")
     energy = _format_quantity(of.energy_joule, of.energy_interval_joule, "J")
-    part = "" if of.complete else f", without {of.pieces_without_cost} of {of.pieces} path segments"
+    part = "" if of.complete else f", without {of.path_segments_without_cost} of {of.path_segments} path segments"
     turns = (
         ""
         if of.turn_energy_joule is None
@@ -109,7 +115,7 @@ def _format_quantity(value: float, interval: tuple[float, float] | None, unit: s
 def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
     """Yield where the model has no support on a path, and how little its intervals rest on."""
     for reason, count in of.reasons.items():
-        names, total = {"reason": reason.replace("_", " ")}, of.pieces
+        names, total = {"reason": reason.replace("_", " ")}, of.path_segments
         yield make_finding("path-not-supported", path, names=names, segment_count=count, total_count=total)
     if of.duration_interval_s is None:
         yield make_finding("no-intervals", path)
@@ -124,7 +130,7 @@ def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
 def predict_path(
     model: Model, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
 ) -> PathResult:
-    """Return what the line in a GeoJSON file costs; write its pieces to ``out`` and the totals beside it.
+    """Return what the line in a GeoJSON file costs; write its path segments to ``out`` and the totals beside it.
 
     ``adapted_by`` is a run by whose metres the model is adapted.
     """
@@ -141,14 +147,14 @@ def predict_path(
         return convert_record(known, PathResult, path=path, out=out, status="unchanged")
     cost = compute_path_cost(model, source, lonlat_deg, where=str(path), known=adapted_by)
     if out is not None:
-        write_pieces(out, cost.pieces)
+        write_path_segments(out, cost.path_segments)
         made = convert_record(cost.totals, TableTotals, key=key, sha256=compute_checksum(out).sha256)
         write_sealed(make_summary_path(out), made)
     return convert_record(cost.totals, PathResult, path=path, out=out, status="done")
 
 
 def make_summary_path(out: Path) -> Path:
-    """Return where the totals of a table of pieces stand."""
+    """Return where the totals of a table of path segments stand."""
     return out.with_name(f"{out.name}.summary.json")
 
 
@@ -299,10 +305,8 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     objective = options.objective
     if (found := _read_plans(out, picture, key)) is not None:
         return PlanResult(objective, out, picture, "unchanged", *found)
-    if costs is None or card is None:
-        survey = make_survey(model, source, options.cell_size_m)
-    else:
-        survey = read_survey(model, source, open_cost_map(costs, card))
+    known = None if costs is None or card is None else open_cost_map(costs, card)
+    survey = make_survey(model, source, options.cell_size_m if known is None else known)
     wanted = (objective, *(name for name in OBJECTIVES if picture is not None and name != objective))
     risk = RISK if options.risk is None and options.budget_joule is not None else options.risk
     step = options.on_step or (lambda _, __: None)
@@ -332,7 +336,7 @@ def _add_up(model: Model, there: Plan, back: Plan | None, budget_joule: float | 
         turning = find_added_turning(model)
         last, first = (np.diff(way.xy_m, axis=0) for way in (there, back))
         turn_rad = wrap_to_pi(np.arctan2(*first[0, ::-1]) - np.arctan2(*last[-1, ::-1]))
-        class_id = to_integers(there.cost.pieces, "terrain_class")[-1:].astype(np.uint8)
+        class_id = to_integers(there.cost.path_segments, "terrain_class")[-1:].astype(np.uint8)
         turn = 0.0 if turning is None else float(turning.energy_joule(np.array([turn_rad]), np.zeros(1), class_id)[0])
         energy, complete = energy + turn + back.totals.energy_joule, complete and back.totals.complete
         if errors is not None and back.cost.errors is not None:

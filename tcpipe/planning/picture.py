@@ -37,6 +37,8 @@ _REST_IN = 3.3
 _TITLE_IN = 0.4
 _MARGIN = 0.14
 _LEAST_SIDE_M = 40.0
+_NICE_M = tuple(step * 10.0**power for power in range(5) for step in (1.0, 2.0, 5.0))
+"""Lengths of the scale bar."""
 _ASPECT = 1.12
 _COST_MAP = "plasma"
 _STYLE: dict[Any, Any] = {
@@ -55,7 +57,8 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
     """Draw plans between the same points as PNG, a panel each; the same plans give the same bytes."""
     bounds = _crop(source, np.concatenate([plan.xy_m for plan in plans]))
     backdrop = _Backdrop(source, bounds)
-    spent = [_compute_cost_per_metre(plan) for plan in plans]
+    tables = [plan.cost.path_segments for plan in plans]
+    spent = [to_floats(table, "energy_joule") / to_floats(table, "arc_length_m") for table in tables]
     known = np.concatenate(spent)
     known = known[np.isfinite(known)]
     scale = Normalize(*(np.percentile(known, (2.0, 98.0)) if known.size else (0.0, 1.0)))
@@ -98,15 +101,11 @@ def _compute_distance(xy_m: Array) -> Array:
     return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
 
 
-def _compute_cost_per_metre(plan: Plan) -> Array:
-    return np.asarray(to_floats(plan.cost.pieces, "energy_joule") / to_floats(plan.cost.pieces, "arc_length_m"))
-
-
 def _crop(source: MapReader, xy_m: Array) -> tuple[float, float, float, float]:
     """Return x min, y min, x max, y max [m] around points: with a margin, near to the panel's shape, on the map as far as it goes."""
     low, high = xy_m.min(axis=0), xy_m.max(axis=0)
     side = (high - low) * (1.0 + 2.0 * _MARGIN)
-    side = np.maximum(side, np.maximum(side.max() * np.array([0.6, 0.6]), _LEAST_SIDE_M))
+    side = np.maximum(side, max(side.max() * 0.6, _LEAST_SIDE_M))
     side = np.array([max(side[0], side[1] * _ASPECT), max(side[1], side[0] / _ASPECT)])
     x_min, y_min, x_max, y_max = source.grid.bounds_m
     side = np.minimum(side, (x_max - x_min, y_max - y_min))
@@ -127,9 +126,8 @@ class _Backdrop:
         window = (int(row0), int(row1), int(col0), int(col1))
         layers = {layer: read_window(level, layer, *window)[::step, ::step] for layer in level.layers}
         self._height = layers["height"].astype(np.float64) + level.height_reference_m
-        pitch = level.grid.pixel_size_m * step
         self._extent = (left, right, bottom, top)
-        self._picture = _blend_picture(layers, shade_heights(self._height, pitch))
+        self._picture = _blend_picture(layers, shade_heights(self._height, level.grid.pixel_size_m * step))
         ids = np.unique(layers["terrain"]).tolist() if "terrain" in layers else []
         self.classes = [(source.classes.name(i), CLASS_COLOURS[(i - 1) % len(CLASS_COLOURS)]) for i in ids if i]
 
@@ -137,20 +135,15 @@ class _Backdrop:
         """Return the height of the nearest pixel [m], shape (N,)."""
         left, right, bottom, top = self._extent
         rows, cols = self._height.shape
-        col = ((xy_m[:, 0] - left) / (right - left) * cols).astype(np.int64)
-        row = ((top - xy_m[:, 1]) / (top - bottom) * rows).astype(np.int64)
+        share = (xy_m - (left, bottom)) / (right - left, top - bottom)
+        col, row = (share * (cols, -rows) + (0, rows)).astype(np.int64).T
         return np.asarray(self._height[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)])
 
     def draw(self, axes: Axes) -> None:
         """Draw it."""
         axes.imshow(self._picture, extent=self._extent, interpolation="bilinear")
-        axes.set_xlim(*self._extent[:2])
-        axes.set_ylim(*self._extent[2:])
-        axes.set_aspect("equal")
-        axes.set_xticks([])
-        axes.set_yticks([])
-        for spine in axes.spines.values():
-            spine.set_visible(False)
+        axes.set(xlim=self._extent[:2], ylim=self._extent[2:], xticks=[], yticks=[], aspect="equal")
+        axes.spines[:].set_visible(False)
 
 
 def _blend_picture(layers: dict[str, NDArray[Any]], light: NDArray[np.uint8]) -> Array:
@@ -168,7 +161,7 @@ def _draw_path(axes: Axes, plan: Plan, values: Array, scale: Normalize) -> LineC
     """Draw the path, coloured by what its metres cost; return the coloured line."""
     points = plan.xy_m
     length = _compute_distance(points)
-    ends = np.r_[to_floats(plan.cost.pieces, "distance_m"), plan.totals.length_m]
+    ends = np.r_[to_floats(plan.cost.path_segments, "distance_m"), plan.totals.length_m]
     at = ends / ends[-1] * length[-1]
     cuts = np.stack([np.interp(at, length, points[:, axis]) for axis in (0, 1)], axis=1)
     axes.plot(*points.T, color="white", lw=7.0, solid_capstyle="round", solid_joinstyle="round")
@@ -184,49 +177,40 @@ def _draw_ends(axes: Axes, plan: Plan) -> None:
     axes.plot(x0, y0, "o", ms=11, color="white", mec=_INK, mew=2.2, zorder=5)
     axes.plot(x1, y1, "*", ms=19, color="white", mec=_INK, mew=1.6, zorder=5)
     for x, y, name in ((x0, y0, "start"), (x1, y1, "goal")):
-        _write_above(axes, name, x, y, 11, weight="bold")
+        _write_above(axes, name, x, y)
 
 
-def _write_above(axes: Axes, text: str, x: float, y: float, points: float, *, weight: str = "normal") -> None:
+def _write_above(axes: Axes, text: str, x: float, y: float) -> None:
     axes.annotate(
-        text, (x, y), (0, points), textcoords="offset points", ha="center", fontsize=9, weight=weight, path_effects=_WHITE
-    )  # fmt: skip
+        text, (x, y), (0, 9), textcoords="offset points", ha="center", fontsize=9, weight="bold", path_effects=_WHITE
+    )
 
 
 def _draw_title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
     colour = _COLOURS[plan.totals.objective]
     axes.set_title(f"Least {plan.totals.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
-    totals = [other.totals for other in plans]
-    parts = [
-        _format_number(name, getattr(plan.totals, name), min(getattr(of, name) for of in totals)) for name in _SHOWN
-    ]
+    of, parts = plan.totals, []
+    texts = {
+        "energy_joule": f"{of.energy_joule / 1000.0:.2f} kJ",
+        "duration_s": f"{of.duration_s:.0f} s",
+        "length_m": f"{of.length_m:.0f} m",
+    }
+    for name, text in texts.items():
+        best = min(getattr(other.totals, name) for other in plans)
+        more = getattr(of, name) / best - 1.0 if best > 0.0 else 0.0
+        parts.append(f"{text} (+{more:.1%})" if more >= 0.0005 else text)
     axes.annotate(
         "     ".join(parts), (0.0, 1.0), (0, 9), xycoords="axes fraction", textcoords="offset points", fontsize=10.5
     )
 
 
-_SHOWN = ("energy_joule", "duration_s", "length_m")
-
-
-def _format_number(name: str, value: float, best: float) -> str:
-    texts = {"energy_joule": f"{value / 1000.0:.2f} kJ", "duration_s": f"{value:.0f} s", "length_m": f"{value:.0f} m"}
-    more = value / best - 1.0 if best > 0.0 else 0.0
-    return f"{texts[name]} (+{more:.1%})" if more >= 0.0005 else texts[name]
-
-
 def _draw_scale_bar(axes: Axes, bounds: tuple[float, float, float, float]) -> None:
     left, bottom, right, top = bounds
-    length = _round_nicely((right - left) / 4.0)
+    length = max(step for step in _NICE_M if step <= max((right - left) / 4.0, _NICE_M[0]))
     x, y = left + 0.04 * (right - left), bottom + 0.05 * (top - bottom)
     axes.plot((x, x + length), (y, y), color="white", lw=6, solid_capstyle="butt")
     axes.plot((x, x + length), (y, y), color=_INK, lw=3, solid_capstyle="butt")
-    _write_above(axes, f"{length:g} m", x + length / 2.0, y, 6)
-
-
-def _round_nicely(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above ``value``."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
-    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1.0 + 1e-9)))
+    _write_above(axes, f"{length:g} m", x + length / 2.0, y)
 
 
 def _draw_profiles(axes: Axes, backdrop: _Backdrop, plans: Sequence[Plan]) -> None:

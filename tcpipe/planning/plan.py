@@ -12,7 +12,6 @@ returned is the one that costs least as `tcpipe predict-path` predicts it.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -117,11 +116,6 @@ def plan_paths(
     allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
     risk : the probability with which a path shall take no more than what is least; None: its prediction is least.
     step : is told how many blocks of how many are looked at, or predicted, in each round.
-
-    Raises
-    ------
-    PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
-    ModelError : the model states no errors for ``risk``.
     """
     errors = survey.model.errors
     if risk is not None and errors is None:
@@ -138,7 +132,7 @@ def plan_paths(
     plans = {}
     for objective in objectives:
         of_all = [_judge(cost, objective, risk) for cost in costs]
-        best = min(range(len(lines)), key=lambda at, of_all=of_all: (costs[at].totals.pieces_without_cost, of_all[at]))  # type: ignore[misc]
+        best = min((cost.totals.path_segments_without_cost, of_all[at], at) for at, cost in enumerate(costs))[-1]
         totals = convert_record(
             costs[best].totals,
             PlanTotals,
@@ -218,18 +212,13 @@ class _Search:
     def _check_open(self) -> None:
         """Raise `PathError` for an end from which no course can be driven; both at once."""
         bits = self.survey.costs.reasons.reshape(len(self.survey.costs.reasons), -1)[:, self._cells]
-        problems = []
-        for label, own in zip(
-            ("--from", "--to"), (bits & (BARRED if self.allow_extrapolation else 0xFFFF)).T, strict=True
-        ):
+        forbidden, problems = BARRED if self.allow_extrapolation else 0xFFFF, []
+        for label, own in zip(("--from", "--to"), (bits & forbidden).T, strict=True):
             if own.all():
                 common = int(np.bitwise_and.reduce(own)) or int(np.bitwise_or.reduce(own))
                 words = ", ".join(name.replace("_", " ") for name in flag_names(common, Reason))
-                hint = (
-                    ""
-                    if self.allow_extrapolation or common & BARRED
-                    else ", or allow such ground with --allow-extrapolation"
-                )
+                is_closed = self.allow_extrapolation or common & BARRED
+                hint = "" if is_closed else ", or allow such ground with --allow-extrapolation"
                 problems.append(
                     f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"
                 )
@@ -326,8 +315,8 @@ class _Search:
                 *(int(np.count_nonzero(cells & ~survey.predicted)) for cells in (probes | ellipse, open_)),
                 COURSES,
             )
-        pace_s = self._ask(probes, 0.0)
-        pace_s = self._ask(ellipse, pace_s)
+        self._ask(probes)
+        self._ask(ellipse)
         while True:
             steps, paths = self._find(objective, survey.predicted, class_id)
             wanted = self._could_be_better(objective, paths[0] if paths else None, class_id)
@@ -335,7 +324,7 @@ class _Search:
                 if not paths:
                     raise PathError(self._no_way())
                 return steps, paths
-            pace_s = self._ask(wanted, pace_s)
+            self._ask(wanted)
 
     def _maybe_open(self) -> NDArray[np.bool_]:
         """Return where a course may be driven as far as is known, shape (16, rows, cols)."""
@@ -357,15 +346,11 @@ class _Search:
         wanted.reshape(-1)[cells[np.argsort(over[cells], kind="stable")[:most]]] = True
         return wanted
 
-    def _ask(self, wanted: Mask, pace_s: float) -> float:
-        """Ask the model about cells; say how many, and how long that takes at ``pace_s`` a cell. Return the pace."""
-        count = int(np.count_nonzero(wanted & ~self.survey.predicted))
-        if not count:
-            return pace_s
-        logger.info("predicting %d cells%s", count, f", about {count * pace_s:.0f} s" if pace_s else "")
-        begun_s = time.monotonic()
-        self.survey.predict(wanted, self.step)
-        return (time.monotonic() - begun_s) / count
+    def _ask(self, wanted: Mask) -> None:
+        """Ask the model about cells, and log how many."""
+        if count := int(np.count_nonzero(wanted & ~self.survey.predicted)):
+            logger.info("predicting %d cells", count)
+            self.survey.predict(wanted, self.step)
 
     def _draw_lines(self, steps: Steps, paths: Iterable[LeastCostPath]) -> Iterator[Floats]:
         """Yield each path in the map's CRS [m], from end to end as they were given: as its steps, and as straight lines that cost less."""

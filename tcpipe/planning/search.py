@@ -222,9 +222,9 @@ class Turning:
     def energy_joule(
         self, turn_rad: Floats, length_m: Floats, class_id: NDArray[np.uint8], *, is_driven: bool = False
     ) -> Floats:
-        """Return what turns cost beyond the usual [J], shape (N,), of N pieces of path of these lengths on these classes.
+        """Return what turns cost beyond the usual [J], shape (N,), of N path segments of path of these lengths on these classes.
 
-        A piece that was driven may turn less than usual and cost less; a drawn one turns no less: nobody drives as straight as a line.
+        A driven one may turn less than usual and cost less; a drawn one turns no less: nobody drives as straight as a line.
         """
         beyond_rad = np.abs(turn_rad) - self.usual_radpm * length_m
         return np.asarray(self.joule_per_rad[class_id] * (beyond_rad if is_driven else np.maximum(beyond_rad, 0.0)))

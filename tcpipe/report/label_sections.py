@@ -129,10 +129,6 @@ def describe_physics(robot: str, fit: PhysicsFit) -> str:
     if fit.held_out is not None:
         text += f" On held-out fifths it explains {fit.held_out.r2:.2f} of the variance of E (R²), "
         text += f"mean error {100 * fit.held_out.mape:.0f} % where it is 10 J and more"
-        if fit.without_turning is not None and fit.gain_of_turning is not None:
-            low, high = (round(gain, 2) + 0.0 for gain in fit.gain_of_turning)  # no -0.00
-            without = f"{fit.without_turning.r2:.2f} and {100 * fit.without_turning.mape:.0f} %"
-            text += f"; without turning {without} (R² by turning {low:+.2f} to {high:+.2f}, 90 %)"
         text += "."
     return text
 

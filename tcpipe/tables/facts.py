@@ -347,11 +347,8 @@ class PhysicsFit:
     """Share of all energy by term."""
     held_out: PhysicsScore | None
     """None with too few segments to fit."""
-    without_turning: PhysicsScore | None
     mean_turn_radpm: float
     """Mean turn per metre, both ways counted."""
-    gain_of_turning: tuple[float, float] | None
-    """Gain of the held-out R² by turning: 90 % interval over blocks of segments."""
 
 
 @dataclass(frozen=True, slots=True)

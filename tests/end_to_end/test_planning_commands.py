@@ -43,17 +43,17 @@ def _run(*arguments: str | Path, cwd: Path, code: int = 0) -> str:
     return done.stdout
 
 
-def test_a_path_is_costed_and_its_pieces_add_up(place: Path):
-    command = ("predict-path", "model", "--path", "path.geojson", "--out", "pieces.csv")
+def test_a_path_is_costed_and_its_segments_add_up(place: Path):
+    command = ("predict-path", "model", "--path", "path.geojson", "--out", "path-segments.csv")
     said = json.loads(_run(*command, "--json", "--quiet", cwd=place))
-    table = pyarrow.csv.read_csv(place / "pieces.csv")
-    assert table.num_rows == said["pieces"] == 19
+    table = pyarrow.csv.read_csv(place / "path-segments.csv")
+    assert table.num_rows == said["path_segments"] == 19
     for name in ("duration_s", "energy_joule"):
         assert np.sum(table.column(name).to_numpy()) == pytest.approx(said[name], rel=1e-9)
     assert said["energy_interval_joule"][0] < said["energy_interval_joule"][1]
-    before = (place / "pieces.csv").stat().st_mtime_ns
+    before = (place / "path-segments.csv").stat().st_mtime_ns
     assert "nothing to do" in _run(*command, cwd=place)
-    assert (place / "pieces.csv").stat().st_mtime_ns == before
+    assert (place / "path-segments.csv").stat().st_mtime_ns == before
 
 
 def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
@@ -116,7 +116,7 @@ def test_a_route_graph_gets_the_costs_of_its_edges(place: Path):
     [
         (("predict-path", "none", "--path", "path.geojson"), 2, "no such directory"),
         (("predict-path", "model", "--path", "none.geojson"), 2, "no such file"),
-        (("predict-path", "model", "--path", "path.geojson", "--out", "pieces.txt"), 2, "ends in .csv"),
+        (("predict-path", "model", "--path", "path.geojson", "--out", "path-segments.txt"), 2, "ends in .csv"),
         (
             ("plan-path", "model", "--from", _FROM, "--to", _TO, "--budget", "300"),
             2,

@@ -55,7 +55,6 @@ from tcpipe.pipeline.calls import (
     LogWriter,
     commit_call,
     estimate,
-    measure_call,
     open_log,
     start_stopwatch,
 )
@@ -152,7 +151,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
-    watch, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
+    measure, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
     out, store, tags, dry_run = options.out, options.store, options.tags or {}, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
     opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
@@ -216,7 +215,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         dataset = _describe_dataset(result, inputs)
         replaced = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
         call.kind = "built"
-        call.end = Entries(datasets=(dataset,), forgotten=replaced, calls=(measure_call(watch, took),))
+        call.end = Entries(datasets=(dataset,), forgotten=replaced, calls=(measure(took),))
     return result
 
 

@@ -20,7 +20,6 @@ EARLIER = [
     ("plan-path", ["--step", "2"], "cell_size_m", 2.0),
     ("plan-path", ["--allow-unseen"], "allow_extrapolation", True),
     ("cost-map", ["--step", "2"], "cell_size_m", 2.0),
-    ("reproduce", ["--hidden", "2"], "hidden_variance", 2.0),
 ]
 
 

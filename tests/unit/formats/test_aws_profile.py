@@ -7,7 +7,7 @@ from object_gateway import in_environment
 from storage_server import READ_ONLY, object_store
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.aws_profile import read_aws_profile
+from tcpipe.formats.object_storage import read_aws_profile
 from tcpipe.formats.place import open_place
 
 CREDENTIALS = """

@@ -77,7 +77,7 @@ def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
     pixels = split.layers(np.arange(20))
     asked = np.arange(20) != 3
     ground = {name: split.column(name)[:20] for name in ("terrain_class", "slope_rad")}
-    said = predict_patches(model, SimpleNamespace(pixels=pixels, **ground), asked)
+    said = predict_patches(model, SimpleNamespace(pixels=pixels, **ground), asked, np.full(20, np.nan))
     assert np.isnan(said.mean[3, 0])
     assert said.mean[asked, 0] == pytest.approx(model.predict(split.patches[:20]).mean[asked, 0])
 

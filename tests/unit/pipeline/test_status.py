@@ -146,7 +146,7 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     os.utime(logs / "whole.mcap", ns=(OLD_NS, OLD_NS + 1))
     line = f"{logs / 'passing.mcap'}: No space left on device (28)"
     call = CallRecord("ingest", "0", 3, {"failed": 1}, failed={str(logs / "passing.mcap"): line})
-    open_log(Store(store)).commit("ended", Entries(calls=(calls.measure_call(calls.start_stopwatch(), call),)))
+    open_log(Store(store)).commit("ended", Entries(calls=(calls.start_stopwatch()(call),)))
     found = where(night)
     assert found.counts == {"done": 2, "quarantined": 1, "growing": 1, "pending": 2, "failed_transient": 1}
     told = {(group.state, group.cause): group.logs for group in found.groups}

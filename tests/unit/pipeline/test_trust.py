@@ -111,7 +111,7 @@ def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
         shutil.rmtree(directory / "index")  # is believed by nobody: test_index.py
     listed = [path for path in files(directory) if path.name not in SEALED]
     whole = {path: path.read_bytes() for path in files(directory)}
-    for place in (0.0, *rng.random(5), 1.0):  # all that are listed at once, then each sealed one alone
+    for place in (0.0, *rng.random(2), 1.0):  # all that are listed at once, then each sealed one alone
         for path in listed:
             flip(path, place, bit=int(rng.integers(8)))
         problems = verify(directory).problems
@@ -119,7 +119,7 @@ def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
         for path in listed:
             path.write_bytes(whole[path])
     for path in set(whole) - set(listed):
-        for place in (0.0, *rng.random(8), 1.0):
+        for place in (0.0, *rng.random(4), 1.0):
             flip(path, place, bit=int(rng.integers(8)))
             problems = find_broken_seal(path.read_bytes(), path) if place else "".join(verify(directory).problems)
             assert str(path) in (problems or ""), (path, place)
@@ -348,23 +348,18 @@ def test_causes_and_effects_are_named(made, copy, tmp_path):
     assert "28 only in b" in lines
 
 
-def test_the_shift_of_labels_is_that_of_scipy(made, copy, tmp_path):
-    from scipy.stats import ks_2samp
-
+def test_the_shift_of_labels_is_over_all_samples(made, copy, tmp_path):
     store = Store(copy("store"))
     start, end = lanes((18.0,), -14.0, 14.0)
     add_run(store, "later", segments("later", start, end + 0.0, start_ns=int(2e18)))
     build_dataset(tmp_path / "b", store=store.root, recipe=Recipe())
     found = diff(made / "zarr", tmp_path / "b")
-    a, b = (
-        np.concatenate([part.samples["power_watt"].to_numpy() for part in open_dataset(path).values()])
-        for path in (made / "zarr", tmp_path / "b")
-    )
-    assert found.labels["power_watt"]["largest_gap"] == pytest.approx(ks_2samp(a, b).statistic)
-    assert found.labels["power_watt"]["mean_b"] == pytest.approx(b.mean())
-    a, b = (open_dataset(path)["train"].samples["power_watt"].to_numpy() for path in (made / "zarr", tmp_path / "b"))
-    assert found.labels_of_train["power_watt"]["largest_gap"] == pytest.approx(ks_2samp(a, b).statistic)
-    assert any(line.startswith("power_watt in train: mean ") for line in str(found).splitlines())
+    for path, name in ((made / "zarr", "a"), (tmp_path / "b", "b")):
+        values = np.concatenate([part.samples["velocity_mps"].to_numpy() for part in open_dataset(path).values()])
+        assert found.labels["velocity_mps"][f"mean_{name}"] == pytest.approx(values.mean())
+        assert found.labels["velocity_mps"][f"std_{name}"] == pytest.approx(values.std())
+    lines = [line for line in str(found).splitlines() if " of all samples: mean " in line]
+    assert [line.partition(" ")[0] for line in lines] == ["velocity_mps"], "nothing else differs but by rounding"
 
 
 @pytest.mark.parametrize("counts", [(0, 3), (3, 0), (40, 50)])

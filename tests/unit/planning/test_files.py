@@ -47,23 +47,23 @@ def _write_path(path: Path, points) -> None:
 
 @pytest.mark.parametrize("ending", ["csv", "parquet", "json"])
 def test_the_table_is_the_same_in_every_format(source, path, ending):
-    out = path.with_name(f"pieces.{ending}")
+    out = path.with_name(f"path-segments.{ending}")
     found = predict_path(MODEL, source, path, out)
     assert found.status == "done"
     assert found.exit_code == 0
     rows = {
         "csv": lambda: pyarrow.csv.read_csv(out).to_pylist(),
         "parquet": lambda: pyarrow.parquet.read_table(out).to_pylist(),
-        "json": lambda: json.loads(out.read_text())["pieces"],
+        "json": lambda: json.loads(out.read_text())["path_segments"],
     }[ending]()
-    assert len(rows) == found.pieces == 18
+    assert len(rows) == found.path_segments == 18
     assert sum(row["energy_joule"] for row in rows) == pytest.approx(found.energy_joule, rel=1e-9)
     assert rows[0]["terrain_name"] == "grass"
     assert json.loads(make_summary_path(out).read_text())["duration_s"] == found.duration_s
 
 
 def test_parquet_says_units_and_what_the_bits_mean(source, path):
-    out = path.with_name("pieces.parquet")
+    out = path.with_name("path-segments.parquet")
     predict_path(MODEL, source, path, out)
     schema = pyarrow.parquet.read_schema(out)
     assert schema.field("energy_joule").metadata[b"unit"] == b"J"
@@ -71,7 +71,7 @@ def test_parquet_says_units_and_what_the_bits_mean(source, path):
 
 
 def test_a_second_call_does_nothing_until_something_changes(source, path):
-    out = path.with_name("pieces.csv")
+    out = path.with_name("path-segments.csv")
     first = predict_path(MODEL, source, path, out)
     second = predict_path(MODEL, source, path, out)
     assert second.status == "unchanged"
@@ -87,7 +87,7 @@ def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
     found = predict_path(MODEL, source, tmp_path / "off.geojson", None)
     assert found.exit_code == 3
     assert "outside map" in str(found)
-    assert f"without {found.pieces_without_cost} of {found.pieces} path segments" in str(found)
+    assert f"without {found.path_segments_without_cost} of {found.path_segments} path segments" in str(found)
 
 
 def _request(source, **options) -> PlanPathOptions:
@@ -153,7 +153,7 @@ def test_files_of_the_user_are_left_alone(source, path):
 
 def test_names_and_points_that_cannot_be_are_one_line(source, path, tmp_path):
     with pytest.raises(UsageError, match=r"ends in \.csv"):
-        predict_path(MODEL, source, path, tmp_path / "pieces.xlsx")
+        predict_path(MODEL, source, path, tmp_path / "path-segments.xlsx")
     with pytest.raises(UsageError, match=r"ends in \.geojson"):
         plan(MODEL, source, _request(source, out=tmp_path / "plan.kml"))
     with pytest.raises(UsageError, match=r"ends in \.png"):

@@ -16,7 +16,7 @@ from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
 MODEL = PhysicsModel()
-TURNS = PhysicsFit(500, (PhysicsTerm("turning", "all", 80.0, 2.0, "J/rad"),), {}, 0.4, 8.0, {}, None, None, 0.05, None)
+TURNS = PhysicsFit(500, (PhysicsTerm("turning", "all", 80.0, 2.0, "J/rad"),), {}, 0.4, 8.0, {}, None, 0.05)
 SCALE = 1.0 / 0.9996
 """Ground metres a map metre on the central meridian of a UTM zone."""
 
@@ -51,13 +51,13 @@ def test_a_model_of_the_velocity_along_the_surface_takes_longer_for_a_metre_of_t
 def test_the_rest_of_a_path_is_paid_by_its_length():
     source = plane()
     found = _cost(source, (5.0, 5.0), (5.0 + 7.4 / SCALE, 5.0))
-    assert found.pieces.num_rows == 8
+    assert found.path_segments.num_rows == 8
     assert found.totals.duration_s == pytest.approx(7.4 / velocity_mps(4, 0.0), rel=1e-4)
 
 
 def test_each_metre_has_the_class_under_it():
     source = plane(classes=lambda east, _: np.where(east < 12.0, 4, 7))
-    found = _cost(source, (4.0, 12.0), (20.0, 12.0)).pieces
+    found = _cost(source, (4.0, 12.0), (20.0, 12.0)).path_segments
     assert found.column("terrain_name").to_pylist()[:7] == ["grass"] * 7
     assert found.column("terrain_class").to_pylist()[-4:] == [7] * 4
     assert found.column("course_rad").to_numpy() == pytest.approx(0.0, abs=1e-4)
@@ -84,31 +84,33 @@ def test_each_metre_has_the_class_under_it():
 )
 def test_ground_that_training_has_not_seen_is_marked_and_still_costed(changes, reason):
     found = _cost(plane(rise_east=0.2), (4.0, 12.0), (9.0, 12.0), model=replace(MODEL, **changes))
-    assert found.totals.reasons == {str(reason.name).lower(): found.pieces.num_rows}
+    assert found.totals.reasons == {str(reason.name).lower(): found.path_segments.num_rows}
     assert found.totals.complete
 
 
 def test_what_cannot_be_driven_has_no_cost_and_the_lane_beside_it_is_marked():
     source = plane(classes=lambda _, north: np.where(np.abs(north - 12.0) < 0.9, 2, 4))
     through = _cost(source, (12.0, 2.0), (12.0, 22.0))
-    assert 1 <= through.totals.pieces_without_cost <= 3
-    assert through.totals.pieces_without_cost == through.totals.reasons["not_traversable"]
+    assert 1 <= through.totals.path_segments_without_cost <= 3
+    assert through.totals.path_segments_without_cost == through.totals.reasons["not_traversable"]
     assert not through.totals.complete
     extra_features = _cost(source, (4.0, 13.1), (20.0, 13.1))
     assert extra_features.totals.complete
-    assert extra_features.totals.reasons["obstacle"] == extra_features.pieces.num_rows
+    assert extra_features.totals.reasons["obstacle"] == extra_features.path_segments.num_rows
 
 
 def test_holes_and_the_map_s_edge_are_told_apart():
     source = plane()
     source.arrays["height"][100:120, 100:120] = np.nan
     found = _cost(source, (4.0, 13.0), (30.0, 13.0))
-    names = found.pieces.column("reason_names").to_pylist()
-    assert found.pieces.num_rows == len(names) == 27
+    names = found.path_segments.column("reason_names").to_pylist()
+    assert found.path_segments.num_rows == len(names) == 27
     assert found.totals.reasons["nodata"] >= 2
     assert found.totals.reasons["outside_map"] >= 6
-    assert found.totals.pieces_without_cost == found.totals.reasons["nodata"] + found.totals.reasons["outside_map"]
-    assert np.isnan(found.pieces.column("energy_joule").to_numpy()[-1])
+    assert (
+        found.totals.path_segments_without_cost == found.totals.reasons["nodata"] + found.totals.reasons["outside_map"]
+    )
+    assert np.isnan(found.path_segments.column("energy_joule").to_numpy()[-1])
 
 
 def test_a_bend_sharper_than_any_segment_is_marked_and_paid_along_its_arc():
@@ -122,7 +124,7 @@ def test_a_bend_sharper_than_any_segment_is_marked_and_paid_along_its_arc():
 def test_without_held_out_samples_there_are_no_intervals():
     found = _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=replace(MODEL, residuals=made_residuals(5)))
     assert found.totals.energy_interval_joule is None
-    assert found.pieces.column("energy_low_joule").null_count == found.pieces.num_rows
+    assert found.path_segments.column("energy_low_joule").null_count == found.path_segments.num_rows
 
 
 class _Stuck(PhysicsModel):
@@ -147,8 +149,8 @@ def test_a_model_that_takes_turns_is_told_those_of_the_path_and_none_is_paid_twi
     told = _cost(*bend, model=_Told(takes_turns=True, physics=TURNS))
     assert told.totals.turn_energy_joule is None
     assert plain.totals.turn_energy_joule > 0.0
-    turn = told.pieces.column("turn_rad").to_numpy() / told.pieces.column("arc_length_m").to_numpy()
-    more = told.pieces.column("power_watt").to_numpy() - plain.pieces.column("power_watt").to_numpy()
+    turn = told.path_segments.column("turn_rad").to_numpy() / told.path_segments.column("arc_length_m").to_numpy()
+    more = told.path_segments.column("power_watt").to_numpy() - plain.path_segments.column("power_watt").to_numpy()
     assert turn.max() > 0.5
     assert more == pytest.approx(np.where(turn > TURNS.mean_turn_radpm, 1000.0 * turn, 0.0), rel=1e-4, abs=1e-3)
 
@@ -161,7 +163,7 @@ class _EnergyAlone(PhysicsModel):
 def test_where_the_model_says_that_nothing_moves_there_is_no_cost():
     found = _cost(plane(), (4.0, 4.0), (12.0, 4.0), model=_Stuck())
     assert found.totals.reasons == {"no_motion": 2}
-    assert np.flatnonzero(np.isnan(found.pieces.column("energy_joule").to_numpy())).tolist() == [3, 4]
+    assert np.flatnonzero(np.isnan(found.path_segments.column("energy_joule").to_numpy())).tolist() == [3, 4]
 
 
 def test_a_model_of_something_else_is_refused():
@@ -198,16 +200,16 @@ _POINT = st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
 
 
 def test_a_metre_is_a_metre_of_ground_where_the_map_is_out_of_scale():
-    pieces = cut_path(np.array([[0.0, 0.0], [10.0, 0.0]]), chord_m=1.0, scale=0.9996)
-    np.testing.assert_allclose(np.diff(pieces.start_xy_m[:, 0]), 1.0 / 0.9996)
-    assert pieces.arc_m.sum() == pytest.approx(9.996)
+    segments = cut_path(np.array([[0.0, 0.0], [10.0, 0.0]]), chord_m=1.0, scale=0.9996)
+    np.testing.assert_allclose(np.diff(segments.start_xy_m[:, 0]), 1.0 / 0.9996)
+    assert segments.arc_m.sum() == pytest.approx(9.996)
 
 
 def test_round_a_corner_the_chord_is_a_metre_and_the_arc_is_longer():
-    pieces = cut_path(np.array([[0.0, 0.0], [1.5, 0.0], [1.5, 5.0]]), chord_m=1.0, scale=1.0)
-    np.testing.assert_allclose(pieces.end_xy_m[1], [1.5, np.sqrt(0.75)])
-    assert pieces.arc_m[1] == pytest.approx(0.5 + np.sqrt(0.75))
-    assert pieces.arc_m.sum() == pytest.approx(6.5)
+    segments = cut_path(np.array([[0.0, 0.0], [1.5, 0.0], [1.5, 5.0]]), chord_m=1.0, scale=1.0)
+    np.testing.assert_allclose(segments.end_xy_m[1], [1.5, np.sqrt(0.75)])
+    assert segments.arc_m[1] == pytest.approx(0.5 + np.sqrt(0.75))
+    assert segments.arc_m.sum() == pytest.approx(6.5)
 
 
 def test_the_patch_of_a_short_rest_ends_with_it_and_is_a_metre_long():
@@ -217,18 +219,18 @@ def test_the_patch_of_a_short_rest_ends_with_it_and_is_a_metre_long():
 
 
 @given(st.lists(_POINT, min_size=2, max_size=12, unique=True))
-def test_pieces_join_up_and_add_up_to_the_path(points):
+def test_segments_join_up_and_add_up_to_the_path(points):
     xy = np.array(points)
-    pieces = cut_path(xy, chord_m=1.0, scale=1.0)
+    segments = cut_path(xy, chord_m=1.0, scale=1.0)
     length = np.linalg.norm(np.diff(xy, axis=0), axis=1).sum()
-    np.testing.assert_array_equal(pieces.start_xy_m[1:], pieces.end_xy_m[:-1])
-    np.testing.assert_allclose(pieces.chord_m[:-1], 1.0, atol=1e-9)
-    assert (pieces.arc_m >= pieces.chord_m - 1e-9).all()
-    assert pieces.arc_m.sum() <= length + 1e-9
-    if len(pieces.chord_m):
+    np.testing.assert_array_equal(segments.start_xy_m[1:], segments.end_xy_m[:-1])
+    np.testing.assert_allclose(segments.chord_m[:-1], 1.0, atol=1e-9)
+    assert (segments.arc_m >= segments.chord_m - 1e-9).all()
+    assert segments.arc_m.sum() <= length + 1e-9
+    if len(segments.chord_m):
         assert (
-            pieces.arc_m.sum() == pytest.approx(length, abs=2e-3)
-            or np.linalg.norm(xy[-1] - pieces.end_xy_m[-1]) <= 1e-3
+            segments.arc_m.sum() == pytest.approx(length, abs=2e-3)
+            or np.linalg.norm(xy[-1] - segments.end_xy_m[-1]) <= 1e-3
         )
 
 

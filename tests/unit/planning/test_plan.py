@@ -73,7 +73,7 @@ def test_no_other_plan_takes_less_of_what_a_plan_is_the_least_of():
     ground = lambda east, north: 4 + (np.sin(east * 0.9) + np.sin(north * 0.7 + 0.2 * east) > 0.5) * 2  # noqa: E731
     source, rng = plane(40.0, classes=ground, rise_north=0.1, pixel_size_m=0.2), np.random.default_rng(1)
     term = PhysicsTerm("turning", "all", 300.0, 5.0, "W s/rad")
-    fit = PhysicsFit(500, (term,), {}, 0.4, 8.0, {}, None, None, 0.05, None)
+    fit = PhysicsFit(500, (term,), {}, 0.4, 8.0, {}, None, 0.05)
     model = replace(MODEL, physics=fit, patch_px=8)
     survey = make_survey(model, source, 2.0)
     survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
@@ -142,7 +142,7 @@ def test_a_road_out_of_sight_is_found_without_a_cost_map(caplog):
     ground, first, *rest = caplog.messages
     assert ground.startswith("checking the ground of")
     assert "without --cost-map" in first
-    assert any(line.startswith("predicting") and line.endswith(" s") for line in rest)
+    assert any(line.startswith("predicting") for line in rest)
 
 
 def test_ends_that_cannot_be_used_are_named_together():

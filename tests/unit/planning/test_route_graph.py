@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -191,9 +192,13 @@ def test_a_graph_is_proposed_from_runs_on_the_map_and_reads_as_one(hill, tmp_pat
         write_route_graph(MODEL, hill, tmp_path / "o.json", graph=None, store=SimpleNamespace(runs=list, root="store"))
 
 
-@pytest.mark.parametrize("name", ["depot_graph", "turtlebot3_graph", "warehouse_graph", "aws_graph", "sample_graph"])
-def test_the_graphs_that_come_with_nav2_are_read_and_written_whole(name, tmp_path):
-    path = shared_data(f"nav2_graphs/{name}.geojson")
+_OURS = Path(__file__).parents[2] / "data" / "route_graph.geojson"
+"""Every member that the format's documentation names: frames, costs, nested metadata, operations, a loop, both kinds of lines."""
+
+
+@pytest.mark.parametrize("name", ["ours", "depot", "turtlebot3", "warehouse", "aws", "sample"])
+def test_graphs_of_the_format_and_those_of_nav2_are_read_and_written_whole(name, tmp_path):
+    path = _OURS if name == "ours" else shared_data(f"nav2_graphs/{name}_graph.geojson")
     found = read_route_graph(path)
     document = json.loads(path.read_text())
     assert len(found.nodes) + len(found.edges) == len(document["features"])
@@ -211,6 +216,16 @@ def test_the_graphs_that_come_with_nav2_are_read_and_written_whole(name, tmp_pat
     assert result.edges == len(found.edges) - len(loops)
     assert list(result.edges_without_cost) == loops
     assert all(metadata["energy_joule"] > 0.0 for metadata in costed.values())
+    before, after = (
+        {of["properties"]["id"]: of for of in json.loads(each.read_text())["features"]}
+        for each in (path, tmp_path / "out.geojson")
+    )
+    for number, feature in after.items():  # nothing but metadata is added, and none is changed
+        metadata = before[number]["properties"].get("metadata", {})
+        assert feature["properties"].get("metadata", {}).items() >= metadata.items()
+        feature["properties"].pop("metadata", None)
+        before[number]["properties"].pop("metadata", None)
+        assert feature == before[number]
 
 
 def test_edges_back_have_new_ids():

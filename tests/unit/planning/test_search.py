@@ -252,7 +252,7 @@ USUAL_RADPM = 0.05
 
 def physics(**joule_per_rad):
     terms = tuple(PhysicsTerm("turning", name, value, 5.0, "W s/rad") for name, value in joule_per_rad.items())
-    return PhysicsFit(500, terms, {}, 0.4, 8.0, {}, None, None, USUAL_RADPM, None)
+    return PhysicsFit(500, terms, {}, 0.4, 8.0, {}, None, USUAL_RADPM)
 
 
 def cost(source, *points, fit=None):
@@ -271,9 +271,9 @@ def test_a_corner_costs_its_angle_on_the_ground_where_it_is():
     assert with_turns.totals.turn_rad == pytest.approx(np.pi / 2, abs=1e-3)
     more = with_turns.totals.energy_joule - without.totals.energy_joule
     assert more == pytest.approx(with_turns.totals.turn_energy_joule)
-    # On paved ground; the pieces beside the corner would have turned their usual 5 cm a metre anyway.
+    # On paved ground; the path segments beside the corner would have turned their usual 5 cm a metre anyway.
     assert 180.0 * (np.pi / 2 - 4 * USUAL_RADPM) < more < 180.0 * (np.pi / 2 - USUAL_RADPM)
-    table = with_turns.pieces
+    table = with_turns.path_segments
     assert table["turn_energy_joule"].to_numpy().sum() == pytest.approx(more)
     assert with_turns.totals.duration_s == without.totals.duration_s
 
@@ -289,7 +289,7 @@ def test_a_straight_path_and_one_of_jitter_cost_nothing_more():
 def test_without_physics_nothing_is_said_of_turns():
     found = cost(plane(), *CORNER)
     assert found.totals.turn_energy_joule is None
-    assert found.pieces["turn_energy_joule"].null_count == found.pieces.num_rows
+    assert found.path_segments["turn_energy_joule"].null_count == found.path_segments.num_rows
     assert find_turning(None, PAPER_CLASSES) is None
     assert find_turning(physics(), PAPER_CLASSES) is None
 

@@ -51,7 +51,7 @@ def store(tmp_path_factory):
     junk = Failure("1", "1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0")
     cut = Failure("2", "a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0")
     failed = {"/logs/passing.mcap": "No space left on device", "/logs/b.mcap": "No space left on device"}
-    call = calls.measure_call(calls.start_stopwatch(), CallRecord("ingest", "0", 3, {"failed": 1}, failed=failed))
+    call = calls.start_stopwatch()(CallRecord("ingest", "0", 3, {"failed": 1}, failed=failed))
     open_log(store).commit("ended", Entries(failed=(junk, cut), calls=(call,)))
     return store
 

@@ -140,6 +140,12 @@ def test_explain_and_diff_tell_it(store, plain, tmp_path):
     assert f"exclusion: added ids.csv (3 samples): {WHY}" in found.causes
     assert found.samples["only in a"] == 3
     assert (found.moved, found.samples["other fold"]) == ({}, 0)
+    (tmp_path / "out").rename(tmp_path / "earlier")
+    build(store, tmp_path, ids=ids[:1])
+    assert (
+        f"exclusion: ids.csv is another list: 3 → 1 samples, {WHY} → {WHY}"
+        in diff(tmp_path / "earlier", tmp_path / "out").causes
+    )
 
 
 def test_its_own_list_makes_the_same_dataset_without_the_first(store, plain, tmp_path):
@@ -194,6 +200,12 @@ def test_a_list_that_cannot_be_used_is_said_to_be(store, tmp_path, text, reason,
     with pytest.raises((DatasetError, UsageError), match=said):
         build(store, tmp_path, reason=reason, split=None)
     assert not (tmp_path / "out").exists()
+
+
+def test_two_lists_of_one_name_are_refused(store, tmp_path):
+    (tmp_path / "ids.csv").write_text("a-1\n")
+    with pytest.raises(UsageError, match="two lists have one name"):
+        build(store, tmp_path, exclude=[tmp_path / "ids.csv", tmp_path / "ids.csv"], reason=["a", "b"], split=None)
 
 
 def test_nothing_is_written_where_a_list_names_everything(store, plain, tmp_path):
