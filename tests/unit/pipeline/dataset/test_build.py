@@ -300,7 +300,7 @@ def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
 
 
 def test_what_the_call_says_instead_of_the_recipe_is_checked_as_the_recipe_is(store, tmp_path):
-    with pytest.raises(RecipeError, match='split.holdout is "samples"'):
+    with pytest.raises(RecipeError, match=r'split\.holdout is "samples"'):
         build(store, tmp_path, holdout="samples")
     with pytest.raises(UsageError, match="seed is -1; expected a number from 0"):
         build(store, tmp_path, seed=-1)
