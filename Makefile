@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock schemas docs release clean
+.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock schemas docs pictures release clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -86,6 +86,10 @@ test-dagster: .venv-dagster/installed
 
 test-pages: .venv-pages/installed
 	.venv-pages/bin/python -m pytest tests/pages
+
+# The documentation's pictures, from the demo.
+pictures: .venv-pages/installed
+	.venv-pages/bin/python docs/pictures.py
 
 # Changes of the rooms of numbers, one at a time: does a test notice? docs/explanation/mutants.md; an hour and more on one core.
 # MUTANTS="--rooms motion path --draw 0" tries less.

@@ -4,6 +4,7 @@ import gc
 import os
 import resource
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,15 @@ gc.set_threshold(50_000)  # as the command does
 os.fsync = lambda _: None  # a process that is killed loses nothing that it wrote, and no test cuts the power
 
 RATCHETS = Path(__file__).parent / "architecture/ratchets.toml"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def dataset_page(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Leave out the page of each dataset, two thirds of a small build, but in modules that say ``DRAWS_DATASET_PAGES = True``."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not getattr(request.module, "DRAWS_DATASET_PAGES", False):
+            patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_, **__: "<!doctype html>")
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

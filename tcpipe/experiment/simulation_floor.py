@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 from tcpipe.dataset import Split
 from tcpipe.learning.baselines import ALL_LAYERS_PER_CLASS, CURVES, OURS, PER_CLASS, TREES
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult, Evaluation
-from tcpipe.learning.evaluation_page import ENERGY
+from tcpipe.learning.evaluation_page import PAPER
 from tcpipe.learning.metrics import Array, Ratio, compute_costs
 from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance
 from tcpipe.simulation.world import World
@@ -168,4 +168,4 @@ def _find_verdict(ratio: Ratio, seeds: int) -> Verdict:
 def _read_paper_value(baseline: str, split: str) -> float | None:
     """Return the same ratio of the paper's table IV."""
     at = SPLITS.index(split)
-    return ENERGY[OURS][at][0] / ENERGY[baseline][at][0] if baseline in ENERGY else None
+    return PAPER[OURS][at][0] / PAPER[baseline][at][0] if baseline in PAPER else None

@@ -5,7 +5,7 @@ The paper's own results (Eder and Steinbauer-Wagner, section V), to stand beside
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from typing import Literal
 
@@ -44,12 +44,7 @@ def render_evaluation_page(
 ) -> str:
     """Return the HTML page of what `evaluate` found; ``warnings`` come first."""
     has_samples = bool(samples.table.num_rows)
-    parts = [
-        *_make_class_sections(found),
-        _make_ablation_section(found),
-        _make_energy_section(found),
-        _make_time_section(found),
-    ]
+    parts = [*_make_class_sections(found), *_make_other_sections(found)]
     paper = Section(
         "Beside the paper",
         "The paper's five tables with the figures of this model.\n" + COUNTED,
@@ -238,63 +233,57 @@ _TEXT = {
 }
 
 
-def _make_ablation_section(found: Evaluation) -> Section:
-    """Return table III, of E."""
-    rows = []
-    for row in found.ablation:
-        layers, how = "+".join(row.layers), "retrained" if row.how == "retrained" else ""
-        cells = (cell for split in found.ordered_splits for cell in _format_figures(row.on(split)["E"], "E"))
-        rows.append((layers, how, *cells))
-        if row.how == "noise" and row.layers in ABLATION:
-            of_paper = (value for split in found.ordered_splits for value in ABLATION[row.layers][SPLITS.index(split)])
-            rows.append(("", "paper", *map(_format_paper_figure, of_paper)))
-    text = (
+def _make_other_sections(found: Evaluation) -> list[Section]:
+    """Return tables III to V: other inputs, other networks, the expected time."""
+    ablation = [
+        (
+            "+".join(row.layers),
+            "retrained" if row.how == "retrained" else "",
+            {split: row.on(split)["E"] for split in found.ordered_splits},
+        )
+        for row in found.ablation
+    ]
+    noise = (
         f"Layers not named are replaced by noise ({found.config.noise_draws} draws); retrained: a network without them."
     )
-    header = ("layers", "", *_name_measures(found, "E"))
-    return Section("Table III: ablation, E", text, header=header, rows=rows, figures_from=2)
-
-
-def _name_measures(found: Evaluation, quantity: str) -> Iterator[str]:
-    """Yield the headers of both measures on every split."""
-    return (f"{split}, {_format_measure(measure, quantity)}" for split in found.ordered_splits for measure in MEASURES)
-
-
-def _make_comparison_section(
-    title: str,
-    text: str,
-    found: Evaluation,
-    of_paper: Mapping[str, Sequence[tuple[float, float]]],
-    quantity: Literal["E", "T"],
-) -> Section:
-    """Return table IV or V, beside the paper's."""
-    table = found.energy if quantity == "E" else found.time
-    splits = found.ordered_splits
-    rows: list[tuple[str, ...]] = []
-    for what in (*((OURS,) if quantity == "E" else ()), ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY, EXPECTED):
-        if what not in table:
-            continue
-        by_split = [_format_figures(table[what].get(split), quantity) for split in splits]
-        rows.append((what, "", *(cell for cells in by_split for cell in cells)))
-        if what in of_paper:
-            cells = [map(_format_paper_figure, of_paper[what][SPLITS.index(split)]) for split in splits]
-            rows.append(("", "paper", *(cell for part in cells for cell in part)))
-    return Section(title, text, header=("", "", *_name_measures(found, quantity)), rows=rows, figures_from=2)
-
-
-def _make_energy_section(found: Evaluation) -> Section:
-    text = (
+    networks = (
         "Beside the one network: one of each class with all layers, and Wei and Isler's, which predict E from heights alone.\n"
         "Each takes as many steps as ours and is centred by class; ratios stand among those of the baselines. "
     )
     if not found.networks:
-        text += "They are trained only if the model is a network."
-    return _make_comparison_section("Table IV: energy, one network or one per class", text, found, ENERGY, "E")
+        networks += "They are trained only if the model is a network."
+    others = [
+        (what, "", found.energy[what])
+        for what in (OURS, ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY)
+        if what in found.energy
+    ]
+    times = [(EXPECTED, "", found.time[EXPECTED])] if EXPECTED in found.time else []
+    of_time = "The expected time is d / v at the robot's maximum speed."
+    return [
+        _make_other_section("Table III: ablation, E", noise, found, "E", ablation),
+        _make_other_section("Table IV: energy, one network or one per class", networks, found, "E", others),
+        _make_other_section("Table V: time against the expected time", of_time, found, "T", times),
+    ]
 
 
-def _make_time_section(found: Evaluation) -> Section:
-    text = "The expected time is d / v at the robot's maximum speed."
-    return _make_comparison_section("Table V: time against the expected time", text, found, TIME, "T")
+def _make_other_section(
+    title: str,
+    text: str,
+    found: Evaluation,
+    quantity: Literal["E", "T"],
+    lines: Iterable[tuple[str, str, Mapping[str, Errors]]],
+) -> Section:
+    """Return errors of a quantity on every split by predictor, beside the paper's; each with a remark that the paper's lacks."""
+    splits = found.ordered_splits
+    rows: list[tuple[str, ...]] = []
+    for what, remark, errors in lines:
+        figures = [_format_figures(errors.get(split), quantity) for split in splits]
+        rows.append((what, remark, *(figure for pair in figures for figure in pair)))
+        if not remark and what in PAPER:
+            pairs = [PAPER[what][SPLITS.index(split)] for split in splits]
+            rows.append(("", "paper", *(_format_paper_figure(value) for pair in pairs for value in pair)))
+    header = ("", "", *(f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in MEASURES))
+    return Section(title, text, header=header, rows=rows, figures_from=2)
 
 
 CLASSES = ("grass", "mud", "unpaved road", "paved road", "all")
@@ -312,23 +301,17 @@ BY_CLASS = {
 }
 """Tables I and II: split (the paper's validation is ``unseen``), quantity, measure, to a value a class."""
 
-ABLATION = {
-    ("O", "C", "H"): ((21.51, 10.77), (26.63, 12.80)),
-    ("C", "H"): ((30.35, 12.29), (27.59, 14.53)),
-    ("O", "H"): ((22.17, 10.92), (34.95, 17.38)),
-    ("O", "C"): ((67.59, 47.84), (73.75, 52.20)),
-    ("O",): ((57.34, 57.17), (87.39, 60.39)),
-    ("C",): ((91.93, 47.16), (79.83, 40.07)),
-    ("H",): ((28.67, 13.31), (32.09, 17.36)),
+PAPER = {
+    "O+C+H": ((21.51, 10.77), (26.63, 12.80)),
+    "C+H": ((30.35, 12.29), (27.59, 14.53)),
+    "O+H": ((22.17, 10.92), (34.95, 17.38)),
+    "O+C": ((67.59, 47.84), (73.75, 52.20)),
+    "O": ((57.34, 57.17), (87.39, 60.39)),
+    "C": ((91.93, 47.16), (79.83, 40.07)),
+    "H": ((28.67, 13.31), (32.09, 17.36)),
+    OURS: ((21.51, 10.77), (26.63, 12.80)),
+    GRASS_ONLY: ((51.39, 27.25), (56.16, 28.37)),
+    PER_CLASS: ((34.52, 14.64), (32.92, 16.96)),
+    EXPECTED: ((0.22, 17.45), (0.17, 13.82)),
 }
-"""Table III: layers that are left, to RMSE [J] and MAPE [%] of E on test and on unseen."""
-
-ENERGY = {
-    "ours": ((21.51, 10.77), (26.63, 12.80)),
-    "Wei & Isler, grass only": ((51.39, 27.25), (56.16, 28.37)),
-    "Wei & Isler, a net per class": ((34.52, 14.64), (32.92, 16.96)),
-}
-"""Table IV: RMSE [J] and MAPE [%] of E on test and on unseen."""
-
-TIME = {"ours": ((0.06, 3.37), (0.08, 5.04)), "expected time": ((0.22, 17.45), (0.17, 13.82))}
-"""Table V: RMSE [s] and MAPE [%] of T on test and on unseen."""
+"""Tables III (layers that are left) to V: RMSE [J or s] and MAPE [%] of E, or of T for the expected time, on test and on unseen."""

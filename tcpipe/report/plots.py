@@ -23,7 +23,6 @@ from bokeh.document import Document
 from bokeh.models import HoverTool
 from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
-from numpy.typing import NDArray
 
 from tcpipe.errors import clean_line
 from tcpipe.formats.json_files import Json
@@ -209,28 +208,24 @@ def draw_ratios(
     return plot
 
 
-def draw_histogram(name: str, values: NDArray[np.float64], *, label: str, of_what: str) -> Plot:
-    """Return a histogram of the finite values; ``alt`` states how many others there are."""
-    finite = values[np.isfinite(values)]
-    lost = len(values) - len(finite)
-    alt = f"Histogram of {label} of {len(finite)} {of_what}" + (f"; {lost} have none" if lost else "")
-    plot = make_plot(name, alt=f"{alt}.", axes=(label, of_what), height_px=220, tools="save", waits=True)
-    if len(finite):
+def draw_label_histograms(segments: pa.Table) -> list[Plot]:
+    """Return how often values of each label occur that any segment has; ``alt`` states how many have none."""
+    plots = []
+    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
+    for label, column in labels.items():
+        values = to_floats(segments, column)
+        finite = values[np.isfinite(values)]
+        if not len(finite):
+            continue
+        lost = f"; {len(values) - len(finite)} have none" if len(finite) < len(values) else ""
+        alt = f"Histogram of {label} of {len(finite)} segments{lost}."
+        plot = make_plot(f"of {column}", alt=alt, axes=(label, "segments"), height_px=220, tools="save", waits=True)
         counts, edges = np.histogram(finite, bins=min(40, max(5, int(np.sqrt(len(finite))))))
         plot.figure.quad(left=edges[:-1], right=edges[1:], bottom=0, top=counts, color=SPLIT_COLOURS["train"])
-        plot.figure.add_tools(HoverTool(tooltips=[(label, "@left to @right"), (of_what, "@top")]))
-    plot.figure.y_range.start = 0
-    return plot
-
-
-def label_histograms(rows: pa.Table, of_what: str, *, prefix: str = "") -> list[Plot]:
-    """Return how often values of each label occur that any of the rows has."""
-    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
-    return [
-        draw_histogram(f"{prefix}{name}", values, label=label, of_what=of_what)
-        for label, name in labels.items()
-        if np.isfinite(values := to_floats(rows, name)).any()
-    ]
+        plot.figure.add_tools(HoverTool(tooltips=[(label, "@left to @right"), ("segments", "@top")]))
+        plot.figure.y_range.start = 0
+        plots.append(plot)
+    return plots
 
 
 def read_bokeh_script() -> str:

@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError, TableError
-from tcpipe.formats.finding_lines import describe_finding, describe_remedy
+from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
@@ -29,7 +29,7 @@ from tcpipe.report.label_sections import (
 )
 from tcpipe.report.maps import Pictures, RunMap, draw_run_map
 from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
-from tcpipe.report.plots import Plot, label_histograms, make_plot, show_text
+from tcpipe.report.plots import Plot, draw_label_histograms, make_plot, show_text
 from tcpipe.report.run_plots import (
     SPEED_ROLES,
     FindingSpan,
@@ -50,7 +50,7 @@ from tcpipe.store import Store
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import NoiseFacts, PhysicsFacts, StageFacts
-from tcpipe.tables.findings import SEVERITIES, Finding, rank_severity, read_catalogue, select_findings
+from tcpipe.tables.findings import SEVERITIES, Finding, rank_severity, read_catalogue
 
 _PAGE = "report.html"
 _NOISE = (
@@ -277,8 +277,7 @@ def _make_label_sections(run: RunDirectory, segments: pa.Table, physics: Physics
         make_quality_section(to_integers(segments, "quality"), "segments"),
         *make_budget_sections(run.facts.energy_budget),
     ]
-    plots = label_histograms(segments, "segments", prefix="of ")
-    return [Section("Labels", "One value per segment.", plots=plots, parts=parts)]
+    return [Section("Labels", "One value per segment.", plots=draw_label_histograms(segments), parts=parts)]
 
 
 def _make_sensor_section(run_json: RunJson | None, manifest: Manifest, rejections: pa.Table) -> Section:
@@ -288,7 +287,7 @@ def _make_sensor_section(run_json: RunJson | None, manifest: Manifest, rejection
     parts = [
         *([] if run_json is None else [_make_topics_section(run_json, manifest.counts)]),
         *_make_trust_sections(facts, rejections),
-        *_make_clock_sections(facts, manifest.info.report.findings),
+        *_make_clock_sections(facts),
     ]
     return Section("Sensors", _NOISE if plots else "", plots=plots, parts=parts)
 
@@ -385,7 +384,7 @@ def _describe_noise(
     ]
 
 
-def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
+def _make_clock_sections(facts: StageFacts) -> list[Section]:
     """Return the time offset of each sensor, if any could be compared."""
     clock_offsets = facts.clock_offsets
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
@@ -393,12 +392,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
     if not offsets and not steps:
         return []
     rows = [
-        (
-            _name(role),
-            f"{round(1e3 * offset.offset_s) + 0:+d} ms",
-            f"{2e3 * offset.std_s:.0f} ms",
-            _format_correction(role, findings),
-        )
+        (_name(role), f"{round(1e3 * offset.offset_s) + 0:+d} ms", f"{2e3 * offset.std_s:.0f} ms")
         for role, offset in sorted(offsets.items())
     ]
     text = ""
@@ -407,16 +401,8 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
         text = f"Time offsets relative to {reference}, from the motion that both sensors measure."
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
-    header = ("sensor", "late by", "± (2σ)", "correction")
+    header = ("sensor", "late by", "± (2σ)")
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
-
-
-def _format_correction(role: str, findings: Sequence[Finding]) -> str:
-    """Return the correction of a sensor's clock that its findings propose."""
-    clocks = select_findings(findings, "time-offset", "clock-drift", "clocks-differ")
-    role_findings = [finding for finding in clocks if finding.subject.name == role]
-    remedies = [describe_remedy(finding, remedy) for finding in role_findings for remedy in finding.remedies]
-    return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in role_findings)
 
 
 def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:

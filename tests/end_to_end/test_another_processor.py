@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import rasterio
 import shapely
+import tiny_pipeline
 from processors import ANOTHER_PROCESSOR
 from simulated_streams import streams_of
 
@@ -23,16 +24,16 @@ NEAR_DIFFERENCE = 1e-7
 """Of a standard deviation whose variance is a small difference of large ones."""
 """Of the largest value of a column; the page says 1e-12, this leaves room for processors that were not seen."""
 
-PIPELINE = Path(__file__).parents[1] / "tiny_pipeline.py"
-
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two simulated sites; the log and the rasters of the first, ingested and built on both processors."""
-    places = tuple(tmp_path_factory.mktemp(name) for name in ("here", "elsewhere"))
-    for place, env in zip(places, ({}, ANOTHER_PROCESSOR), strict=True):
-        subprocess.run([sys.executable, PIPELINE, place, places[0]], env={**os.environ, **env}, check=True)
-    return places
+    here, elsewhere = (tmp_path_factory.mktemp(name) for name in ("here", "elsewhere"))
+    tiny_pipeline.main(here, here)
+    subprocess.run(
+        [sys.executable, tiny_pipeline.__file__, elsewhere, here], env={**os.environ, **ANOTHER_PROCESSOR}, check=True
+    )
+    return here, elsewhere
 
 
 def _unlike(ours: pa.Table, theirs: pa.Table) -> list[str]:

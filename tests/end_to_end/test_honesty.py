@@ -1,6 +1,5 @@
 """The truth gate: its errors are drawn as they are stated, its figures find labels that are sure and wrong, and it runs."""
 
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -207,25 +206,14 @@ def test_cells_are_named_once_and_the_gate_has_sixty():
     assert sum(not cell.wide for cell in cells.honest_cells()) >= 60
 
 
-def test_a_cached_drive_gives_the_same_labels(tmp_path):
-    command: list[str | Path] = [
-        sys.executable,
-        HERE / "honesty.py",
-        "--cells",
-        "^GNSS, wheels: wheels",
-        "--seeds",
-        "1",
-        "--length",
-        "50",
-    ]
+def test_a_cached_drive_gives_the_same_labels(tmp_path, monkeypatch, capsys):
     made = []
     for name in ("a", "b"):
         out = tmp_path / f"{name}.json"
-        done = subprocess.run(
-            [*command, "--out", out, "--cache", tmp_path / "cache"], capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "2 drives" in done.stdout
+        options = f"--cells ^GNSS,.wheels:.wheels --seeds 1 --length 50 --out {out} --cache {tmp_path / 'cache'}"
+        monkeypatch.setattr(sys, "argv", ["honesty.py", *options.split()])
+        honesty.main()
+        assert "2 drives" in capsys.readouterr().out
         made.append(honesty.read(out))
     assert made[0].keys() == made[1].keys()
     for key, outcome in made[0].items():

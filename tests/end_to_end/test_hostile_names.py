@@ -16,6 +16,8 @@ from tcpipe.formats.maps.building import read_class_scheme
 from tcpipe.simulation import simulate
 from tcpipe.store import Store
 
+DRAWS_DATASET_PAGES = True
+
 TERMINAL = "\x1b]0;owned\x07\x1b[31m\u202e\x9b2J"
 HTML = '<script>alert("1")</script>'
 CLASSES = (HTML, "a|b `c` [red]*d*", r"$\oops{$ {{ 7 * 7 }}")

@@ -63,7 +63,7 @@ def test_even_a_quick_network_learns_that_slope_costs_time(reproduced):
 def test_again_is_nothing_to_do(reproduced):
     here, first = reproduced
     before = (here / "here" / "reproduction.json").read_bytes()
-    again = tcpipe("reproduce", "here", "--quick", "--seeds", "1", "--jobs", "2", cwd=here, env=ENV)
+    again = tcpipe("reproduce", "here", "--quick", "--seeds", "1", "--jobs", "1", cwd=here, env=ENV)
     assert again.returncode == 0
     assert "epoch" not in again.stderr
     assert (here / "here" / "reproduction.json").read_bytes() == before

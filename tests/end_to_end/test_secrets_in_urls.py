@@ -18,6 +18,8 @@ from tcpipe.formats.place import open_place
 from tcpipe.simulation import simulate
 from tcpipe.store import Store
 
+DRAWS_DATASET_PAGES = True
+
 SECRET, OTHER = "5ecretS1gnature/+x", "an0therS1gnature"
 SIGNED, AGAIN = (f"?X-Amz-Expires=900&X-Amz-Signature={name}" for name in (SECRET.replace("+", "%2B"), OTHER))
 

@@ -20,6 +20,8 @@ from tcpipe.simulation import SimulatedSite, compute_true_cost, find_scenario, r
 from tcpipe.store import Store
 from tcpipe.tables.bits import DropReason
 
+DRAWS_DATASET_PAGES = True
+
 Demo = tuple[Path, subprocess.CompletedProcess[str]]
 """Where ``tcpipe demo`` put all it made, and what it said."""
 

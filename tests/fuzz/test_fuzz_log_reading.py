@@ -18,7 +18,7 @@ TARGETS = fuzz_log_reading.TARGETS
 
 CHANGES = 8
 """Changed copies of each input of a corpus."""
-RUNS = {"autopilots": 200, "containers": 75, "plans": 200, "definitions": 500}
+RUNS = {"autopilots": 100, "containers": 40, "plans": 100, "definitions": 250}
 """Inputs of a run with atheris: each takes some seconds."""
 
 

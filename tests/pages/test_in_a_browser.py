@@ -18,6 +18,7 @@ from tcpipe.pipeline.report import report
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 
+DRAWS_DATASET_PAGES = True
 axe = pytest.importorskip("axe_core_python.sync_playwright", reason="axe-core-python is not installed: make test-pages")
 LOOKS = [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")]
 

@@ -131,13 +131,12 @@ def test_a_split_travels_to_a_worker_without_its_pixels(path):
     np.testing.assert_array_equal(pickle.loads(blob)[3][0], whole[3])  # noqa: S301
 
 
-def test_opening_imports_no_trainer(path):
+def test_opening_imports_no_trainer(directory):
     import subprocess
     import sys
 
-    code = (
-        f"import sys, tcpipe.dataset as d; d.open_dataset({str(path)!r})['train'][0]; sys.exit('torch' in sys.modules)"
-    )
+    opening = "; ".join(f"d.open_dataset({str(directory / name)!r})['train'][0]" for name in ("zarr", "parquet"))
+    code = f"import sys, tcpipe.dataset as d; {opening}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
