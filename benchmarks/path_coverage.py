@@ -29,7 +29,7 @@ from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
-from tcpipe.planning.drives import collect_run
+from tcpipe.planning.drives import collect_runs
 from tcpipe.planning.path_files import RISK, choose_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
@@ -70,8 +70,8 @@ def measure(here: Path, seed: int, *, given: argparse.Namespace) -> tuple[Model,
     model = load_model(here / "model")
     further = drive(here / "further" / "site", given.further, given.metres, payload_kg=given.payload, seed=seed + 1000)
     store = store_of(here / "further", further)
-    source = choose_map(store, None)
-    return model, [collect_run(model, source, run) for run in open_store(store).runs()]
+    source, opened = choose_map(store, None), open_store(store)
+    return model, collect_runs(model, source, opened, [run.run_id for run in opened.runs()])
 
 
 Found = list[tuple[dict[str, Errors], Run]]

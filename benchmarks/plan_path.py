@@ -12,6 +12,7 @@ plans of each pair, as `tcpipe predict-path` judges it.
 from __future__ import annotations
 
 import multiprocessing
+import os
 import resource
 import sys
 import time
@@ -40,7 +41,7 @@ from tcpipe.planning.cost_grid import (
     LazyCostGrid,
     find_crossed_cells,
     make_grid,
-    read_survey,
+    make_survey,
 )
 from tcpipe.planning.plan import OBJECTIVES, plan_paths
 from tcpipe.planning.search import find_best_potential, find_least_cost_paths, find_turning, make_steps
@@ -80,7 +81,7 @@ def make_site(cells: int) -> tuple[LazyCostGrid, NDArray[np.uint8]]:
         velocity[course] = np.where(class_id == 2, np.nan, velocity_mps(class_id, e * right - n * down))
     reasons = np.broadcast_to(np.where(class_id == 2, 4, 0).astype(np.uint16), shape).copy()
     costs = CostGrid(make_grid(source, 1.0), power, velocity, reasons, middle.astype(np.float32))
-    return read_survey(MODEL, source, costs), class_id
+    return make_survey(MODEL, source, costs), class_id
 
 
 def choose_ends(class_id: NDArray[np.uint8], pair: int) -> list[int]:
@@ -150,15 +151,15 @@ def measure(kind: str, cells: int, pairs: int) -> tuple[list[float], float, floa
     return costs, spent, max(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, 100) / 1e3
 
 
-def plan(cells: int, pairs: int) -> tuple[list[dict[str, float]], float, float]:
-    """Return the judged energy of each plan by objective; CPU seconds of one plan of least energy, and peak memory [MB] of the process."""
+def plan(cells: int, pairs: int) -> tuple[list[dict[str, float]], tuple[float, float], float]:
+    """Return the judged energy of each plan by objective; wall and CPU seconds of a plan of least energy, and peak memory [MB] in all."""
     survey, class_id = make_site(cells)
-    judged, spent = [], 0.0
+    judged, spent = [], (0.0, 0.0)
     for pair in range(pairs):
         ends = [(end % cells + 0.5, cells - end // cells - 0.5) for end in choose_ends(class_id, pair)]
-        begun = time.process_time()
+        begun = time.perf_counter(), time.process_time()
         plans = plan_paths(survey, *lonlat(survey.source, *ends), ("energy",))
-        spent = time.process_time() - begun
+        spent = time.perf_counter() - begun[0], time.process_time() - begun[1]
         plans |= plan_paths(survey, *lonlat(survey.source, *ends), OBJECTIVES[1:])
         judged.append({name: of.totals.energy_joule for name, of in plans.items()})
     return judged, spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
@@ -174,7 +175,7 @@ def main() -> None:
     cells = int(sys.argv[1]) if len(sys.argv) > 1 else 300
     pairs = int(sys.argv[2]) if len(sys.argv) > 2 else 3
     found = {kind: run_alone(measure, kind, cells, pairs) for kind in ("explicit", "implicit")}
-    judged, plan_s, plan_mb = run_alone(plan, cells, pairs)
+    judged, (wall_s, plan_s), plan_mb = run_alone(plan, cells, pairs)
     (costs, spent, peak), (theirs, their_s, their_mb) = found["implicit"], found["explicit"]
     off = max(0.0 if a == b else abs(a / b - 1.0) for a, b in zip(costs, theirs, strict=True))
     print(f"{cells} x {cells} cells, {pairs} pairs")
@@ -184,7 +185,8 @@ def main() -> None:
         f"peak memory: {peak / their_mb:.2f} x that of the full search ({peak:.0f} of {their_mb:.0f} MB, without the site)"
     )
     print(
-        f"a whole plan of least energy: {plan_s:.2f} s of CPU; peak memory of its process {plan_mb:.0f} MB, with the site"
+        f"a whole plan of least energy: {wall_s:.2f} s at a load of {os.getloadavg()[0]:.1f}, {plan_s:.2f} s of CPU; "
+        f"peak memory of its process {plan_mb:.0f} MB, with the site"
     )
     worst = max(plans["energy"] / min(plans.values()) for plans in judged) - 1.0
     print(f"plans of least energy take at most {worst:.1%} more energy than those of least time and distance")

@@ -14,10 +14,7 @@ from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
 
 if TYPE_CHECKING:
-    from tcpipe.cost.adaptation import Run
-    from tcpipe.formats.maps.map_files import MapFile
     from tcpipe.learning.evaluation_files import AdaptationResult, EvaluationResult
-    from tcpipe.learning.models import Model
     from tcpipe.learning.training import TrainResult
     from tcpipe.planning.drives import DrivesResult
     from tcpipe.planning.path_files import PathResult, PlanResult
@@ -74,9 +71,15 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
 
         loaded, source = load_model(model, options.predictor), choose_map(store, options.map_name)
     if options.adapt is not None:
+        from tcpipe.dataset import open_dataset
         from tcpipe.learning.evaluation_files import evaluate_adaptation
+        from tcpipe.planning.drives import collect_runs
+        from tcpipe.store import open_store
 
-        runs = [_collect_run(loaded, source, store, log) for log in options.drives] if options.drives else None
+        runs = None
+        if options.drives:
+            logs, data = [*map(str, options.drives)], open_dataset(dataset)
+            runs = collect_runs(loaded, source, open_store(store), logs, data)
         return evaluate_adaptation(model, dataset, out, options.adapt, runs=runs, predictor=options.predictor)
     if options.drives:
         from tcpipe.dataset import open_dataset
@@ -113,15 +116,13 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     asked = choose_model(
         options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
     )
-    known = None if options.adapt is None else _collect_run(asked, source, options.store, options.adapt)
+    known = None
+    if options.adapt is not None:
+        from tcpipe.planning.drives import collect_runs
+        from tcpipe.store import open_store
+
+        (known,) = collect_runs(asked, source, open_store(options.store), [str(options.adapt)])
     return run(asked, source, Path(options.path), None if options.out is None else Path(options.out), adapted_by=known)
-
-
-def _collect_run(model: Model, source: MapFile, store: str | Path, log: str | Path) -> Run:
-    from tcpipe.planning.drives import collect_run, find_drive
-    from tcpipe.store import open_store
-
-    return collect_run(model, source, find_drive(open_store(store), str(log)))
 
 
 predict_path = as_function(PredictPathOptions, run_predict_path)

@@ -250,8 +250,8 @@ def preflight(
 ) -> int:
     """Predict from LOG, a typical minute or more, how much data a day of such recording gives, and what to correct before.
 
-    Prints segments per hour, the distance breakdown, the uncertainty of labels, the verdict, findings with remedies, and the command
-    that records the required topics. Writes no files.
+    Prints segments per hour, the distance breakdown, the uncertainty of labels, the verdict, and findings with remedies. Writes no
+    files.
 
     Exit codes: 0 ready; 3 warnings, errors or no segments; 1 ingest would fail.
     """

@@ -2,15 +2,16 @@
 
 The trained model is the prior. With p what it predicts of the metres of the new run, and y what was measured there::
 
-    y = p + X b + e,   b ~ N(0, s² (t q)²),   e ~ N(0, s² S (R + r L) S)
+    y = p + X b + e,   b ~ N(0, s² q² (t² + f² L)),   e ~ N(0, s² S R S)
 
 The columns of X are in the unit of y: p itself (scale), and what a usual metre or second of the run costs times its length (offset),
-predicted duration (idle power), slope (payload; 10 % count as a metre) and turn (0.3 rad count as a metre). b is relative to them; a
-Bayesian linear regression gives it. S are the spreads that the model states of a metre, R the correlation of neighbours, L one that falls
-over tens or hundreds of metres: what a model does not know of new ground; what the known metres show of it counts nearby. s² has an
-inverse-gamma prior of mean about 1, so that all that is stated has Student's t (Gelman et al., Bayesian Data Analysis, 2013, 14.2). How
-far the prior reaches, t, and how much of the errors is of the ground, r and its length, are not known: all of a small grid are averaged,
-each with the evidence that the metres give it (ibid., 7.4).
+predicted duration (idle power), slope (payload; 10 % count as a metre) and turn (0.3 rad count as a metre). b is relative to them, and
+has a part that lasts and one of the place, warmth or wear, whose correlation L falls over tens or hundreds of metres: what the known
+metres show of it counts less far away, and nothing on another way. Were only errors of metres allowed to fade, the same misfit would be
+taken for a lasting property of the robot, because b reaches further. S are the spreads that the model states of a metre, R the
+correlation of neighbours. s² has an inverse-gamma prior of mean about 1, so that all that is stated has Student's t (Gelman et al.,
+Bayesian Data Analysis, 2013, 14.2). How far both parts reach, t and f, and L are not known: all of a small grid are averaged, each with
+the evidence that the metres give it (ibid., 7.4). It is a Gaussian process (Rasmussen and Williams, 2006, 2.2).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from hashlib import sha256
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,10 +33,10 @@ Floats = NDArray[np.float64]
 
 _PRIOR = 0.05
 """q: standard deviation of a coefficient at the least reach, of what it multiplies."""
-_REACHES = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""t."""
-_GROUNDS = ((0.0, 20.0), (0.5, 20.0), (2.0, 20.0), (0.5, 200.0), (2.0, 200.0), (8.0, 200.0))
-"""r, and the distance over which L falls [m]."""
+_REACHES = (1.0, 4.0, 16.0)
+"""t and f, of which one may also be 0."""
+_FADES_M = (20.0, 200.0)
+"""Distances over which L falls."""
 _RISE_M, _TURN_RAD = 0.1, 0.3
 """What costs about as much as a metre."""
 _FREEDOM = 4.0
@@ -109,29 +111,27 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     spread, spread_there = (errors.compute_std(of.predicted, of.class_id, of.stated_std) for of in (known, there))
     neighbour, apart_m = _find_neighbour(errors), np.abs(known.distance_m[:, None] - known.distance_m)
     beside = np.eye(len(residual)) + neighbour * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
+    noise = spread[:, None] * beside * spread
+    gram, cross = design @ design.T, design @ design_there.T
+    far_m, alone = np.abs(known.distance_m[:, None] - there.distance_m), (design_there**2).sum(axis=1)
+    noise_sum, lasting = _sum_neighbours(spread_there, there, neighbour), float((design_there.sum(axis=0) ** 2).sum())
+    fading_sums = {fade_m: sum(_sum_fading(column, there, fade_m) for column in design_there.T) for fade_m in _FADES_M}
     freedom, evidences, values, variances, sums = _FREEDOM + len(residual), [], [], [], []
-    for share, ground_m in _GROUNDS:
-        factor = cho_factor(spread[:, None] * (beside + share * np.exp(-apart_m / ground_m)) * spread, lower=True)
-        whitened, solved = cho_solve(factor, design), cho_solve(factor, residual)
-        precision, log_noise = design.T @ whitened, 2.0 * float(np.log(np.diag(factor[0])).sum())
-        fades = np.exp(-np.abs(known.distance_m[:, None] - there.distance_m) / ground_m)
-        common = share * spread[:, None] * fades * spread_there
-        shares = cho_solve(factor, common)  # kriging: what is known of the ground beside
-        left, base = design_there - shares.T @ design, there.predicted + shares.T @ residual
-        own = (1.0 + share) * spread_there**2 - np.einsum("ij,ij->j", common, shares)
-        summed = _sum_neighbours(spread_there, there, neighbour) + share * _sum_ground(spread_there, there, ground_m)
-        summed -= float(common.sum(axis=1) @ shares.sum(axis=1))
-        for reach in _REACHES:
-            prior = np.eye(design.shape[1]) / (_PRIOR * reach) ** 2
-            covariance = np.linalg.inv(prior + precision)
-            coefficients = covariance @ (whitened.T @ residual)
-            misfit = float(residual @ solved - coefficients @ (whitened.T @ residual))
-            log_det = log_noise + float(np.linalg.slogdet(prior + precision)[1] - np.linalg.slogdet(prior)[1])
-            evidences.append(-0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM)))
-            scale, over = (_FREEDOM + misfit) / freedom, left.sum(axis=0)
-            values.append(base + left @ coefficients)
-            variances.append(scale * (own + np.einsum("ij,jk,ik->i", left, covariance, left)))
-            sums.append(scale * (summed + over @ covariance @ over))
+    grid = [(_FADES_M[0], reach, 0.0) for reach in _REACHES] + [*product(_FADES_M, (0.0, *_REACHES), _REACHES)]
+    for fade_m, reach, fading in grid:
+        lasts, fades = (_PRIOR * reach) ** 2, (_PRIOR * fading) ** 2
+        factor = cho_factor(noise + gram * (lasts + fades * np.exp(-apart_m / fade_m)), lower=True)
+        common = cross * (lasts + fades * np.exp(-far_m / fade_m))
+        solved, shares = cho_solve(factor, residual), cho_solve(factor, common)
+        misfit, log_det = float(residual @ solved), 2.0 * float(np.log(np.diag(factor[0])).sum())
+        evidences.append(-0.5 * log_det - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM)))
+        scale = (_FREEDOM + misfit) / freedom
+        values.append(there.predicted + common.T @ solved)
+        variances.append(scale * (spread_there**2 + (lasts + fades) * alone - np.einsum("ij,ij->j", common, shares)))
+        of_sum = (
+            noise_sum + lasts * lasting + fades * fading_sums[fade_m] - float(common.sum(axis=1) @ shares.sum(axis=1))
+        )
+        sums.append(scale * of_sum)
     weights = np.exp(np.array(evidences) - max(evidences))
     weights /= weights.sum()
     mean, variance = _mix(weights, np.array(values), np.array(variances))
@@ -160,10 +160,10 @@ def _sum_neighbours(spread: Floats, of: Metres, neighbour: float) -> float:
     return float((spread**2).sum() + 2.0 * neighbour * products.sum())
 
 
-def _sum_ground(spread: Floats, of: Metres, ground_m: float) -> float:
+def _sum_fading(values: Floats, of: Metres, fade_m: float) -> float:
     """Return sum_ij of a_i a_j times the correlation L."""
-    total, carried = float((spread**2).sum()), 0.0
-    for fades, before, here in zip(np.exp(-np.diff(of.distance_m) / ground_m), spread[:-1], spread[1:], strict=True):
+    total, carried = float((values**2).sum()), 0.0
+    for fades, before, here in zip(np.exp(-np.diff(of.distance_m) / fade_m), values[:-1], values[1:], strict=True):
         carried = fades * (carried + before)
         total += 2.0 * here * carried
     return total

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
+from numpy.typing import NDArray
 
 from tcpipe.dataset.energies import ENERGIES, EnergyName
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
@@ -30,6 +31,31 @@ SCHEMA_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
+class LayerRange:
+    """What patches of a layer of the user's were like: the means of its bands, or shares of its classes."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    largest: float
+    """Of all training samples and bands, how far from the mean, in standard deviations."""
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64]) -> LayerRange:
+        """Return the range of patches, shape (N, bands)."""
+        mean, std = values.mean(axis=0), values.std(axis=0)
+        plain = cls(tuple(mean.tolist()), tuple(np.maximum(std, _LEAST_SHARE * np.abs(mean) + 1e-9).tolist()), 0.0)
+        return replace(plain, largest=float(plain.compute_distance(values).max()))
+
+    def compute_distance(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the farthest band of each patch is from the mean, in standard deviations, shape (N,)."""
+        return np.asarray((np.abs(values - np.array(self.mean)) / np.array(self.std)).max(axis=1))
+
+
+_LEAST_SHARE = 1e-3
+"""Of its mean, by which a band varies at least: what is rounded is not outside."""
+
+
+@dataclass(frozen=True, slots=True)
 class TrainingRange:
     """What the training samples held: beyond it a model has no business."""
 
@@ -39,6 +65,8 @@ class TrainingRange:
     """Class ids of which any pixel occurs."""
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest ``slope_rad``, ``cross_slope_rad``, ``relief_m`` (highest above lowest pixel of a patch)."""
+    layers: Mapping[str, LayerRange] = field(default_factory=dict, metadata=LEFT_OUT)
+    """Of the user's layers that it takes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
-from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, format_readme
+from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange, format_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.learning.own_models import load_own_kind, report_errors
 from tcpipe.learning.physics_model import find_idle_power
@@ -45,7 +45,7 @@ from tcpipe.learning.predictor import (
 )
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS
+from tcpipe.terrain.layers import COLOURS, LAYERS, PAPER_LAYERS
 from tcpipe.terrain.sampling import compute_relief_m
 
 logger = logging.getLogger("tcpipe")
@@ -235,7 +235,9 @@ def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -
         *(name for name in LAYERS if name in named),
         *(name for name in data.card.layers if name in named - {*LAYERS}),
     ]
-    unused = [name for name in data.card.layers if name not in taken]
+    unused = [
+        name for name in data.card.layers if name not in taken and name not in COLOURS
+    ]  # colours of the grey ortho
     logger.info("%s: layers: %s; not used: %s", data.path, ", ".join(channels), ", ".join(unused) or "none")
     if own := [] if is_chosen else [name for name in unused if name not in PAPER_LAYERS]:
         message = "%s: the model does not use %s; to use it: --layers %s"
@@ -324,6 +326,7 @@ def find_training_range(split: Split) -> TrainingRange:
     """Return classes and ranges of what a split holds."""
     pixel_classes: set[int] = set()
     reliefs_m: list[float] = []
+    means: dict[str, list[Array]] = {}
     for first in range(0, len(split), _READ_TOGETHER):
         layers = split.layers(np.arange(first, min(first + _READ_TOGETHER, len(split))))
         if "terrain" in layers:
@@ -331,6 +334,8 @@ def find_training_range(split: Split) -> TrainingRange:
         if "height" in layers:
             found_m = compute_relief_m(np.asarray(layers["height"], np.uint16))
             reliefs_m += [float(found_m.min()), float(found_m.max())]
+        for name in layers.keys() - PAPER_LAYERS.keys():
+            means.setdefault(name, []).append(split.view.form.known[name].compute_means(layers[name]))
     slopes = {name: split.column(name) for name in ("slope_rad", "cross_slope_rad")}
     ranges = {name: (float(np.min(of)), float(np.max(of))) for name, of in slopes.items()}
     if reliefs_m:
@@ -338,7 +343,8 @@ def find_training_range(split: Split) -> TrainingRange:
     class_ids = split.column("terrain_class").astype(np.float64)
     ids, counts = np.unique(class_ids[np.isfinite(class_ids)].astype(int), return_counts=True)
     class_counts = dict(zip(ids.tolist(), counts.tolist(), strict=True))
-    return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges)
+    own = {name: LayerRange.of(np.concatenate(of)) for name, of in sorted(means.items())}
+    return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges, own)
 
 
 def _read_known_model(place: Path, predictor: str | None) -> ModelCard | None:
@@ -377,9 +383,10 @@ def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: 
     is_network = getattr(fitted.predictor, "stops_by_fold", False)
     used = samples.split.take(samples.folds != config.fold) if is_network else samples.split
     held = samples.take(is_held)
+    own = [name for name in samples.split.view.form.layers if name not in PAPER_LAYERS]
     return ModelCard(
         inputs=inputs,
-        layers={name: card.layers[name] for name in samples.split.view.form.layers if name not in PAPER_LAYERS},
+        layers={name: card.layers[name] for name in own},
         chord_m=card.recipe.segment.chord_m,
         max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
         label_velocity=card.label.velocity,
@@ -388,7 +395,7 @@ def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: 
         robot=", ".join(card.robots),
         classes=read_class_table(card).classes,
         training_range=find_training_range(
-            used.with_channels(*(name for name in ("terrain", "height") if name in card.layers))
+            used.with_channels(*(name for name in ("terrain", "height") if name in card.layers), *own)
         ),
         physics=card.physics.get(card.robots[0]) if len(card.robots) == 1 else None,
         dataset=TrainedOn(card.name, compute_dataset_checksum(card), card.data_model_version, card.splits),

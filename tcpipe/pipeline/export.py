@@ -95,18 +95,12 @@ def export(
 ) -> Exported:
     """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, units and definition in the metadata.
 
-    The log is read once and written piece by piece: memory does not grow with it. What ``out`` holds already of the same log is left
-    alone.
+    The log, or that at a URL, is read once and written piece by piece: memory does not grow with it. What ``out`` holds already of the
+    same log is left alone. Without ``topics`` all are written; one text may name several, divided by commas. ``message_definitions`` is a
+    directory of .msg or .idl files for types that the log does not define.
 
-    Raises `LogError`: the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to
-    another log or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
-
-    Parameters
-    ----------
-    log_path : a log of any container, or the URL of one.
-    out : a directory; it is made where it does not exist.
-    topics : names of topics; none given means all. One text may name several, divided by commas.
-    message_definitions : a directory of .msg or .idl files for types that the log does not define.
+    `LogError`: the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another
+    log or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
     """
     _refuse_what_is_ours(out)
     clear(out)

@@ -106,14 +106,10 @@ def inspect(
     full: bool = False,
     message_definitions: Path | None = None,
 ) -> Inspected:
-    """Return what the path holds.
+    """Return what the path holds; with ``full`` from every message of a log, for damage, gaps, stamps and clocks.
 
-    Raises `LogError`, `MapError`, `DatasetError`, `StoreError`: it is none of these, or cannot be read.
-
-    Parameters
-    ----------
-    full : read every message of a log: damage, gaps, stamps and clocks, instead of its index alone.
-    message_definitions : a directory of .msg or .idl files for types that a log does not define.
+    ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `LogError`, `MapError`,
+    `DatasetError`, `StoreError`: it is none of these, or cannot be read.
     """
     ask = partial(
         _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions

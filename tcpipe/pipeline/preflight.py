@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -20,9 +20,7 @@ from tcpipe.formats.finding_lines import format_findings, format_loss, format_ve
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.logs.clocks import CLOCK
-from tcpipe.logs.roles import OVERLAY
-from tcpipe.logs.topics import MISSING, Topic
+from tcpipe.logs.topics import MISSING
 from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.ingest_run import run_stages
@@ -41,20 +39,8 @@ WANTED_HZ: Mapping[str, float] = {
 }
 """Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.labels`)."""
 
-LARGE_TYPES = frozenset(
-    f"sensor_msgs/msg/{name}"
-    for name in ("Image", "CompressedImage", "PointCloud", "PointCloud2", "LaserScan", "MultiEchoLaserScan")
-) | {
-    "stereo_msgs/msg/DisparityImage",
-    "nav_msgs/msg/OccupancyGrid",
-    "velodyne_msgs/msg/VelodyneScan",
-    "livox_ros_driver2/msg/CustomMsg",
-}
-"""What fills disks and is of no use here."""
-
 _WORTH_SAYING = 0.05
 _MOST_LOSSES = 3
-_TRANSFORMS = "/tf_static"
 _WINDOW_S, _FEWEST_WINDOWS = 10.0, 3
 
 
@@ -127,10 +113,6 @@ class Preflight:
     verdict: Verdict
     losses: tuple[StoreLoss, ...]
     """Where most metres go that are no segments."""
-    record: str
-    """The command that records all that may be of use; "" where the log is no recording of ROS."""
-    large: Mapping[str, float | None]
-    """Images and point clouds, which it leaves out, with the messages that come of each a second."""
     recipe: str
     """What ``tcpipe init --from`` would write, less what the recipe settles [TOML]."""
     exit_code: int
@@ -147,9 +129,6 @@ class Preflight:
         said += [f"verdict   {format_verdict(self.verdict)}"] if self.expected_yield else []
         said += format_findings(self.findings, more=f"tcpipe preflight {shlex.quote(self.log)} --json")
         said += [f"loss      {format_loss(loss)}" for loss in self.losses]
-        said += [f"record    {self.record}"] if self.record else []
-        rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())
-        said += [f"large     images and point clouds, which this command does not record: {rates}"] if rates else []
         said += ["ready: no problems found"] if self.exit_code == 0 else []
         return clean_lines([*said, "", *self.recipe.splitlines()])
 
@@ -164,12 +143,8 @@ def preflight(
 ) -> Preflight:
     """Return what recording like this promises.
 
-    Raises `LogError`, `RecipeError`: it is no log, or cannot be read at all.
-
-    Parameters
-    ----------
-    log : a minute or more, of any container, or the URL of one; all of it is read. Of a folder of logs the first.
-    recipe, robot, message_definitions : as `tcpipe.pipeline.ingest.ingest` takes them.
+    ``log`` is a minute or more, of any container, or the URL of one, of a folder of logs the first; all of it is read. The rest is as
+    `tcpipe.pipeline.ingest.ingest` takes it. `LogError`, `RecipeError`: it is no log, or cannot be read at all.
     """
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)
@@ -177,30 +152,22 @@ def preflight(
         path = find_logs_at(path, recipe.tables)[0][0]
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as found:
         seen = replace(inspect_log(found, recipe, robot, full=False, reads_roles=True), path=format_path(log))
-        topics = tuple(found.topics.values())
         read = find_read_config(recipe, found.topics)
-        cast = decide_roles(read, topics, robot, known=load_profiles(recipe))
-        large = {of.name: of.rate_hz for of in seen.topics or () if of.type in LARGE_TYPES and of.role is None}
-        kept = [of.name for of in topics if of.name not in large and not of.name.startswith(OVERLAY)]
-        record = record_command(topics, kept)
-        record += "" if cast.transforms or not record else f" {_TRANSFORMS}"
-        missing = tuple(find_missing(cast.roles, read))
+        roles = decide_roles(read, found.topics.values(), robot, known=load_profiles(recipe)).roles
+        missing = tuple(find_missing(roles, read))
         labelled, problems, causes = None, tuple[str, ...](), tuple[Finding, ...]()
         try:
             streams = read_run(found, read, robot=robot, known=load_profiles(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
             problems, causes = error.problems, error.findings
-    return _summarize(seen, labelled, (*missing, *causes), record=record, large=large, problems=problems)
+    return _summarize(seen, labelled, (*missing, *causes), problems)
 
 
 def _summarize(
     seen: InspectedLog,
     labelled: LabelledSegments | None,
     missing: tuple[Finding, ...],
-    *,
-    record: str,
-    large: Mapping[str, float | None],
     problems: tuple[str, ...],
 ) -> Preflight:
     report = labelled.info.report if labelled else NOTHING_FOUND
@@ -221,8 +188,6 @@ def _summarize(
         findings=tuple(sort_findings(findings)),
         verdict=judge(findings),
         losses=tuple(loss for loss in losses if loss.share > _WORTH_SAYING)[:_MOST_LOSSES],
-        record=record,
-        large=large,
         recipe=seen.recipe or "",
         exit_code=0 if ready else 3 if expected_yield else 1,
     )
@@ -304,13 +269,3 @@ def _is_ruled_by_rate(budget: EnergyBudget) -> bool:
     least_share = read_threshold("power-rate-dominates", "min_variance_fraction")
     gain = read_threshold("power-rate-dominates", "max_remaining_fraction")
     return budget.rate**2 > least_share * budget.total**2 and budget.at_20_hz < gain * budget.total
-
-
-def record_command(topics: Iterable[Topic], names: Sequence[str]) -> str:
-    """Return how ROS records exactly these topics, and a simulation's clock; "" where they come from no recording of ROS."""
-    known = {topic.name: topic for topic in topics}
-    clocks = [name for name, topic in known.items() if topic.type_name == CLOCK and names]
-    wanted = [name for name in dict.fromkeys([*names, *clocks]) if name in known]
-    encodings = {known[name].encoding for name in wanted}
-    begin = "rosbag record --lz4 -O drive" if encodings == {"ros1"} else "ros2 bag record -s mcap -o drive"
-    return " ".join([begin, *map(shlex.quote, wanted)]) if wanted and encodings <= {"ros1", "cdr"} else ""

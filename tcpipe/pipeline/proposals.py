@@ -52,34 +52,33 @@ def propose_recipe(
 
     Raises `LogError`, `UsageError`: there is nothing to read.
     """
-    path = path if is_url(path) else Path(path)
+    path, others, recipe = path if is_url(path) else Path(path), list[str](), Recipe()
     if isinstance(path, Path) and (is_store(path) or (path / "dataset.json").is_file()):
         raise UsageError(f"{path}: tcpipe wrote this; expected a log or a folder of tables")
     if isinstance(path, Path) and (is_table(path.name) or (path.is_dir() and not is_one_bag(path))):
         logs = list_logs_below(path) if path.is_dir() else []
         if not logs:
-            from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
-
-            found = propose_tables(path)
-            if not found.lines:
-                raise UsageError(
-                    f"{path}: it contains no log, and no table with stamps and columns of known names",
-                    *filter(None, found.head),
-                )
-            return found
-        others = [f"proposed for the first of {len(logs)} logs"] if len(logs) > 1 else []
+            return _propose_tables(path)
+        others += [f"proposed for the first of {len(logs)} logs"] if len(logs) > 1 else []
         if tables := [file.name for file in list_table_files(path)]:
             others += [f"tables, not used: {', '.join(tables)}; to use them, tcpipe init --from a folder without logs"]
         path = logs[0]
-    else:
-        others = []
-    recipe = Recipe()
     with open_single_log(path, message_definitions=message_definitions, tables=None) as log:
         config, known = recipe.read, load_profiles(recipe)
         assigned = decide_roles(config, log.topics.values(), robot, known=known)
         proposals = find_proposals(log, assigned, config, known)
         found = propose_for_log(log, assigned, recipe, proposals, is_complete=True)
         return replace(found, head=[*others, *found.head], log=format_path(path))
+
+
+def _propose_tables(path: Path) -> ProposedRecipe:
+    from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
+
+    found = propose_tables(path)
+    if not found.lines:
+        what = f"{path}: it contains no log, and no table with stamps and columns of known names"
+        raise UsageError(what, *filter(None, found.head))
+    return found
 
 
 def propose_for_log(

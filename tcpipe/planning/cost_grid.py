@@ -266,16 +266,10 @@ def read_classes(source: MapReader, grid: MapGrid) -> Classes:
     return classes
 
 
-def make_survey(model: Model, source: MapReader, cell_size_m: float) -> LazyCostGrid:
-    """Return a survey of which nothing is known."""
-    grid = make_grid(source, cell_size_m)
-    known = np.zeros((2, grid.rows, grid.cols), np.bool_)
-    return LazyCostGrid(
-        model, source, make_empty_grid(grid), known[0], known[1], CellFrames(grid, where=f"map {source.name}")
-    )
-
-
-def read_survey(model: Model, source: MapReader, costs: CostGrid) -> LazyCostGrid:
-    """Return a survey of which all is known, from a cost map."""
-    known = np.ones((2, costs.grid.rows, costs.grid.cols), np.bool_)
-    return LazyCostGrid(model, source, costs, known[0], known[1], CellFrames(costs.grid, where=f"map {source.name}"))
+def make_survey(model: Model, source: MapReader, costs: CostGrid | float) -> LazyCostGrid:
+    """Return a survey of which all is known, from a cost map, or of cells of this side [m] of which nothing is."""
+    is_known = isinstance(costs, CostGrid)
+    grid = costs if isinstance(costs, CostGrid) else make_empty_grid(make_grid(source, costs))
+    known = np.full((2, grid.grid.rows, grid.grid.cols), is_known)
+    frames = CellFrames(grid.grid, where=f"map {source.name}")
+    return LazyCostGrid(model, source, grid, known[0], known[1], frames)

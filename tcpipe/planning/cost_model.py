@@ -67,6 +67,9 @@ def check_model(model: Model, source: MapReader) -> None:
 LANE_M = 0.7
 """Width of the strip that a robot needs, about the paper's Husky (0.67 m) [m]."""
 
+_ROUNDED = 1.0 + 1e-6
+"""Factor up to which a distance is that of training."""
+
 _STRAY = 0.05
 """Share of a lane's pixels that may be wrongly classed."""
 
@@ -94,6 +97,8 @@ class Reason(IntFlag):
     """More than 5 % of the strip that the robot drives over (0.7 m wide) is not traversable, though the middle is."""
     CURVED = 1 << 9
     """The path is more curved here than any training segment (its recipe's `max_arc_to_chord`)."""
+    LAYER_OUTSIDE_TRAINING = 1 << 10
+    """The mean of a band of a layer of yours, or the share of a class of it, is farther from that of training than in any sample."""
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION
@@ -120,6 +125,9 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, sour
     for reason, (values, name) in ranges.items():
         low, high = model.card.training_range.ranges[name]
         bits[~((values >= low) & (values <= high))] |= np.uint16(reason)
+    for name, known in model.card.training_range.layers.items():
+        values = model.card.layout.known[name].compute_means(patches.pixels[name])
+        bits[known.compute_distance(values) > known.largest * _ROUNDED] |= np.uint16(Reason.LAYER_OUTSIDE_TRAINING)
     if "terrain" in patches.pixels:
         bits |= _find_class_reasons(patches, patches.pixels["terrain"], model, source)
     bits[~on_map] = Reason.OUTSIDE_MAP

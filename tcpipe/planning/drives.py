@@ -29,7 +29,7 @@ from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import Reason, check_model, predict_segments
 from tcpipe.planning.path_cost import find_added_turning
-from tcpipe.recipe import SampleConfig
+from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store
@@ -182,18 +182,42 @@ def predict_run(
     return DrivenMetres(Run(run.run_id, metres), reasons)
 
 
-def collect_run(model: Model, source: MapReader, run: RunDirectory) -> Run:
-    """Return the labelled segments of a run on ground that the model knows, predicted and measured; `UsageError` if there are none.
+def collect_runs(
+    model: Model, source: MapFile, store: Store, logs: Sequence[str], data: Dataset | None = None
+) -> list[Run]:
+    """Return the labelled segments of drives on ground that the model knows, predicted and measured; `UsageError` if one has none.
 
-    The run may be of another robot, payload or season: a model is adapted by it.
+    They may be of another robot, payload or season: a model is adapted by them. They are moved onto the map as the dataset's recipe says
+    (``sample.align``), without one by the default.
     """
-    found = predict_run(model, source, run)
-    if not found.is_good.any():
-        named = ", ".join(found.names).replace("_", " ") or "it has no segments"
-        raise UsageError(
-            f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
-        )
-    return Run(run.run_id, {name: of.take(found.is_good) for name, of in found.run.metres.items()})
+    runs = [find_drive(store, log) for log in logs]
+    recipe = replace(Recipe(), read=runs[0].manifest.recipe.read) if data is None else data.card.recipe
+    shifts, collected = find_shifts(store, source, recipe, runs, data)[0], list[Run]()
+    for run in runs:
+        shift = shifts.get(run.run_id, (0.0, 0.0, 0.0))
+        found = predict_run(model, source, run, sample=recipe.sample, shift=shift)
+        if not found.is_good.any():
+            named = ", ".join(found.names).replace("_", " ") or "it has no segments"
+            raise UsageError(
+                f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
+            )
+        collected.append(Run(run.run_id, {name: of.take(found.is_good) for name, of in found.run.metres.items()}))
+    return collected
+
+
+def find_shifts(
+    store: Store, source: MapFile, recipe: Recipe, runs: Sequence[RunDirectory], data: Dataset | None = None
+) -> tuple[Shifts, list[Finding]]:
+    """Return where runs lie on a map, with those of a dataset that are in the store, and findings; nothing without ``sample.align``."""
+    if not recipe.sample.align:
+        return {}, []
+    known = {(run.run_id, run.recipe_id) for run in runs}
+    known |= set() if data is None else {(run.run_id, run.recipe_id) for run in data.card.runs}
+    together = [run for run in store.runs() if (run.run_id, run.recipe_id) in known]
+    registrations, found = register_runs(together, source, recipe)
+    names = {run.run_id for run in runs}
+    moved = [of for of in found if of.subject.kind != "run" or of.subject.name in names]
+    return list_shifts(registrations), moved
 
 
 def compute_drive_cost(
@@ -313,14 +337,7 @@ def evaluate_drives(
     clear(place)
     if place.exists() and not place.is_dir():
         raise UsageError(f"{place}: is a file, expected a directory to write {JSON} into")
-    recipe, shifts, moved = data.card.recipe, dict[str, tuple[float, float, float]](), list[Finding]()
-    if recipe.sample.align:
-        names = {run.run_id for run in runs}
-        known = {(run.run_id, run.recipe_id) for run in data.card.runs} | {(run.run_id, run.recipe_id) for run in runs}
-        together = [run for run in opened.runs() if (run.run_id, run.recipe_id) in known]
-        registrations, found_on_map = register_runs(together, source, recipe)
-        shifts = list_shifts(registrations)
-        moved = [of for of in found_on_map if of.subject.kind != "run" or of.subject.name in names]
+    shifts, moved = find_shifts(opened, source, data.card.recipe, runs, data)
     found = tuple(
         compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
         for run, log in zip(runs, logs, strict=True)

@@ -23,7 +23,7 @@ from tcpipe.formats.json_files import convert_record, digest, read_as, write_jso
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.learning.models import Model
-from tcpipe.planning.cost_grid import make_survey, read_survey
+from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import check_model
 from tcpipe.planning.path_cost import (
@@ -305,10 +305,8 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     objective = options.objective
     if (found := _read_plans(out, picture, key)) is not None:
         return PlanResult(objective, out, picture, "unchanged", *found)
-    if costs is None or card is None:
-        survey = make_survey(model, source, options.cell_size_m)
-    else:
-        survey = read_survey(model, source, open_cost_map(costs, card))
+    known = None if costs is None or card is None else open_cost_map(costs, card)
+    survey = make_survey(model, source, options.cell_size_m if known is None else known)
     wanted = (objective, *(name for name in OBJECTIVES if picture is not None and name != objective))
     risk = RISK if options.risk is None and options.budget_joule is not None else options.risk
     step = options.on_step or (lambda _, __: None)

@@ -12,7 +12,6 @@ returned is the one that costs least as `tcpipe predict-path` predicts it.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -213,18 +212,13 @@ class _Search:
     def _check_open(self) -> None:
         """Raise `PathError` for an end from which no course can be driven; both at once."""
         bits = self.survey.costs.reasons.reshape(len(self.survey.costs.reasons), -1)[:, self._cells]
-        problems = []
-        for label, own in zip(
-            ("--from", "--to"), (bits & (BARRED if self.allow_extrapolation else 0xFFFF)).T, strict=True
-        ):
+        forbidden, problems = BARRED if self.allow_extrapolation else 0xFFFF, []
+        for label, own in zip(("--from", "--to"), (bits & forbidden).T, strict=True):
             if own.all():
                 common = int(np.bitwise_and.reduce(own)) or int(np.bitwise_or.reduce(own))
                 words = ", ".join(name.replace("_", " ") for name in flag_names(common, Reason))
-                hint = (
-                    ""
-                    if self.allow_extrapolation or common & BARRED
-                    else ", or allow such ground with --allow-extrapolation"
-                )
+                is_closed = self.allow_extrapolation or common & BARRED
+                hint = "" if is_closed else ", or allow such ground with --allow-extrapolation"
                 problems.append(
                     f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"
                 )
@@ -321,8 +315,8 @@ class _Search:
                 *(int(np.count_nonzero(cells & ~survey.predicted)) for cells in (probes | ellipse, open_)),
                 COURSES,
             )
-        pace_s = self._ask(probes, 0.0)
-        pace_s = self._ask(ellipse, pace_s)
+        self._ask(probes)
+        self._ask(ellipse)
         while True:
             steps, paths = self._find(objective, survey.predicted, class_id)
             wanted = self._could_be_better(objective, paths[0] if paths else None, class_id)
@@ -330,7 +324,7 @@ class _Search:
                 if not paths:
                     raise PathError(self._no_way())
                 return steps, paths
-            pace_s = self._ask(wanted, pace_s)
+            self._ask(wanted)
 
     def _maybe_open(self) -> NDArray[np.bool_]:
         """Return where a course may be driven as far as is known, shape (16, rows, cols)."""
@@ -352,15 +346,11 @@ class _Search:
         wanted.reshape(-1)[cells[np.argsort(over[cells], kind="stable")[:most]]] = True
         return wanted
 
-    def _ask(self, wanted: Mask, pace_s: float) -> float:
-        """Ask the model about cells; say how many, and how long that takes at ``pace_s`` a cell. Return the pace."""
-        count = int(np.count_nonzero(wanted & ~self.survey.predicted))
-        if not count:
-            return pace_s
-        logger.info("predicting %d cells%s", count, f", about {count * pace_s:.0f} s" if pace_s else "")
-        begun_s = time.monotonic()
-        self.survey.predict(wanted, self.step)
-        return (time.monotonic() - begun_s) / count
+    def _ask(self, wanted: Mask) -> None:
+        """Ask the model about cells, and log how many."""
+        if count := int(np.count_nonzero(wanted & ~self.survey.predicted)):
+            logger.info("predicting %d cells", count)
+            self.survey.predict(wanted, self.step)
 
     def _draw_lines(self, steps: Steps, paths: Iterable[LeastCostPath]) -> Iterator[Floats]:
         """Yield each path in the map's CRS [m], from end to end as they were given: as its steps, and as straight lines that cost less."""

@@ -104,6 +104,19 @@ class Layer:
         wanted = FINE_ENOUGH * min(patch_m / self.pixel_size_m, patch_px)
         return replace(self, own_px=next(n for n in range(1, patch_px + 1) if patch_px % n == 0 and n >= wanted))
 
+    def compute_means(self, pixels: Pixels) -> NDArray[np.float64]:
+        """Return the mean of each band of stored patches, or the share of each class, shape (N, bands or classes); without data: 0."""
+        if self.classes is not None:
+            ids = np.arange(1, self.classes.count + 1)
+            return np.stack([np.mean(pixels == of, axis=(1, 2)) for of in ids], axis=1)
+        values = pixels.reshape(len(pixels), max(len(self.bands), 1), -1).astype(np.float64)
+        has_data = self.has_stored_data(values)
+        return np.asarray(np.where(has_data, values, 0.0).sum(axis=2) / np.maximum(has_data.sum(axis=2), 1))
+
+    def has_stored_data(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which pixels of a patch have data."""
+        return np.isfinite(values) if np.isnan(self.nodata) else np.asarray(values != self.nodata)
+
     @property
     def signature(self) -> str:
         """What layers of one name have in common wherever patches of them go together, but for classes."""

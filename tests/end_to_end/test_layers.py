@@ -19,11 +19,14 @@ from synthetic_store import WORLD, add_run, lanes, segments
 import tcpipe
 from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.learning.model_card import LayerRange
 from tcpipe.learning.models import load_model
 from tcpipe.learning.training import _report_layers
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import Store, open_store
+from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import Layer
 
 DRAWS_DATASET_PAGES = True
 
@@ -313,6 +316,23 @@ def test_a_network_takes_a_channel_for_each_band(datasets, tmp_path):
     other = patches.copy()
     other[..., 5] = 1.0 - other[..., 5]  # one band alone
     assert np.abs(model.predict(patches).mean - model.predict(other).mean).max() > 0.0
+
+
+def test_ground_unlike_that_of_training_in_a_layer_of_one_s_own_is_named(models):
+    """A band far from all training samples, or a class that none had; the same patches as in training are inside."""
+    model = load_model(models / "model-bands")
+    split = tcpipe.open_dataset(models / "zarr")["train"].with_channels("embedding")
+    known, layer = model.card.training_range.layers["embedding"], model.card.layout.known["embedding"]
+    patches = split.layers(np.arange(len(split)))["embedding"]
+    inside = known.compute_distance(layer.compute_means(patches))
+    assert inside.max() == pytest.approx(known.largest)
+    other = patches.astype(np.float32)
+    other[:, 3] += 3.0 * (other[:, 3].max() - other[:, 3].min())
+    assert (known.compute_distance(layer.compute_means(other)) > known.largest).all()
+    classes = Layer("x", "categorical", "x", np.dtype(np.uint8), np.dtype(np.uint8), classes=PAPER_CLASSES)
+    seen = LayerRange.of(classes.compute_means(np.full((5, 2, 2), 4, np.uint8)))
+    new = seen.compute_distance(classes.compute_means(np.array([[[4, 4], [4, 4]], [[4, 4], [4, 5]]], np.uint8)))
+    assert (new > seen.largest).tolist() == [False, True]
 
 
 def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):

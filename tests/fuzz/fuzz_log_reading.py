@@ -177,9 +177,8 @@ def _text(row: dict[str, object]) -> str:
 def _block(payloads: list[bytes]) -> MessageBlock:
     lengths = np.array([len(payload) for payload in payloads], np.int64)
     order = np.arange(len(payloads))
-    alike = int(lengths[0]) if (lengths == lengths[0]).all() else None
     starts = np.cumsum(lengths) - lengths
-    return MessageBlock(0, memoryview(b"".join(payloads)), starts, lengths, order, order, order, alike)
+    return MessageBlock(0, memoryview(b"".join(payloads)), starts, lengths, order, order, order)
 
 
 def _definition(type_name: str, encoding: str) -> str:

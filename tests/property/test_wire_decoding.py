@@ -106,9 +106,7 @@ def decoded(of, payloads, encoding, definitions=None):
     table = TopicTable(MessageType(of, "log", definitions or {}), encoding)
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.arange(len(payloads))
-    table.add(
-        MessageBlock(0, memoryview(b"".join(payloads)), np.cumsum(lengths) - lengths, lengths, rows, rows, rows, None)
-    )
+    table.add(MessageBlock(0, memoryview(b"".join(payloads)), np.cumsum(lengths) - lengths, lengths, rows, rows, rows))
     found = table.take()
     assert table.undecodable == 0
     return found
@@ -149,7 +147,7 @@ def test_a_message_that_fits_no_definition_costs_only_itself(header):
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.arange(len(payloads))
     buffer = memoryview(b"".join(payloads))
-    table.add(MessageBlock(0, buffer, np.cumsum(lengths) - lengths, lengths, rows, rows, rows, None))
+    table.add(MessageBlock(0, buffer, np.cumsum(lengths) - lengths, lengths, rows, rows, rows))
     found = table.take()
     kept = [value for row, value in enumerate(values) if row not in (3, 50, 99)]
     assert found["texts"].to_pylist() == [value["texts"] for value in kept]
@@ -174,9 +172,7 @@ def test_arrays_of_messages_that_hold_short_arrays_of_messages():
     lengths = np.full(len(writer), len(writer[0]), np.int64)
     order = np.arange(len(writer))
     table = TopicTable(MessageType(outer, "log", {}), "cdr")
-    table.add(
-        MessageBlock(0, memoryview(b"".join(writer)), order * lengths[0], lengths, order, order, order, int(lengths[0]))
-    )
+    table.add(MessageBlock(0, memoryview(b"".join(writer)), order * lengths[0], lengths, order, order, order))
     found = table.take()
     found.validate(full=True)
     assert found["a"].to_pylist() == [value["a"] for value in values]

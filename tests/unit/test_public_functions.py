@@ -5,8 +5,10 @@ import inspect
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import numpy as np
@@ -22,6 +24,10 @@ from tcpipe.cli import cli
 from tcpipe.errors import UsageError
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.models import load_model
+from tcpipe.planning import drives
+from tcpipe.planning.path_files import choose_map
+from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 
 STUB = Path(tcpipe.__file__).with_suffix(".pyi")
@@ -193,6 +199,16 @@ def test_a_model_is_adapted_by_runs_of_the_store(place, monkeypatch):
     assert {(of["predictor"], of["metres"]) for of in said["errors"]} == {
         ("model", 0.0), ("model", 5.0), ("mean of the metres", 5.0),
     }  # fmt: skip
+    # The recipe of the dataset says whether they are moved onto the map (where "south" lies is patched).
+    aligned = replace(Recipe(), sample=replace(Recipe().sample, align=True))
+    there = SimpleNamespace(run_id="south", shift_xy_m=(1.0, 0.0), applied_std_m=0.02)
+    monkeypatch.setattr(drives, "register_runs", lambda _runs, _source, _recipe: ((there,), []))
+    given = load_model("adaptable"), choose_map(store, None), open_store(store), ["south"]
+    still, moved = (
+        drives.collect_runs(*given, SimpleNamespace(card=SimpleNamespace(recipe=recipe, runs=())))[0].metres["energy"]
+        for recipe in (Recipe(), aligned)
+    )
+    assert not np.array_equal(still.predicted[:20], moved.predicted[:20])
     done = command("evaluate", "adaptable", "dataset", "--adapt", "0,9000", cwd=here)
     assert "give smaller values to --adapt" in plain_lines(done, 1)
     assert "expected metres with commas" in plain_lines(

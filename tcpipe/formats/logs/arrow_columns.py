@@ -34,25 +34,20 @@ from tcpipe.tables.arrays import number_column
 
 FLUSH_BYTES = 1 << 21
 """Payloads are turned into columns when about this much has gathered: it still lies in the cache."""
-MIN_GROUP = 8
-"""Fewer messages of equal length are not worth a walk of their own."""
+MIN_GROUP = 512
+"""Fewer messages of equal length, among others, are not worth a walk of their own."""
 MAX_REFUSED = 20_000
 """Of a topic's messages that a walk does not fit, so many are refused one by one."""
-RAGGED_BYTES = 1 << 21
-"""Messages of many lengths are walked when about this much of them has gathered."""
 MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 
 _TIMES_BYTES, _HEAD_BYTES = 24, 4
-_FEW = 32
 _BEFORE_ALL = -(2**63)
 
 LOG_TIME = "log_time_ns"
 PUBLISH_TIME = "publish_time_ns"
 
 _Int64 = NDArray[np.int64]
-_Gathered = list[tuple[_Int64, NDArray[np.uint8], _Int64]]
-"""Rows of messages, their payloads one after the other, and how long each is."""
 
 
 def make_arrow_schema(message: Record) -> pa.Schema:
@@ -86,13 +81,13 @@ class TopicTable:
         """About how much memory the messages take that no table was taken of yet."""
         self._type, self._encoding = message_type, encoding
         self._wire = message_type.wire
-        self._alike: dict[int, _Gathered] = {}
-        self._ragged: _Gathered = []
-        self._alike_bytes = self._ragged_bytes = 0
+        self._gathered: list[tuple[_Int64, NDArray[np.uint8], _Int64]] = []
+        """Rows of messages, their payloads one after the other, and how long each is."""
+        self._gathered_bytes = 0
         self._scratch = np.zeros(0, np.uint8)
         self._times: list[tuple[_Int64, _Int64, _Int64]] = []
         self._parts: list[tuple[_Int64, pa.Table]] = []
-        self._rows = self._seen = 0
+        self._rows = 0
         self._taken_until = _BEFORE_ALL
         self._side_by_side = True
         self._refused = 0
@@ -100,40 +95,21 @@ class TopicTable:
 
     def add(self, block: MessageBlock) -> None:
         """Add the messages of a block; its buffer is not needed afterwards."""
-        count = len(block.offsets)
-        rows = np.arange(self._rows, self._rows + count)
-        self._rows += count
-        self._seen += count
+        count, lengths = len(block.offsets), block.lengths
+        if not count:
+            return
         self._times.append((block.log_time_ns, block.publish_time_ns, block.ordinal))
-        self.held_bytes += int(block.lengths.sum()) + _TIMES_BYTES * count
-        distinct = np.unique(block.lengths).tolist() if block.length is None else [block.length] if count else []
-        if len(distinct) == 1:
-            self._add_alike(rows, block.buffer, block.offsets, distinct[0])
-        elif len(distinct) * MIN_GROUP > max(count, _FEW):
-            pieces = zip(block.offsets.tolist(), block.lengths.tolist(), strict=True)
-            payloads = b"".join(block.buffer[start : start + length] for start, length in pieces)
-            self._add_ragged([(rows, np.frombuffer(payloads, np.uint8), block.lengths)])
+        if (lengths == lengths[0]).all():
+            payloads = _gather_payloads(block.buffer, block.offsets, int(lengths[0]))
         else:
-            for length in distinct:
-                chosen = block.lengths == length
-                self._add_alike(rows[chosen], block.buffer, block.offsets[chosen], length)
-        if self._alike_bytes > FLUSH_BYTES:
+            pieces = zip(block.offsets.tolist(), lengths.tolist(), strict=True)
+            payloads = np.frombuffer(b"".join(block.buffer[at : at + length] for at, length in pieces), np.uint8)
+        self._gathered.append((np.arange(self._rows, self._rows + count), payloads, lengths))
+        self._rows += count
+        self._gathered_bytes += len(payloads)
+        self.held_bytes += len(payloads) + _TIMES_BYTES * count
+        if self._gathered_bytes > FLUSH_BYTES:
             self._flush()
-
-    def _add_alike(self, rows: _Int64, buffer: memoryview, offsets: _Int64, length: int) -> None:
-        """Add messages of equal length."""
-        payloads = np.zeros(0, np.uint8)
-        if length:
-            windows: NDArray[np.void] = np.ndarray((len(buffer) - length + 1,), f"V{length}", buffer, 0, (1,))
-            payloads = windows[offsets].view(np.uint8)
-        self._alike.setdefault(length, []).append((rows, payloads, np.full(len(rows), length)))
-        self._alike_bytes += len(payloads)
-
-    def _add_ragged(self, gathered: _Gathered) -> None:
-        self._ragged += gathered
-        self._ragged_bytes += sum(len(payloads) for _, payloads, _ in gathered)
-        if self._ragged_bytes > RAGGED_BYTES:
-            self._decode(self._ragged)
 
     def take(self, *, share: float = 1.0) -> pa.Table:
         """Return the messages held, sorted by log time (those of equal time in the order of the log), and forget them.
@@ -141,7 +117,6 @@ class TopicTable:
         With a ``share`` below 1, about so much of them, the earlier ones: the rest stays, for what comes later but belongs before it.
         """
         self._flush()
-        self._decode(self._ragged)
         if not self._parts:
             self._forget()
             return self.schema.empty_table()
@@ -184,24 +159,16 @@ class TopicTable:
         self._times, self._parts = [], []
 
     def _flush(self) -> None:
-        for gathered in self._alike.values():
-            if self._seen < MIN_GROUP or sum(len(rows) for rows, *_ in gathered) >= MIN_GROUP:
-                self._decode(gathered)
-            else:
-                self._add_ragged(gathered)
-        self._alike, self._alike_bytes = {}, 0
-
-    def _decode(self, gathered: _Gathered) -> None:
-        """Turn messages into a part of the table for each dialect, and forget them."""
-        if not gathered:
+        """Turn the messages gathered into parts of the table for each dialect."""
+        if not self._gathered:
             return
-        rows, lengths = (np.concatenate([piece[at] for piece in gathered]) for at in (0, 2))
-        size = int(lengths.sum())
-        if size > len(self._scratch):
-            self._scratch = np.empty(size, np.uint8)
-        data = np.concatenate([payloads for _, payloads, _ in gathered], out=self._scratch[:size])
-        if gathered is self._ragged:
-            self._ragged, self._ragged_bytes = [], 0
+        rows, lengths = (np.concatenate([piece[at] for piece in self._gathered]) for at in (0, 2))
+        if self._gathered_bytes > len(self._scratch):
+            self._scratch = np.empty(self._gathered_bytes, np.uint8)
+        data = np.concatenate(
+            [payloads for _, payloads, _ in self._gathered], out=self._scratch[: self._gathered_bytes]
+        )
+        self._gathered, self._gathered_bytes = [], 0
         ends = np.cumsum(lengths)
         starts = ends - lengths
         for of in self._split_dialects(data, starts, lengths):
@@ -211,7 +178,25 @@ class TopicTable:
             except LayoutError as error:
                 self._leave_out(str(error), len(rows[of]))
             else:
-                self._decode_dialect(rows[of], data, starts[of], ends[of], dialect)
+                self._decode_lengths(rows[of], data, starts[of], ends[of], dialect)
+
+    def _decode_lengths(
+        self, rows: _Int64, data: NDArray[np.uint8], starts: _Int64, ends: _Int64, dialect: Dialect
+    ) -> None:
+        """Decode messages, those of each length that many have apart: a field of them is a strided view."""
+        lengths = ends - starts
+        if (lengths == lengths[0]).all():
+            self._decode_dialect(rows, data, starts, ends, dialect)
+            return
+        groups = dict(group_by_key(lengths))
+        for length in [length for length, of in groups.items() if length and len(of) >= MIN_GROUP]:
+            of = groups.pop(length)
+            begins = length * np.arange(len(of))
+            alike = _gather_payloads(data.data, starts[of], length)
+            self._decode_dialect(rows[of], alike, begins, begins + length, dialect)
+        if groups:
+            of = np.sort(np.concatenate(list(groups.values())))
+            self._decode_dialect(rows[of], data, starts[of], ends[of], dialect)
 
     def _split_dialects(self, data: NDArray[np.uint8], starts: _Int64, lengths: _Int64) -> Iterator[slice | _Int64]:
         """Yield which messages have the same head of CDR; those that are too short for one have none."""
@@ -282,6 +267,14 @@ class TopicTable:
     def _add_part(self, rows: _Int64, columns: list[pa.Array]) -> None:
         if len(rows):
             self._parts.append((rows, pa.Table.from_arrays(columns, schema=self._fields)))
+
+
+def _gather_payloads(buffer: memoryview, offsets: _Int64, length: int) -> NDArray[np.uint8]:
+    """Return messages of one length one after the other."""
+    if not length:
+        return np.zeros(0, np.uint8)
+    windows: NDArray[np.void] = np.ndarray((len(buffer) - length + 1,), f"V{length}", buffer, 0, (1,))
+    return windows[offsets].view(np.uint8)
 
 
 def _make_contiguous(table: pa.Table) -> pa.Table:

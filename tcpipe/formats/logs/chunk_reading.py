@@ -100,7 +100,6 @@ class Messages:
         if not len(self.channel):
             return []
         starts = [0, *((self.channel[1:] != self.channel[:-1]).nonzero()[0] + 1).tolist()]
-        least, most = (of.reduceat(self.length, starts).tolist() for of in (np.minimum, np.maximum))
         return [
             MessageBlock(
                 int(self.channel[a]),
@@ -110,9 +109,8 @@ class Messages:
                 self.log_time_ns[a:b],
                 self.publish_time_ns[a:b],
                 ordinal[a:b],
-                low if low == high else None,
             )
-            for a, b, low, high in zip(starts, [*starts[1:], len(self.channel)], least, most, strict=True)
+            for a, b in zip(starts, [*starts[1:], len(self.channel)], strict=True)
         ]
 
 

@@ -62,10 +62,7 @@ class DamageError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class MessageBlock:
-    """Messages of one channel inside one buffer; arrays have shape (N,). ``ordinal`` is their order within the file.
-
-    ``length`` is their length where all are equally long, else None.
-    """
+    """Messages of one channel inside one buffer; arrays have shape (N,). ``ordinal`` is their order within the file."""
 
     channel: int
     buffer: memoryview
@@ -74,7 +71,6 @@ class MessageBlock:
     log_time_ns: Int64Array
     publish_time_ns: Int64Array
     ordinal: Int64Array
-    length: int | None
 
 
 def group_by_key(keys: Int64Array) -> Iterator[tuple[int, Int64Array]]:

@@ -196,7 +196,6 @@ def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
         block.log_time_ns[rows],
         block.publish_time_ns[rows],
         block.ordinal[rows],
-        None,
     )
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.topics import Topic
 from tcpipe.motion.distance_breakdown import make_loss_code
 from tcpipe.pipeline.preflight import (
     ExpectedYield,
@@ -11,25 +10,11 @@ from tcpipe.pipeline.preflight import (
     _compute_hourly_std,
     find_missing,
     find_slow,
-    record_command,
 )
 from tcpipe.recipe import ReadConfig
 from tcpipe.tables.bits import DropReason, Loss, flag_name
 from tcpipe.tables.facts import EnergyBudget
 from tcpipe.tables.findings import read_catalogue
-
-
-def topic(name, type_name="std_msgs/msg/String", encoding="cdr"):
-    return Topic(name, type_name, 10, 0, 10**9, encoding, "")
-
-
-def test_the_command_records_what_is_read_and_a_simulations_clock():
-    topics = [topic("/fix"), topic("/a b; rm"), topic("/camera"), topic("/clock", "rosgraph_msgs/msg/Clock")]
-    told = record_command(topics, ["/fix", "/a b; rm", "/fix", "/gone"])
-    assert told == "ros2 bag record -s mcap -o drive /fix '/a b; rm' /clock"
-    assert record_command([topic("/fix", encoding="ros1")], ["/fix"]) == "rosbag record --lz4 -O drive /fix"
-    assert record_command([topic("/fix", encoding="csv")], ["/fix"]) == ""
-    assert record_command(topics, []) == ""
 
 
 def promise(segments=50, budget=None):

@@ -142,7 +142,7 @@ def test_a_road_out_of_sight_is_found_without_a_cost_map(caplog):
     ground, first, *rest = caplog.messages
     assert ground.startswith("checking the ground of")
     assert "without --cost-map" in first
-    assert any(line.startswith("predicting") and line.endswith(" s") for line in rest)
+    assert any(line.startswith("predicting") for line in rest)
 
 
 def test_ends_that_cannot_be_used_are_named_together():
