@@ -104,10 +104,6 @@ def evaluate(
 
     Networks that it needs beside it are trained into ``out`` and kept there. ``plant`` is the best that can be predicted where the
     samples were simulated.
-
-    Raises
-    ------
-    ModelError, DatasetError : the model is none or does not fit the dataset, or there is nothing to evaluate on.
     """
     ours = load_model(model, predictor)
     data = open_dataset(dataset, label=ours.card.label_energy)

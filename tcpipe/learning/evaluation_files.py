@@ -77,12 +77,6 @@ def run_evaluation(
 
     It may be a URL in a bucket, where it becomes the newest generation. Where the same evaluation is already, only its page
     is written again; at a URL nothing is.
-
-    Raises
-    ------
-    UsageError : ``out`` holds something else.
-    StoreError : the dataset or the model was replaced meanwhile.
-    ModelError, DatasetError : as `evaluate`.
     """
     rules = config or EvaluateConfig()
     own = [] if predictor is None else [load_own_kind(predictor).digest]
@@ -197,11 +191,6 @@ def evaluate_adaptation(
     """Predict the rest of each run after its first metres are known, and write adaptation.json into the directory ``out``.
 
     ``runs`` are whole drives; without them those of the dataset whose samples did not train the model.
-
-    Raises
-    ------
-    UsageError : the metres are none.
-    ModelError, DatasetError : they do not fit, the model states no errors, or no run is long enough.
     """
     if not known_m or not all(0.0 <= metres < np.inf for metres in known_m):
         raise UsageError(f"adapt: {known_m} are no metres of a run; expected some, as 0, 10, 50")

@@ -150,10 +150,6 @@ def load_model(path: str | Path, predictor: str | None = None) -> Model:
     ----------
     path : its folder, or the URL of one in a bucket.
     predictor : ``FILE.py[:NAME]`` or entry point of the code of a model that was trained with one; it is run.
-
-    Raises
-    ------
-    ModelError : there is no model, its training has not finished, a file is damaged or cut short, or it is of another schema.
     """
     place = fetch_directory(path)
     card = read_model_card(place)

@@ -56,12 +56,7 @@ class OnnxModel(Predictor):
 
 
 def export_network(predictor: Predictor, name: str) -> bytes:
-    """Return a network as a graph from patches (N, px, px, channels) to its outputs in their units.
-
-    Raises
-    ------
-    ModelError : it is no network of patches alone, or the package onnx is not installed.
-    """
+    """Return a network as a graph from patches (N, px, px, channels) to its outputs in their units."""
     if not isinstance(predictor, NetworkModel) or predictor.inputs.extra_features:
         raise ModelError(f"{name}: expected a model of kind resnet18 without extra features to write as ONNX")
     _require("onnx")

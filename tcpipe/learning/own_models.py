@@ -45,11 +45,6 @@ def load_own_kind(source: str) -> OwnKind:
     """Return the kind of model that ``FILE.py``, ``FILE.py:NAME`` or the name of an entry point stands for; this runs its code.
 
     ``FILE.onnx`` is a graph, which is no code.
-
-    Raises
-    ------
-    UsageError : there is no such file, entry point or name.
-    ModelError : the code fails.
     """
     if source.endswith(".onnx"):
         data = _read(source, Path(source))

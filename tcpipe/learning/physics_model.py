@@ -106,10 +106,6 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
     extra_features : of N samples; without any turn it has no term for turning.
     labels : power [W] and velocity [m/s], finite, shape (N, 2).
     idle_watt : what the robot was seen to draw while it stood; None where it was not.
-
-    Raises
-    ------
-    ModelError : there are fewer than 20 samples.
     """
     names = np.where(extra_features.class_id > 0, extra_features.class_id.astype(np.str_), ALL)
     power, velocity = labels.T

@@ -54,13 +54,7 @@ class Measured:
 
 
 def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
-    """Return what was measured; samples without a label are left out.
-
-    Parameters
-    ----------
-    split : of a dataset.
-    names : of its classes, by id.
-    """
+    """Return what was measured, with the names of classes by id; samples without a label are left out."""
     of = split.energy
     with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column(of.energy).astype(np.float64))
     chosen = split.take(with_label)
@@ -120,13 +114,8 @@ class Predicted:
 def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)) -> Predicted:
     """Return what a model says of w, v, T, E of every sample; of E alone where it predicts nothing else.
 
-    It is centred by class, or as one where it is not shown the classes.
-
-    Parameters
-    ----------
-    model, split : of the same channels.
-    noise : channels that are replaced by noise, uniform in [0, 1], each pixel on its own (section V-C).
-    seed : of that noise.
+    It is centred by class, or as one where it is not shown the classes. Channels that ``noise`` names are replaced by noise of this seed,
+    uniform in [0, 1], each pixel on its own (section V-C).
     """
     rng, layout = np.random.default_rng(list(seed)), model.card.layout
     replaced = [place for place, plane in enumerate(layout.planes) if plane.partition("[")[0] in noise]

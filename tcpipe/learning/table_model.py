@@ -235,12 +235,6 @@ def grow(
         Shape (N, outputs).
     folds
         Of each sample, shape (N,); at least two.
-
-    Raises
-    ------
-    ModelError
-        LightGBM is not installed, or cannot be loaded.
-
     """
     config = config or TrainConfig()
     lightgbm, held_out, trees = _load_lightgbm(), np.empty(labels.shape), list[tuple[Mapping[str, Any], int]]()
@@ -362,10 +356,6 @@ def fit_table(
     folds : of each sample, shape (N,); at least two.
     channels, class_count : what the features are of.
     config : settings of LightGBM.
-
-    Raises
-    ------
-    ModelError : LightGBM is not installed, or cannot be loaded.
     """
     slope_rad, class_id = find_slope_and_class(features, channels, class_count)
     told = cross_fit_curves(slope_rad, class_id, labels, folds)

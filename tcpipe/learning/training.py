@@ -170,10 +170,6 @@ def train(
     variant : what another network than the paper's is trained on.
     no_resume : ignore an earlier state.
     predictor : code of the user, ``FILE.py[:NAME]`` or an entry point, that is fitted instead of a shipped kind.
-
-    Raises
-    ------
-    DatasetError, ModelError, UsageError : the dataset has no samples or no weights, or ``out`` or the state is of something else.
     """
     rules, other = config or FitConfig(), variant or Variant()
     own = None if predictor is None else load_own_kind(predictor)
@@ -270,12 +266,7 @@ def select_train(data: Dataset, variant: Variant, kind: type[Predictor] = Predic
 def make_samples(
     data: Dataset, rules: FitConfig, variant: Variant, kind: type[Predictor], train: Split | None = None
 ) -> Samples:
-    """Return what a model of a kind is fitted to: of ``train`` as it is, or of all that `select_train` finds.
-
-    Raises
-    ------
-    DatasetError : there is nothing to train on, or the fold that is to stop the training is empty, or all of it.
-    """
+    """Return what a model of a kind is fitted to: of ``train`` as it is, or of all that `select_train` finds."""
     needs_folds, train = train is None, select_train(data, variant, kind) if train is None else train
     outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
     folds = train.column("fold")
