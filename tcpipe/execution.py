@@ -89,14 +89,8 @@ def run_all(
     ``function`` and tasks are picklable (workers are spawned); ``function`` returns its errors rather than raising them.
     Use it within ``contextlib.closing``: workers end when the iterator is closed.
 
-    Parameters
-    ----------
-    jobs : processes; this one for 1.
-    cluster : the address of a Dask scheduler, or an executor, whose workers do it instead. They see the same files under the same names.
-
-    Raises
-    ------
-    UsageError : there is no such scheduler, it has no workers, or they are not as they have to be.
+    With ``cluster``, the address of a Dask scheduler or an executor, its workers do it instead of ``jobs`` processes. They see the same
+    files under the same names.
     """
     todo = enumerate(tasks)
     first = list(islice(todo, 1 + (jobs > 1)))

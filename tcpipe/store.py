@@ -33,7 +33,7 @@ import pyarrow as pa
 from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import check_local_output
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
-from tcpipe.formats.commit_log import Stamp, pause_garbage_collection, put_commit, read_state
+from tcpipe.formats.commit_log import Stamp, put_commit, read_state
 from tcpipe.formats.commits import Entries, Kind, State
 from tcpipe.formats.index_files import RunFacts, make_run_facts, read_known_log, write_index
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, seal_document
@@ -232,10 +232,7 @@ class Store:
     def write_index(self, state: State, *, before: State | None = None) -> None:
         """Write the table of all runs for other tools; one that was written at the state ``before`` is brought up to date."""
         before = before or State()
-        with pause_garbage_collection():
-            write_index(
-                self.index_place, state.runs, state.digest, before=before.runs, digest_before=before.digest or None
-            )
+        write_index(self.index_place, state.runs, state.digest, before=before.runs, digest_before=before.digest or None)
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.

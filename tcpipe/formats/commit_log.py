@@ -14,8 +14,8 @@ import gc
 import hashlib
 import logging
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -39,9 +39,6 @@ _SEAL_BYTES = 64
 """The first line of a snapshot is the sha256 (hex) of the rest."""
 _KEPT = 2
 """So many snapshots stay."""
-_MANY_RUNS = 5_000
-"""The search for cycles would go through the rows of so many three times, in vain: they are kept out of it."""
-
 
 ReadCommit: TypeAlias = tuple[Commit, str, int]
 
@@ -64,32 +61,24 @@ class _Snapshot:
     """Which of the findings each run has."""
 
 
-@contextmanager
-def pause_garbage_collection() -> Iterator[None]:
-    """Let Python's search for cycles rest: rows have none, and it would go through ten thousand of them again and again."""
-    was = gc.isenabled()
-    gc.disable()
+def read_state(store: Place) -> State:
+    """Return what the log of a store says: the newest readable snapshot, and the commits after it."""
+    has_collector = gc.isenabled()
+    gc.disable()  # the rows have no cycles: to search ten thousand of them again and again takes as long as to read them
     try:
-        yield
+        return refresh(store, _read_newest_snapshot(store.below(LOG)))
     finally:
-        if was:
+        if has_collector:
             gc.enable()
 
 
-@pause_garbage_collection()
-def read_state(store: Place) -> State:
-    """Return what the log of a store says: the newest readable snapshot, and the commits after it."""
-    log, state = store.below(LOG), State()
+def _read_newest_snapshot(log: Place) -> State:
     for name in reversed(_list_snapshots(log)):
         try:
-            state = _read_snapshot(log, name)
-            break
+            return _read_snapshot(log, name)
         except StoreError as error:
             logger.info("%s; an earlier snapshot, or all commits, are read instead", error)
-    state = refresh(store, state)
-    if len(state.runs) >= _MANY_RUNS:
-        gc.freeze()
-    return state
+    return State()
 
 
 def refresh(store: Place, state: State) -> State:

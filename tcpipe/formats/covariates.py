@@ -29,20 +29,13 @@ _MOSTLY = 0.5
 
 @dataclass(frozen=True, slots=True)
 class CovariateTable:
-    """A table of covariates, by rising and different stamps.
-
-    Attributes
-    ----------
-    name : the file's name.
-    time_column : which of its columns tells the time.
-    rows : values by column, numbers as float64 and all else as text, behind the stamps [ns].
-    findings : rows that are left out, and columns of numbers that a few words make text.
-    """
+    """A table of covariates, by rising and different stamps; ``findings`` name rows that are left out, and odd columns."""
 
     name: str
     checksum: Checksum
     time_column: str
     rows: pl.DataFrame
+    """Values by column, numbers as float64 and all else as text, behind the stamps [ns]."""
     findings: tuple[Finding, ...]
 
     @property

@@ -362,10 +362,7 @@ class PatchFiles:
     ) -> dict[str, NDArray[Any]]:
         """Return layers of one piece, each of shape (rows, *patch); `DatasetError` if it cannot be read.
 
-        Parameters
-        ----------
-        piece, layers : what is read.
-        out : where to, `piece_rows` or more rows a layer; None makes new arrays.
+        ``out`` has `piece_rows` or more rows a layer; None makes new arrays.
         """
         rows = int(self.starts[piece + 1] - self.starts[piece])
         into = {layer: self.make_room(layer, self.piece_rows) for layer in layers} if out is None else out

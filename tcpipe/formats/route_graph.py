@@ -40,14 +40,7 @@ class RouteEdge:
 
 @dataclass(frozen=True, slots=True)
 class RouteGraph:
-    """A graph.
-
-    Attributes
-    ----------
-    document, others : the file without its features, and its features but the edges.
-    nodes : x and y [m] by id.
-    edges : in the order of the file.
-    """
+    """A graph: the file without its features, its features but the edges, nodes (x and y [m] by id), and edges in the file's order."""
 
     document: Mapping[str, Json]
     others: Sequence[Json]

@@ -63,12 +63,7 @@ class ShardedArray:
     _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
 
     def chunk(self, index: tuple[int, ...], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return a chunk, whole even where the array ends inside it: shape ``chunk_shape``; in ``out``, contiguous, where it is given.
-
-        Raises
-        ------
-        StoreError : its shard is gone or damaged.
-        """
+        """Return a chunk, whole even where the array ends inside it: shape ``chunk_shape``; in ``out``, contiguous, where it is given."""
         shard, place = self._shard_and_place(index)
         out = np.empty(self.chunk_shape, self.dtype) if out is None else out
         path = self._shard_path(shard)
@@ -140,10 +135,7 @@ class ShardedArray:
     def encoded_shard(self, values: NDArray[Any], *, threads: int = 1) -> bytes:
         """Return the file of a shard that holds ``values`` from its corner on; what they leave of its last chunks is fill value.
 
-        Parameters
-        ----------
-        values : at most ``shard_shape``.
-        threads : chunks that are encoded side by side; the bytes do not depend on it.
+        ``threads`` encode chunks side by side; the bytes do not depend on their number.
         """
         values = np.asarray(values, self.dtype)
         places = list(product(*(range(-(-n // c)) for n, c in zip(values.shape, self.chunk_shape, strict=True))))
@@ -220,16 +212,6 @@ def open_sharded(
     """Return the array in ``path``, once its description, ``zarr.json``, says that it has the form that is wanted.
 
     Every number comes from the caller, who knows it from a card: of the description only the compression is used.
-
-    Parameters
-    ----------
-    path : directory of the description, and of the shards unless they are ``fetched``.
-    shape, chunk_shape, shard_shape, dtype, fill, sparse : as of `ShardedArray`.
-    fetched : where the shards are; None: on this machine.
-
-    Raises
-    ------
-    StoreError : there is no description, or it says something else.
     """
     where = path / DESCRIPTION
     if not where.exists():

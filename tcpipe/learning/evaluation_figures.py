@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tcpipe.balance.cells import SLOPE_NAMES, find_slope_ranges
 from tcpipe.dataset import Dataset
+from tcpipe.dataset.batches import Pixels
 from tcpipe.formats.json_files import Json
 from tcpipe.learning.metrics import QUANTITIES, UNITS
 from tcpipe.learning.predictions import (
@@ -58,7 +59,7 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
     plain = tuple(
         name for name, layer in data.card.layers.items() if "bands" not in layer
     )  # no picture of several bands
-    parts: list[dict[str, NDArray[Any]]] = []
+    parts: list[Pixels] = []
     for name in dict.fromkeys(split.tolist()):
         ids, view = table.column("sample_id").take(pa.array(rows[split == name])), data[name].view
         known = pa.array(data[name].column("sample_id").tolist(), pa.string())
@@ -159,7 +160,7 @@ def make_slope_section(table: pa.Table) -> Section:
     is_outside = (energy < low) | (energy > high)
     splits, classes = (to_texts(part.column(name)) for name in ("split", "terrain_name"))
     lines = list(dict.fromkeys(zip(splits.tolist(), classes.tolist(), strict=True)))
-    columns = np.unique(ranges)
+    columns = np.unique(ranges).tolist()
     cells = {
         (*line, at): (splits == line[0]) & (classes == line[1]) & (ranges == at) for line in lines for at in columns
     }
@@ -171,7 +172,7 @@ def make_slope_section(table: pa.Table) -> Section:
         read_threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction")
     )
 
-    def shade(cell: tuple[str, str, Any]) -> str | Shaded:
+    def shade(cell: tuple[str, str, int]) -> str | Shaded:
         if cell not in rmse:
             return ""
         count = len(errors[cell])

@@ -19,7 +19,7 @@ from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line
 from tcpipe.execution import Executor, run_all
 from tcpipe.formats.atomic import make_scratch_directory
-from tcpipe.formats.commit_log import keep_state_here, pause_garbage_collection
+from tcpipe.formats.commit_log import keep_state_here
 from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State, Superseded
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import is_presigned, make_absolute
@@ -126,10 +126,9 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
 
         begin = (INGEST, given, (ingest_key(ruling), robot))
         with nullcontext() if shard is None else hold_claims(opened.place) as claims:
-            with pause_garbage_collection():
-                broken = find_broken(opened, log.state, [found.sources[at] for at in own])
-                queue = LogQueue(log, tasks, own, broken, claims)
-                summary = tell(chain(_iterate_missing(found), _iterate_finished(log, queue.steps)))
+            broken = find_broken(opened, log.state, [found.sources[at] for at in own])
+            queue = LogQueue(log, tasks, own, broken, claims)
+            summary = tell(chain(_iterate_missing(found), _iterate_finished(log, queue.steps)))
             if queue.is_done:
                 log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
             else:

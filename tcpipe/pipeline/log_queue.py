@@ -162,13 +162,7 @@ class LogQueue:
 
     Logs that may be the same recording are a unit with one claim, so that the first of them names the run, whoever ingests it.
 
-    Parameters
-    ----------
-    log : writes into the log of the store.
-    tasks : all logs, and how they are to be ingested.
-    own : those of this task's share.
-    broken : runs and recipes of which files are gone.
-    claims : those of this task; None of a call alone.
+    ``own`` are the logs of this task's share, ``broken`` runs and recipes of which files are gone; a call alone has no claims.
     """
 
     def __init__(

@@ -77,13 +77,8 @@ def prune(
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or something cannot be removed; what went before is gone.
 
-    Parameters
-    ----------
-    recipe : the recipe that rules: of a run that was ingested with it, what earlier calls made with others is old.
-    keep : runs and recipes, by id, of which nothing goes.
-    forget : datasets, by the path where they lay, that are gone: what they refer to may go.
-    min_age_s : what killed calls left is removed when it is so old; what waits for a dataset, when nothing was put there for so long.
-    dry_run : say what would go, and remove nothing.
+    Of a run that was ingested with the ``recipe`` that rules, what earlier calls made with others is old. Of what ``keep`` names, runs
+    and recipes, nothing goes. Datasets that lay at the paths ``forget`` are gone: what they refer to may go.
     """
     ruling = resolve_recipe(recipe)
     opened = open_store(store)

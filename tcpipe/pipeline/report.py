@@ -9,7 +9,6 @@ from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
-from tcpipe.formats.commit_log import pause_garbage_collection
 from tcpipe.formats.commits import Dataset, State
 from tcpipe.formats.dataset_files import CARD, REPORT, read_current_card
 from tcpipe.formats.finding_lines import group_findings
@@ -69,9 +68,8 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
 
 def _report_store(store: Store, *, runs: bool) -> list[Page]:
     """Write the store's page, first, as those of the runs lead to it, and again without the runs that cannot be read."""
-    with pause_garbage_collection():
-        found = store.ingestions()
-        page = _write(store.place, store_report(store_facts(store, found, will_be=found.finished if runs else ())), ())
+    found = store.ingestions()
+    page = _write(store.place, store_report(store_facts(store, found, will_be=found.finished if runs else ())), ())
     pages, problems = list[Page](), list[str]()
     pictures_by_map: dict[str, Pictures] = {}
     for run in found.finished if runs else ():

@@ -16,7 +16,6 @@ import numpy as np
 from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import check_local_output, make_scratch_directory
-from tcpipe.formats.commit_log import pause_garbage_collection
 from tcpipe.formats.commits import CallRecord, Problem
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, format_verdict, group_findings
 from tcpipe.formats.index_files import RunFacts
@@ -114,7 +113,6 @@ class Status:
         return clean_lines([*lines, *(_format_call(call) for call in self.history[:_MOST_CALLS])])
 
 
-@pause_garbage_collection()
 def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     """Return what a call of ingest with these options would find; with ``create`` the store need not be there.
 

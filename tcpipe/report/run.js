@@ -178,7 +178,8 @@ page.start(async () => {
     model("labels").data_source.data = { t: s.start.map((t, i) => (t + s.end[i]) / 2), y, low: off(-1), high: off(1), colour: flagged };
     model("label plot").left[0].axis_label = `${at("label").value} [${unit}]${std ? ", ± σ" : ""}`;
   }
-  const found = told.findings.flatMap(([start, end, colour]) => pathOf(after(track.t, start - 1), after(track.t, end + 1)).map((path) => [path, colour]));
+  const local = told.findings.filter(([start, end]) => end - start < 0.9 * (told.last_s - told.first_s));  // others hold everywhere
+  const found = local.flatMap(([start, end, colour]) => pathOf(after(track.t, start - 1), after(track.t, end + 1)).map((path) => [path, colour]));
   model("findings").data_source.data = lines(found.map(([path]) => path), found.map(([, colour]) => colour));
   page.chooseGround(told.ground);
   at("ground").closest("label").hidden = !told.ground.length;

@@ -58,8 +58,17 @@ def energy(store):
     return found.segments()["energy_joule"].drop_null().to_numpy().sum(), found.segments().num_rows
 
 
+@pytest.fixture(scope="module")
+def known(drive, tmp_path_factory):
+    """Energy and number of the segments by the message that tcpipe knows."""
+    here = tmp_path_factory.mktemp("known")
+    write_mcap(here / "run.mcap", drive.messages)
+    run("ingest", here / "run.mcap", "--store", here / "store")
+    return energy(here / "store")
+
+
 @pytest.mark.parametrize("kind", ["one", "escs", "escs in mA"])
-def test_bare_numbers_are_read_by_the_recipe_as_it_is_printed(drive, tmp_path, kind):
+def test_bare_numbers_are_read_by_the_recipe_as_it_is_printed(drive, known, tmp_path, kind):
     log = tmp_path / "run.mcap"
     write_mcap(log, floats_of(drive, kind))
     told = {name: run(name, log).output for name in ("inspect", "preflight")}
@@ -75,14 +84,12 @@ def test_bare_numbers_are_read_by_the_recipe_as_it_is_printed(drive, tmp_path, k
     (tmp_path / "tcpipe.toml").write_text(block + "\n")
     cured = run("ingest", log, "--store", tmp_path / "with", "--recipe", tmp_path / "tcpipe.toml")
     assert "[no-power]" not in cured.output
-    write_mcap(tmp_path / "known.mcap", drive.messages)
-    run("ingest", tmp_path / "known.mcap", "--store", tmp_path / "known")
-    (ours, count), (theirs, _) = energy(tmp_path / "with"), energy(tmp_path / "known")
+    (ours, count), (theirs, _) = energy(tmp_path / "with"), known
     assert count > 30
     assert ours == pytest.approx(theirs, rel=0.03)
 
 
-def test_currents_in_milliamperes_come_first_and_are_cured_by_the_recipe_as_it_is_printed(drive, tmp_path):
+def test_currents_in_milliamperes_come_first_and_are_cured_by_the_recipe_as_it_is_printed(drive, known, tmp_path):
     other = tuple(
         replace(m, columns={n: 1000.0 * v if "current" in n else v for n, v in m.columns.items()})
         if m.topic == NAMES["power"]
@@ -100,6 +107,4 @@ def test_currents_in_milliamperes_come_first_and_are_cured_by_the_recipe_as_it_i
     assert "current_scale = 0.001" in verdict.split("[power-rejected]")[1].split("</pre>")[0]
     (tmp_path / "tcpipe.toml").write_text(block_of(told) + "\n")
     run("ingest", log, "--store", tmp_path / "with", "--recipe", tmp_path / "tcpipe.toml")
-    write_mcap(tmp_path / "known.mcap", drive.messages)
-    run("ingest", tmp_path / "known.mcap", "--store", tmp_path / "known")
-    assert energy(tmp_path / "with")[0] == pytest.approx(energy(tmp_path / "known")[0], rel=1e-6)
+    assert energy(tmp_path / "with")[0] == pytest.approx(known[0], rel=1e-6)

@@ -21,12 +21,14 @@ from synthetic_store import STANDING_WATT, small_store
 
 from tcpipe.cost.prediction_errors import fit_bias_correction
 from tcpipe.dataset import Split, open_dataset
+from tcpipe.dataset.batches import StoredPixels
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.integrity import Checksum, write_sealed
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.parquet import read_table
 from tcpipe.learning.evaluation_facts import EvaluateConfig
+from tcpipe.learning.evaluation_figures import select_evaluated_samples
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import load_model
@@ -156,6 +158,25 @@ def test_the_worst_metres_have_their_own_patches(evaluated, dataset):
         row = data[split].column("sample_id").tolist().index(ids[sheets["rows"][place_in_sheet]])
         stored = data[split].layers(np.array([row]))["ortho"][0].astype(float)
         assert np.corrcoef(shown.ravel(), stored.ravel())[0, 1] > 0.9
+
+
+def test_patches_are_in_colour_where_the_dataset_is(evaluated, dataset, monkeypatch):
+    """The model takes one grey band; the page shows all layers of one band, of which three make a colour."""
+    place, _ = evaluated
+    data, asked = open_dataset(dataset), []
+    colours = {f"ortho_{name}": data.card.layers["ortho"] for name in ("red", "green", "blue")}
+    layers = {**data.card.layers, **colours, "embedding": {"bands": 8}}
+
+    def gather(_self, at, layers):
+        asked.append(set(layers))
+        return {layer: np.zeros((len(at), 8, 8), np.uint8) for layer in layers}
+
+    monkeypatch.setattr(StoredPixels, "gather", gather)
+    monkeypatch.setattr("tcpipe.learning.evaluation_figures.make_sheets", lambda *_: None)
+    select_evaluated_samples(
+        read_table(place / "predictions.parquet"), replace(data, card=replace(data.card, layers=layers))
+    )
+    assert asked == [{"ortho", "terrain", "height", *colours}] * 2  # of each split
 
 
 def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):
