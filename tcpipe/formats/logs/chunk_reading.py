@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,8 +150,16 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Close the file."""
         self._bytes.close()
 
-    def _note(self, cause: str, offset: int, **lost: Any) -> None:
-        self.damage.append(Damage(cause, self.name, offset, **lost))
+    def _note(
+        self,
+        cause: str,
+        offset: int,
+        *,
+        messages_lost: int | None = None,
+        bytes_lost: int | None = None,
+        reason: str = "",
+    ) -> None:
+        self.damage.append(Damage(cause, self.name, offset, None, messages_lost, bytes_lost, reason=reason))
 
     @abstractmethod
     def _open(self) -> dict[int, Topic]:
