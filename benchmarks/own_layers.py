@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from path_coverage import drive, store_of
 
 from tcpipe.dataset import open_dataset
 from tcpipe.dataset.extra_features import read_extra_features
@@ -23,14 +24,15 @@ from tcpipe.learning.metrics import compute_costs
 from tcpipe.learning.models import load_model
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
-from tcpipe.simulation import find_scenario, simulate
+from tcpipe.simulation import find_scenario
 from tcpipe.simulation.scenarios import scale_hidden_variance
 from tcpipe.simulation.world import World, draw_waves, sum_waves
 
 PIXEL_M = 0.5
+_METRES = 190.0
+"""Of a drive."""
+
 PAPER = ("ortho", "terrain", "height")
 
 
@@ -49,13 +51,11 @@ def make_bands(world: World, count: int, rng: np.random.Generator) -> dict[str, 
 
 def build(out: Path, drives: int, variance: float, bands: int) -> Path:
     """Return a dataset of the simulated drives, with both layers."""
-    made = find_scenario("paper_quick")
-    every = [replace(of, name=f"{of.name}_{n}") for n in range(-(-drives // 3)) for of in made.drives][:drives]
-    made = replace(made, world=scale_hidden_variance(made.world, variance), drives=tuple(every))
-    site = simulate(out / "site", scenario=made)
-    world = made.world.site
+    site = drive(out / "site", drives, _METRES, seed=0, hidden_variance=variance)
+    made = scale_hidden_variance(find_scenario("paper_quick").world, variance)
+    world = made.site
     rasters = {}
-    for name, values in make_bands(made.world, bands, np.random.default_rng(7)).items():
+    for name, values in make_bands(made, bands, np.random.default_rng(7)).items():
         rasters[name] = out / f"{name}.tif"
         affine = (PIXEL_M, 0.0, world.west_m, 0.0, -PIXEL_M, world.south_m + world.height_m)
         write_geotiff(
@@ -63,10 +63,7 @@ def build(out: Path, drives: int, variance: float, bands: int) -> Path:
             affine=affine, crs=f"EPSG:{world.epsg}", dtype="float32", bands=bands,
         )  # fmt: skip
     recipe = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="run", test_fraction=0.34))
-    store = out / "store"
-    ingest(site.logs, store=store, recipe=recipe)
-    paper = {name: site.rasters[name] for name in (*PAPER, "classes")}
-    print(add_map("site", **paper, layers=rasters, store=store))
+    store = store_of(out, site, rasters)
     print(str(build_dataset(out / "dataset", store=store, recipe=recipe)).splitlines()[0])
     return out / "dataset"
 

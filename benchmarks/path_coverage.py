@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,15 +33,19 @@ from tcpipe.planning.drives import collect_runs
 from tcpipe.planning.path_files import RISK, choose_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
+from tcpipe.simulation.scenarios import scale_hidden_variance
 from tcpipe.store import open_store
 
 LENGTHS = (1, 10, 30, 100)
 KNOWN_M = (0.0, 10.0, 50.0, 100.0)
 
 
-def drive(place: Path, count: int, metres: float, *, payload_kg: float, seed: int) -> SimulatedSite:
-    """Simulate drives over the small site."""
+def drive(
+    place: Path, count: int, metres: float, *, seed: int, payload_kg: float = 0.0, hidden_variance: float = 1.0
+) -> SimulatedSite:
+    """Simulate drives over the small site, whose rolling resistance that no raster shows has so many times its variance."""
     site = find_scenario("paper_quick")
+    site = replace(site, world=scale_hidden_variance(site.world, hidden_variance))
     robot = site.drives[0].robot
     robot = replace(robot, mass_kg=robot.mass_kg + payload_kg)
     drives = tuple(
@@ -52,12 +56,12 @@ def drive(place: Path, count: int, metres: float, *, payload_kg: float, seed: in
     return simulate(place, scenario=replace(site, drives=drives), seed=seed)
 
 
-def store_of(place: Path, site: SimulatedSite) -> Path:
-    """Ingest the logs of a site and add its map."""
+def store_of(place: Path, site: SimulatedSite, layers: Mapping[str, Path] | None = None) -> Path:
+    """Ingest the logs of a site and add its map, with further layers."""
     store = place / "store"
     done = ingest(site.logs, store=store, recipe=replace(Recipe(), robot="husky"))
     assert done.exit_code == 0, "\n".join(problem for result in done.results for problem in result.problems)
-    add_map("site", store=store, **site.rasters)
+    add_map("site", store=store, layers=layers or {}, **site.rasters)
     return store
 
 

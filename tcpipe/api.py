@@ -93,7 +93,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
     from tcpipe.learning.evaluation_files import run_evaluation
     from tcpipe.recipe.checking import from_values
 
-    asked = {name: getattr(options, name) for name in ("noise_draws", "baselines", "retrain_ablation", "seed")}
+    asked = {name: getattr(options, name) for name in ("noise_draws", "baselines", "seed")}
     return run_evaluation(
         model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"), predictor=options.predictor
     )

@@ -17,7 +17,6 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
 from tcpipe.fusion.densities import NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
-from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
     ACCEPTED,
     NONE,
@@ -32,10 +31,13 @@ from tcpipe.fusion.filter_kernel import (
 from tcpipe.fusion.hypotheses import (
     POSSIBLE,
     ROLES,
+    EventCandidate,
     Hypothesis,
     compute_weights,
     explain,
+    find_fix_excursions,
     find_suspects,
+    find_turn_jump,
     make_excursions,
 )
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
@@ -50,7 +52,7 @@ from tcpipe.fusion.measurements import (
     select_rows,
 )
 from tcpipe.fusion.pair_residuals import find_residuals
-from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
+from tcpipe.fusion.parameters import PARAMETERS, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
     GROUND,
     SLOPE_RAD,
@@ -148,16 +150,18 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     std = make_priors(m, noise, ticks)[0]
     section = _Section(m, noise, ticks, gate_probability)
     model = section.make_model()
-    start = make_start(initial, model, std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
-    first_minute = filter_section(ticks, model, start, until=round(_LEVELLING_S / ticks.inputs.period_s))
+    start = make_start(initial, std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
+    first_minute = filter_section(
+        ticks, model, start.select(model.active), until=round(_LEVELLING_S / ticks.inputs.period_s)
+    )
     start.x[:9] = smooth_section(first_minute).states[0, :9]
-    made = filter_section(ticks, model, start)
+    made = filter_section(ticks, model, start.select(model.active))
     hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise)) if _is_judging_fixes(m) else []
     if hypotheses:
-        made = section.filter(start, model, hypotheses[0])
+        made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
     if len(hypotheses) > 1:
-        rivals = [smooth_section(section.filter(start, model, each)) for each in hypotheses[1:]]
+        rivals = [smooth_section(section.filter(start, each)) for each in hypotheses[1:]]
         widen(smoothed, rivals, compute_weights(hypotheses), made.ticks.inputs.period_s)
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
@@ -198,10 +202,10 @@ class _Section:
             possible=POSSIBLE if judges else (),
         )
 
-    def filter(self, start: Memory, model: Model, hypothesis: Hypothesis) -> Pass:
-        """Return the forward pass under a hypothesis from a start of the ``model`` without one."""
+    def filter(self, start: Memory, hypothesis: Hypothesis) -> Pass:
+        """Return the forward pass under a hypothesis from a start of all errors."""
         changed = self.make_model(hypothesis)
-        return filter_section(hypothesis.alter_ticks(self.ticks), changed, expand_start(start, model, changed))
+        return filter_section(hypothesis.alter_ticks(self.ticks), changed, start.select(changed.active))
 
     def explain(self, made: Pass, start: Memory, excursions: Sequence[EventCandidate]) -> list[Hypothesis]:
         """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not.
@@ -212,7 +216,7 @@ class _Section:
         if jump is None and not find_suspects(made.tests, self.ticks.inputs.period_s):
             return make_excursions(made, excursions)
         model = self.make_model(judges=True)
-        plain = filter_section(self.ticks, model, expand_start(start, made.model, model))
+        plain = filter_section(self.ticks, model, start.select(model.active))
 
         def run(changed: Hypothesis, first: int, last: int) -> Pass:
             block = first // _BLOCK

@@ -126,6 +126,10 @@ class Memory(NamedTuple):
         """Return a copy."""
         return Memory(self.x.copy(), self.P.copy(), self.waits.copy())
 
+    def select(self, active: Indices) -> Memory:
+        """Return a copy with some of the errors."""
+        return Memory(self.x.copy(), self.P[np.ix_(active, active)], self.waits.copy())
+
 
 class Steps(NamedTuple):
     """What the smoother needs of B ticks: motion F, kept shares, updates by kind (gain K, H, S⁻¹ y, S⁻¹, turn of axes), P after all."""

@@ -9,6 +9,10 @@ as the gate, less a cost by kind. The changes that explain most are found one af
 deviations where they differ.
 
 Blame is never what is left when a sensor is ignored: without fixes everything is explained.
+
+Two candidates need no search. Smooth excursions of fixes, which no gate sees, show in windows of the pairs' residuals that are far beyond
+the noise of the run: a step at t is beyond in every window that holds t, an excursion only in windows as long as itself. A jump of the
+gyroscope's bias shows in the turns of camera and wheels.
 """
 
 from __future__ import annotations
@@ -21,11 +25,14 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
-from tcpipe.fusion.event_candidates import EventCandidate, TurnJump
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
-from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS
+from tcpipe.fusion.level_motion import find_turn_roles, get_turn_rates
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.pair_residuals import ACROSS, ALONG, Residuals, align_turns
 from tcpipe.fusion.parameters import Event
+from tcpipe.fusion.signals import compute_interval_means, compute_seconds, is_covered
 from tcpipe.fusion.ticks import Pass, Ticks
+from tcpipe.robust import estimate_robust_std
 
 Floats = NDArray[np.float64]
 
@@ -268,8 +275,6 @@ def explain(
             tests = run(best, 0, size).tests
         elif number > 0:
             break
-    if any(each.kind == "varies" for each in best.changes):
-        best, tests = _drop_changes(best, tests, gates, run)
     left = [each for each in find_suspects(tests, period_s) if each.role == state.FIX] if best.changes else []
     rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
     off_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in left]
@@ -283,23 +288,6 @@ def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> b
     if change.kind == "varies" and any((each.kind, each.role) == ("varies", change.role) for each in best.changes):
         return False
     return all(e in active for place, count, _ in change.blocks for e in range(place, place + count))
-
-
-def _drop_changes(
-    best: Hypothesis, tests: Tests, gates: Floats, run: Callable[[Hypothesis, int, int], Pass]
-) -> tuple[Hypothesis, Tests]:
-    """Return the hypothesis without the changes that a scale that varies explains as well, and its tests.
-
-    Such a scale varies throughout, so it also explains what earlier changes were found for.
-    """
-    size, first = tests.verdict.shape[0], min(each.first for each in best.changes)
-    for change in [each for each in best.changes if each.kind not in {"varies", "wander"}]:
-        others = replace(best, changes=tuple(each for each in best.changes if each != change))
-        rest = run(others, 0, size).tests
-        lost = compute_evidence(tests, gates, first, size) - compute_evidence(rest, gates, first, size) - change.cost
-        if lost < _SURELY:
-            best, tests = replace(others, score=best.score - lost), rest
-    return best, tests
 
 
 def _list_wanders(tick: int, off_m: float, size: int, period_s: float) -> Iterator[Change]:
@@ -380,3 +368,173 @@ def _find_innovation_m(suspect: Suspect, tests: Tests) -> Floats:
     span = slice(suspect.first, suspect.last)
     rejected = tests.fix_innovation[span][tests.verdict[span, state.FIX] == REJECTED]
     return np.asarray(np.median(rejected[:, :2], axis=0))
+
+
+# Candidates that need no search
+
+_GATE = 4.0  # standard deviations
+_FEWEST_WINDOWS = 3  # overlapping windows
+_SHORTEST_S = 4.0  # single fixes off are for the gate
+_LEAST = 1e-6  # m² or rad²
+_ALIKE_CHANGES = 2.0
+_LONG_S = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class EventCandidate:
+    """Three or more overlapping windows in which fixes moved otherwise than an odometry, far beyond the noise.
+
+    Attributes
+    ----------
+    pair, axis : the sensors compared, by role; along or across.
+    time_s : [s], length of the windows.
+    start_ns, end_ns : [ns], from the start of the first window to the end of the last.
+    at_ns : [ns], middle of the windows, weighted by z²: where a single step is.
+    change, z : [m], the residual of the window that is farthest beyond, and the same in standard deviations.
+    """
+
+    pair: tuple[str, str]
+    axis: str
+    time_s: float
+    start_ns: int
+    end_ns: int
+    at_ns: int
+    change: float
+    z: float
+
+
+def find_event_candidates(residuals: Sequence[Residuals], noise: NoiseModel) -> list[EventCandidate]:
+    """Return candidates of events of the fixes, the farthest beyond the noise first.
+
+    ``noise`` was fitted to these residuals. Of candidates of one pair and axis at one time, the one that is farthest beyond stands for all.
+    """
+    of_fixes = [
+        each for each in residuals if GNSS in each.pair and each.axis in {ALONG, ACROSS} and each.time_s >= _SHORTEST_S
+    ]
+    kept: list[EventCandidate] = []
+    for candidate in sorted((one for each in of_fixes for one in _find_runs(each, noise)), key=lambda each: -each.z):
+        of_same = (each for each in kept if (each.pair, each.axis) == (candidate.pair, candidate.axis))
+        if not any(each.start_ns <= candidate.at_ns <= each.end_ns for each in of_same):
+            kept.append(candidate)
+    return kept
+
+
+def find_fix_excursions(residuals: Sequence[Residuals], noise: NoiseModel) -> list[EventCandidate]:
+    """Return where fixes moved otherwise than two odometries alike, which did not slip at the same time."""
+    found = find_event_candidates(residuals, noise)
+    # Shorter ones may show only that the antenna is elsewhere than stated while the robot turns.
+    return [one for one in found if one.time_s > _LONG_S and any(_is_confirmed(one, other) for other in found)]
+
+
+def _is_confirmed(one: EventCandidate, other: EventCandidate) -> bool:
+    overlap_ns = min(one.end_ns, other.end_ns) - max(one.start_ns, other.start_ns)
+    is_other = other.pair != one.pair and other.axis == one.axis and overlap_ns > 0
+    return (
+        is_other
+        and one.change * other.change > 0.0
+        and abs(other.change) < _ALIKE_CHANGES * abs(one.change) < _ALIKE_CHANGES**2 * abs(other.change)
+    )
+
+
+def _find_runs(each: Residuals, noise: NoiseModel) -> Iterator[EventCandidate]:
+    """Yield each run of overlapping windows beyond the noise."""
+    densities = noise.densities.get(each.axis, {})
+    variance = _LEAST + sum((densities.get(name, 0.0) * factor for name, factor in each.features.items()), start=0.0)
+    z = each.value / np.sqrt(variance)
+    beyond = np.flatnonzero(np.abs(z) > _GATE)
+    if not beyond.size:
+        return
+    overlaps = each.start_ns[beyond][1:] < each.end_ns[beyond][:-1]
+    for rows in np.split(beyond, np.flatnonzero(~overlaps) + 1):
+        if rows.size < _FEWEST_WINDOWS:
+            continue
+        worst = rows[np.argmax(np.abs(z[rows]))]
+        start_ns = int(each.start_ns[rows[0]])
+        middle_ns = 0.5 * ((each.start_ns[rows] - start_ns) + (each.end_ns[rows] - start_ns))
+        at_ns = start_ns + round(float(np.average(middle_ns, weights=z[rows] ** 2)))
+        yield EventCandidate(
+            each.pair, each.axis, each.time_s, start_ns, int(each.end_ns[rows[-1]]), at_ns,
+            float(each.value[worst]), float(abs(z[worst])),
+        )  # fmt: skip
+
+
+_STEP_S = 0.5
+_BLOCK_S = 10.0
+_AROUND_S, _LEAST_S = 60.0, 15.0  # compared before and after a jump
+_FAR = 4.0  # standard deviations beyond which a turn is a slip
+_JUMPS = 8.0  # standard deviations
+_LEAST_JUMP_RADPS = 0.003
+_MOST_GAIN = 50.0
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class TurnJump:
+    """A jump of the gyroscope's bias, by the turns of an odometry.
+
+    Attributes
+    ----------
+    at_ns, time_std_s : [ns] when, and how well that is known [s].
+    change, std : [rad/s].
+    gain : log likelihood against none.
+    """
+
+    at_ns: int
+    time_std_s: float
+    change: float
+    std: float
+    gain: float
+
+
+def find_turn_jump(m: Measurements) -> TurnJump | None:
+    """Return the largest jump of the gyroscope's vertical bias that turns of camera or wheels show; None if there is none."""
+    roles = find_turn_roles(m)
+    if m.imu is None or len(roles) < 2:
+        return None
+    found = [jump for role in roles if role != IMU for jump in _find_jumps(m, role)]
+    return max(found, key=lambda jump: abs(jump.change) / jump.std, default=None)
+
+
+def _find_jumps(m: Measurements, role: str) -> Iterator[TurnJump]:
+    """Yield the largest jump by one odometry."""
+    sources = [get_turn_rates(m, each) for each in (IMU, role)]
+    begin_ns, end_ns = (
+        max(int(stamp_ns[0]) for stamp_ns, _ in sources),
+        min(int(stamp_ns[-1]) for stamp_ns, _ in sources),
+    )
+    edges_ns = np.arange(begin_ns, end_ns, round(_STEP_S * 1e9))
+    around, least, block = (round(each / _STEP_S) for each in (_AROUND_S, _LEAST_S, _BLOCK_S))
+    if edges_ns.size <= 2 * least + block:
+        return
+    edges_s = compute_seconds(edges_ns, begin_ns)
+    turns = []
+    for stamp_ns, rate in sources:
+        mean = compute_interval_means(compute_seconds(stamp_ns, begin_ns), rate[:, 2:], edges_s[:-1], edges_s[1:])[:, 0]
+        turns.append(np.where(is_covered(stamp_ns, edges_ns[:-1], edges_ns[1:]), mean, np.nan) * _STEP_S)
+    known = np.isfinite(turns).all(axis=0)
+    if known.sum() <= 2 * least + block:
+        return
+    turn = np.cumsum(np.stack(turns, -1)[known], axis=0)
+    rows = np.arange(least, len(turn) - least)
+    before, after = np.minimum(rows, around), np.minimum(len(turn) - 1 - rows, around)
+    jumped = np.zeros(len(turn))
+    for _ in range(_ROUNDS):  # the scale is fitted without the jump
+        aligned = align_turns(turn - np.column_stack((jumped, 0.0 * jumped)), block) + jumped
+        off = np.diff(aligned) / _STEP_S
+        off -= np.median(off)
+        scatter = estimate_robust_std(off) + 1e-9
+        off = off.clip(-_FAR * scatter, _FAR * scatter)
+        total = np.concatenate(([0.0], np.cumsum(off)))
+        step = (total[rows + after] - total[rows]) / after - (total[rows] - total[rows - before]) / before
+        blocks = off[: off.size // block * block].reshape(-1, block).mean(1)
+        # Differences of neighbours hold no jump, but for one of them.
+        density = estimate_robust_std(np.diff(blocks)) ** 2 / 2.0 * block
+        std = np.sqrt(density * (1.0 / before + 1.0 / after)) + 1e-9
+        top = int(np.argmax(np.abs(step) / std))
+        change, spread = float(step[top]), float(std[top])
+        jumped = change * _STEP_S * np.arange(-rows[top], len(turn) - rows[top]).clip(0)
+    if abs(change) < max(_JUMPS * spread, _LEAST_JUMP_RADPS):
+        return
+    time_std_s = max(_STEP_S, 2.0 * density * _STEP_S / change**2)
+    at_ns = int(edges_ns[:-1][known][rows[top] + 1])
+    yield TurnJump(at_ns, time_std_s, change, spread, min(_MOST_GAIN, 0.5 * (change / spread) ** 2))

@@ -227,8 +227,8 @@ def _find_patience(m: Measurements, *, follows: bool) -> Floats:
     return patience
 
 
-def make_start(initial: InitialState, model: Model, std: Floats, arm_m: Sequence[float]) -> Memory:
-    """Return the filter's state at the first tick."""
+def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Memory:
+    """Return the filter's state at the first tick, of all errors."""
     x, P = np.zeros(state.NX), np.zeros((state.N, state.N))
     rotation = matrix_from_quat(initial.quat_xyzw)
     x[:9] = rotation.ravel()
@@ -244,12 +244,4 @@ def make_start(initial: InitialState, model: Model, std: Floats, arm_m: Sequence
     P[0:3, 0:3] = rotation.T @ level @ rotation
     P[3:6, 3:6] = rotation.T @ np.diag(np.square(initial.position_std_m)) @ rotation
     P[6:9, 6:9] = np.eye(3) * initial.velocity_std_mps**2
-    active = model.active
-    return Memory(x, P[np.ix_(active, active)].copy(), np.zeros((state.KINDS, 2)))
-
-
-def expand_start(start: Memory, model: Model, other: Model) -> Memory:
-    """Return a start of one model as that of another, in which more errors are active."""
-    P = np.zeros((state.N, state.N))
-    P[np.ix_(model.active, model.active)] = start.P
-    return Memory(start.x.copy(), P[np.ix_(other.active, other.active)].copy(), start.waits.copy())
+    return Memory(x, P, np.zeros((state.KINDS, 2)))

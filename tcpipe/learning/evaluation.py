@@ -23,7 +23,6 @@ from tcpipe.learning.baselines import (
     BASELINE_OF_KIND,
     CURVES,
     OURS,
-    Trained,
     compare_baselines,
     make_energy_table,
     rank_model,
@@ -71,7 +70,7 @@ from tcpipe.terrain.classes import NODATA_ID
 logger = logging.getLogger("tcpipe")
 
 NETWORKS = "networks"
-"""Folder of the networks that an evaluation trains: baselines, and the ablation anew."""
+"""Folder of the networks that an evaluation trains."""
 
 INPUT_SETS = (("O", "C", "H"), ("C", "H"), ("O", "H"), ("O", "C"), ("O",), ("C",), ("H",))
 """Layers that are left, in the order of table III."""
@@ -136,7 +135,7 @@ def evaluate(
         train(dataset, place, config=rules, variant=variant, predictor=predictor)
         return load_model(place, predictor)
 
-    ablation = list(_iterate_ablation(ours, sets, config, trained))
+    ablation = list(_iterate_ablation(ours, sets, config))
     with_networks = config.baselines and find_kind(ours.card.training.kind).stops_by_fold
     energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
@@ -193,8 +192,8 @@ def _split_errors(
     )
 
 
-def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained) -> Iterator[AblationRow]:
-    """Yield table III, row by row: the trained network with layers replaced by noise, and networks that never had them."""
+def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig) -> Iterator[AblationRow]:
+    """Yield table III, row by row: the model with layers replaced by noise."""
     for number, letters in enumerate(_list_input_sets(ours)):
         left = tuple(LETTERS[letter] for letter in letters)
         noise = [channel for channel in ours.card.inputs.channels if channel not in left]
@@ -210,13 +209,7 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: 
                 for draw in range(config.noise_draws if noise else 1)
             ]
             by_split[name] = {quantity: average_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
-        yield AblationRow(letters, "noise", **by_split)
-        if config.retrain_ablation and noise:
-            anew = trained("ablation_" + "".join(letters), Variant(channels=left))
-            by_split = {
-                name: _compute_errors(predict_costs(anew, found.split), found, anew) for name, found in sets.items()
-            }
-            yield AblationRow(letters, "retrained", **by_split)
+        yield AblationRow(letters, **by_split)
 
 
 def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:

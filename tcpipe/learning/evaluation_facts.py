@@ -32,8 +32,6 @@ class EvaluateConfig:
     """Draws of noise that each ablated input set is the mean of."""
     baselines: bool = True
     """Train networks of each class alone, and those of Wei & Isler."""
-    retrain_ablation: bool = False
-    """Train a network for each input set of the ablation, too."""
     seed: Seed = 0
     """Of the noise."""
 
@@ -101,10 +99,9 @@ class SplitErrors:
 
 @dataclass(frozen=True, slots=True)
 class AblationRow:
-    """A row of table III: layers that are left, how the others went, and the errors on each split by quantity."""
+    """A row of table III: layers that are left, the others being noise, and the errors on each split by quantity."""
 
     layers: tuple[str, ...]
-    how: Literal["noise", "retrained"]
     test: Mapping[str, Errors] | None = field(default=None, metadata=ABSENT)
     unseen: Mapping[str, Errors] | None = field(default=None, metadata=ABSENT)
 

@@ -238,14 +238,12 @@ def _make_other_sections(found: Evaluation) -> list[Section]:
     ablation = [
         (
             "+".join(row.layers),
-            "retrained" if row.how == "retrained" else "",
+            "",
             {split: row.on(split)["E"] for split in found.ordered_splits},
         )
         for row in found.ablation
     ]
-    noise = (
-        f"Layers not named are replaced by noise ({found.config.noise_draws} draws); retrained: a network without them."
-    )
+    noise = f"Layers not named are replaced by noise ({found.config.noise_draws} draws)."
     networks = (
         "Beside the one network: one of each class with all layers, and Wei and Isler's, which predict E from heights alone.\n"
         "Each takes as many steps as ours and is centred by class; ratios stand among those of the baselines. "

@@ -13,8 +13,9 @@ taken as normal with its standard deviation s, z = (label - m) / s, by ::
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,28 +96,7 @@ def _compute_scores(off: Array, measured: Array, spread: Spread) -> tuple[float,
     return 100.0 * float(held.mean()), float(nll.mean()), float(crps.mean())
 
 
-def combine_errors(parts: Iterable[Errors]) -> Errors:
-    """Return the errors of all parts together: RMSE in quadrature, MAPE weighted by count."""
-    found = [part for part in parts if part.count]
-    count, mape_count = sum(part.count for part in found), sum(part.mape_count for part in found)
-    squares = sum(part.count * part.rmse**2 for part in found if part.rmse is not None)
-    shares = sum(part.mape_count * part.mape_percent for part in found if part.mape_percent is not None)
-    rmse = float(np.sqrt(squares / count)) if count else None
-    return Errors(count, rmse, shares / mape_count if mape_count else None, mape_count, *_combine_scores(found, count))
-
-
 _SCORES = tuple(of.name for of in fields(Errors))[4:]
-
-
-def _combine_scores(found: list[Errors], count: int) -> list[float | None]:
-    """Return the scores of all parts together, each None where a part has none."""
-    of_parts = [[getattr(part, name) for part in found] for name in _SCORES]
-    return [
-        None
-        if not found or None in values
-        else sum(part.count * value for part, value in zip(found, values, strict=True)) / count
-        for values in of_parts
-    ]
 
 
 def average_draws(draws: Iterable[Errors]) -> Errors:
@@ -139,7 +119,7 @@ def compute_errors_by_class(
     names: Mapping[int, str],
     spreads: Mapping[str, Spread] | None = None,
 ) -> dict[str, dict[str, Errors]]:
-    """Return the errors of each quantity by class name, and of `ALL`: the classes combined.
+    """Return the errors of each quantity by class name, and of `ALL` samples.
 
     Parameters
     ----------
@@ -148,18 +128,21 @@ def compute_errors_by_class(
     names : of the ids that occur.
     spreads : what is stated of the predictions' errors, by quantity.
     """
-    found = {}
-    for quantity in predicted:
+
+    def errors_of(quantity: str, rows: NDArray[np.bool_]) -> Errors:
         spread = (spreads or {}).get(quantity)
-        by_class = {
-            name: compute_errors(
-                predicted[quantity][here], measured[quantity][here], LEAST[quantity], spread and spread.take(here)
-            )
-            for class_id, name in names.items()
-            if (here := class_ids == class_id).any()
-        }
-        found[quantity] = {**by_class, ALL: combine_errors(by_class.values())}
-    return found
+        said, true = predicted[quantity][rows], measured[quantity][rows]
+        return compute_errors(said, true, LEAST[quantity], spread and spread.take(rows))
+
+    return {quantity: _group_by_class(partial(errors_of, quantity), class_ids, names) for quantity in predicted}
+
+
+def _group_by_class(
+    errors_of: Callable[[NDArray[np.bool_]], Errors], class_ids: NDArray[np.int64], names: Mapping[int, str]
+) -> dict[str, Errors]:
+    """Return errors by the name of each class that occurs, and of `ALL`."""
+    rows = {name: class_ids == class_id for class_id, name in names.items()} | {ALL: np.ones(len(class_ids), np.bool_)}
+    return {name: errors_of(here) for name, here in rows.items() if here.any() or name == ALL}
 
 
 def label_floor(
@@ -169,19 +152,14 @@ def label_floor(
 
     The labels' errors are taken as Gaussian: a mean absolute error of sqrt(2 / pi) deviations.
     """
-    found = {}
-    for quantity, sigma in deviations.items():
-        by_class = {}
-        for class_id, name in names.items():
-            here = class_ids == class_id
-            if not here.any():
-                continue
-            label, std = measured[quantity][here], sigma[here]
-            large = label >= LEAST[quantity]
-            mape = 100.0 * np.sqrt(2.0 / np.pi) * float(np.mean(std[large] / label[large])) if large.any() else None
-            by_class[name] = Errors(int(here.sum()), float(np.sqrt(np.mean(std**2))), mape, int(large.sum()))
-        found[quantity] = {**by_class, ALL: combine_errors(by_class.values())}
-    return found
+
+    def floor_of(quantity: str, rows: NDArray[np.bool_]) -> Errors:
+        label, std = measured[quantity][rows], deviations[quantity][rows]
+        large = label >= LEAST[quantity]
+        mape = 100.0 * np.sqrt(2.0 / np.pi) * float(np.mean(std[large] / label[large])) if large.any() else None
+        return Errors(len(std), float(np.sqrt(np.mean(std**2))) if len(std) else None, mape, int(large.sum()))
+
+    return {quantity: _group_by_class(partial(floor_of, quantity), class_ids, names) for quantity in deviations}
 
 
 def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dict[str, Array]:

@@ -110,13 +110,6 @@ class EvaluateOptions:
             ("--baselines/--no-baselines",),
         ),
     )
-    retrain_ablation: bool = option(
-        False,
-        Option(
-            "Also train a network for each input set of the ablation (six more).",
-            ("--retrain-ablation",), earlier="--retrain",
-        ),
-    )  # fmt: skip
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
     predictor: str | None = option(None, PREDICTOR)
     adapt: Sequence[float] | None = option(

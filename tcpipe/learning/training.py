@@ -57,7 +57,7 @@ _CALLED = {"turn_radpm": "turn (mean_abs_yaw_rate_radps)", "command_mps": "comma
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """What a network for a baseline or for the retrained ablation is trained on."""
+    """What a network for a baseline is trained on."""
 
     channels: tuple[str, ...] = ()
     """Of the patch; empty: all that the dataset has."""
@@ -103,13 +103,13 @@ _MOST_FOLDS, _FEWEST_RUNS = 5, 5
 """Parts of the runs that are predicted by the others; runs below which their folds are what errs alike."""
 
 
-def choose_kind(data: Dataset, config: FitConfig, variant: Variant) -> ModelKind:
+def choose_kind(data: Dataset, config: FitConfig, variant: Variant, split: Split | None = None) -> ModelKind:
     """Return the simplest kind that predicts other runs as well as the best one, within a standard error of the difference (ADR-23).
 
     Each part of the runs is predicted by models of the others; of a single run, each fold. The loss is the squared error of time and of
-    energy, each over its variance.
+    energy, each over its variance. ``split`` are labelled samples of train, by default all.
     """
-    split = select_train(data, variant)
+    split = select_train(data, variant) if split is None else split
     runs, folds = (np.unique(split.column(name), return_inverse=True)[1] for name in ("run_id", "fold"))
     part = runs % _MOST_FOLDS if runs.any() else folds
     clusters = runs if runs.max() + 1 >= _FEWEST_RUNS else runs * (folds.max() + 1) + folds
@@ -117,7 +117,8 @@ def choose_kind(data: Dataset, config: FitConfig, variant: Variant) -> ModelKind
     for name in AUTOMATIC:
         kind = find_kind(name)
         try:
-            samples = make_samples(data, config, variant, kind)
+            train = split.with_channels(*kind.channels) if kind.channels else split
+            samples = make_samples(data, config, variant, kind, train)
             losses[name] = _compute_losses(samples, cross_predict(kind, samples, part).mean)
         except ModelError as error:
             logger.info("%s is not compared: %s", name, error.problems[0])

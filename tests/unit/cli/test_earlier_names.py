@@ -14,7 +14,6 @@ EARLIER = [
     ("train", ["--model", "table"], "model", "boosting"),
     ("train", ["--label", "above_standing"], "label", "net"),
     ("evaluate", ["--draws", "2"], "noise_draws", 2),
-    ("evaluate", ["--retrain"], "retrain_ablation", True),
     ("predict-path", ["--physics", "."], "physics_from", "."),
     ("plan-path", ["--physics", "."], "physics_from", "."),
     ("plan-path", ["--step", "2"], "cell_size_m", 2.0),

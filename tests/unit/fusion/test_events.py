@@ -7,7 +7,7 @@ import pytest
 from unit.fusion import drive
 from unit.fusion.test_error_state import fuse, truth
 
-from tcpipe.fusion.event_candidates import find_turn_jump
+from tcpipe.fusion.hypotheses import find_turn_jump
 from tcpipe.fusion.measurements import GNSS, IMU
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow.compute as pc
 import pyproj
 import pytest
-from installed_command import tcpipe
 from made_models import CARD, made_model
 from object_gateway import in_environment
 from page_reading import data_of, unpacked
@@ -334,19 +333,3 @@ def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
     )
     with pytest.raises(ModelError, match="it predicts only energy_joule, expected power_watt and velocity_mps"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
-
-
-def test_the_ablation_can_be_retrained(model, dataset, tmp_path):
-    options = ("--retrain-ablation", "--no-baselines", "--noise-draws", "1", "--json", "--quiet")
-    done = tcpipe("evaluate", model, dataset, "evaluation", *options, cwd=tmp_path, env={"OMP_NUM_THREADS": "1"})
-    assert done.returncode in {0, 3}, done.stderr
-    rows = json.loads(done.stdout)["ablation"]
-    assert sorted("".join(row["layers"]) for row in rows if row["how"] == "retrained") == [
-        "C",
-        "CH",
-        "H",
-        "O",
-        "OC",
-        "OH",
-    ]
-    assert all(row["test"]["w"]["rmse"] > 0.0 for row in rows)
