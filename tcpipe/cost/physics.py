@@ -152,16 +152,15 @@ class Physics:
         return found
 
 
-def fit_physics(metres: FitSamples, *, idle_watt: float | None = None, turning: bool = True) -> Physics | None:
+def fit_physics(metres: FitSamples, *, idle_watt: float | None = None) -> Physics | None:
     """Fit the terms to labels; None for fewer than 20.
 
     Parameters
     ----------
     metres : rows with NaN are left out; without any turn rate there is no term for it.
     idle_watt : power while standing, measured at halts; None fits it where the speeds vary enough.
-    turning : whether turning is a term.
     """
-    turning = turning and bool(np.isfinite(metres.mean_abs_yaw_rate_radps).any())
+    turning = bool(np.isfinite(metres.mean_abs_yaw_rate_radps).any())
     known = metres.power_watt + metres.velocity_mps + metres.rise + (metres.mean_abs_yaw_rate_radps if turning else 0.0)
     rows = np.flatnonzero(np.isfinite(known) & (metres.velocity_mps > 0.0))
     if rows.size < FEWEST:

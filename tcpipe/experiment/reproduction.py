@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError, clean_lines
 from tcpipe.experiment.simulation_floor import FEWEST_SEEDS, Claim, check_claims, compute_true_costs
 from tcpipe.formats.atomic import clear, write_text
@@ -74,15 +73,6 @@ RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout=
 """The defaults with the paper's random test samples."""
 
 
-@dataclass(frozen=True, slots=True)
-class SampleCounts:
-    """Driven distance by class: samples by split, by class of each split, and all."""
-
-    splits: Mapping[str, int]
-    terrain: Mapping[str, Mapping[str, int]]
-    segments: int
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproductionSummary:
     """All of reproduction.json."""
@@ -91,7 +81,6 @@ class ReproductionSummary:
     simulated: bool = True
     scenario: str
     plan: Experiment
-    counts: SampleCounts
     claims: tuple[Claim, ...]
     seeds: tuple[Mapping[str, SplitErrors], ...]
     """Errors by split, of each training."""
@@ -144,11 +133,8 @@ def reproduce(
     with _measure_time(seconds, "ingest and build"):
         _build(place, site, jobs)
     runs = [_train_and_evaluate(place, made, plan, seed, seconds) for seed in range(seeds)]
-    card = open_dataset(place / "dataset").card
-    values = ReproductionSummary(
-        scenario=plan.scenario, plan=plan, counts=SampleCounts(card.splits, card.terrain, card.samples),
-        claims=tuple(check_claims(runs)), seeds=tuple(run.splits for run in runs),
-    )  # fmt: skip
+    splits = tuple(run.splits for run in runs)
+    values = ReproductionSummary(scenario=plan.scenario, plan=plan, claims=tuple(check_claims(runs)), seeds=splits)
     write_json(place / JSON, values)
     write_text(place / PAGE, _render_page(values, runs))
     return Reproduction(place, values, dict(seconds))

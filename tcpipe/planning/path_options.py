@@ -19,6 +19,11 @@ _ORIGIN = Option(
 )  # fmt: skip
 
 
+_CELL_SIZE = Option(
+    "Side of a cell; plans on a cost map have its cells.", ("--cell-size",), Range(0.05, 1000.0), "METRES", earlier="--step"
+)  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class PredictPathOptions:
     """Which path is predicted with which model, on which map."""
@@ -52,9 +57,7 @@ class PlanPathOptions:
     goal: tuple[float, float] = required(Option("End of the path.", ("--to",), "lonlat"))
     _: KW_ONLY
     objective: Objective = option("energy", Option("Quantity to minimise.", (), ("energy", "time", "distance")))
-    map_name: str | None = option(
-        None, Option("Map to plan on (default: the only one in the store).", ("--map",), "map", "NAME")
-    )
+    map_name: str | None = option(None, MAP)
     out: str | Path = option("plan.geojson", Option("Write the path as GeoJSON.", (), "output_file", "FILE"))
     picture: str | Path | None = option(
         None, Option("Draw the paths of all three objectives on the map (.png).", (), "output_file", "FILE")
@@ -65,16 +68,7 @@ class PlanPathOptions:
             "Cost map of this model and map; without one, only the necessary cells are predicted.", (), "sealed", "DIR"
         ),
     )
-    cell_size_m: float = option(
-        1.0,
-        Option(
-            "Side of a cell; --cost-map overrides it.",
-            ("--cell-size",),
-            Range(0.05, 1000.0),
-            "METRES",
-            earlier="--step",
-        ),
-    )
+    cell_size_m: float = option(1.0, _CELL_SIZE)
     allow_extrapolation: bool = option(
         False,
         Option(
@@ -110,9 +104,7 @@ class CostMapOptions:
     out: str = option("cost-map", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
     map_name: str | None = option(None, MAP)
-    cell_size_m: float = option(
-        1.0, Option("Side of a cell.", ("--cell-size",), Range(0.05, 1000.0), "METRES", earlier="--step")
-    )
+    cell_size_m: float = option(1.0, _CELL_SIZE)
     origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
     speed_mps: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)

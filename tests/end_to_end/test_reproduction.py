@@ -78,7 +78,7 @@ def test_without_baselines_their_claims_are_not_measured(reproduced, tmp_path):
     with_them, without = (
         json.loads((at / "here" / "reproduction.json").read_text())["claims"] for at in (here, tmp_path)
     )
-    assert json.loads(done.stdout)["claims"] == without
+    assert json.loads(done.stdout)["values"]["claims"] == without
     for one, other in zip(with_them, without, strict=True):
         assert (other["verdict"] == "not measured") if "net per class" in other["says"] else (other == one)
 
