@@ -145,7 +145,7 @@ def simulate(seeds: list[int], length_m: float, only: str) -> None:
                     ]
                 )
                 false_mm.append(1e3 * np.sqrt(model.horizontal.correlated.variance))
-                told.append(model.horizontal.correlated.told)
+                told.append(model.horizontal.correlated.data_share)
             found = np.array(ratios)
             inside.append((found[:, :2] > 0.85) & (found[:, :2] < 1.35))
             columns = (
@@ -165,12 +165,12 @@ def describe(model: NoiseModel) -> Iterator[str]:
             )
             yield (
                 f"  fixes, {axis}: claimed {claimed:.1f} mm, white {white:.1f} mm, correlated {slow:.1f} mm over "
-                f"{noise.correlated.time_s:.0f} s (told {noise.correlated.told:.2f})"
+                f"{noise.correlated.time_s:.0f} s (told {noise.correlated.data_share:.2f})"
             )
     for role, each in model.odometries.items():
         yield (
-            f"  {role}: {1e3 * np.sqrt(each.velocity_m2ps):.1f} mm after 1 s (told {each.velocity_told:.2f}), scale "
-            f"{100 * np.sqrt(each.scale.variance):.2f} % over {each.scale.time_s:.0f} s (told {each.scale.told:.2f})"
+            f"  {role}: {1e3 * np.sqrt(each.velocity_m2ps):.1f} mm after 1 s (told {each.velocity_data_share:.2f}), scale "
+            f"{100 * np.sqrt(each.scale.variance):.2f} % over {each.scale.time_s:.0f} s (told {each.scale.data_share:.2f})"
         )
     for role, turn in model.turns.items():
         yield f"  turns, {role}: {1e3 * np.sqrt(turn.white_rad2ps):.2f} mrad after 1 s"

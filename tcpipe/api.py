@@ -32,7 +32,7 @@ def run_train(options: TrainOptions) -> TrainResult:
     from tcpipe.learning.training import train as run
     from tcpipe.recipe.checking import from_values
 
-    names = [of.name for of in fields(FitConfig) if of.name != "predictor"]
+    names = [entry.name for entry in fields(FitConfig) if entry.name != "predictor"]
     given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features", "layers"})
     if isinstance(layers := given.get("layers"), str):

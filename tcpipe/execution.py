@@ -192,9 +192,9 @@ class _LogForwarder(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage().encode(errors="backslashreplace")[:_LONGEST_SAYING_BYTES].decode(errors="ignore")
-        told = step_of(record)
+        step = step_of(record)
         with suppress(OSError):
-            self._send((record.levelno, "%s", text) if told is None else (STEP, str(record.msg), *astuple(told)))
+            self._send((record.levelno, "%s", text) if step is None else (STEP, str(record.msg), *astuple(step)))
 
 
 _spent = {"cpu_s": 0.0}

@@ -148,8 +148,8 @@ class Store:
             prefix = f"{name}/{name_folder(checksums)}"
             if free := self.map_number(name) == after:
                 maps.put_files(prefix, directory)
-        told = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", subdirectory(prefix, checksums)
-        data, new = to_json(seal_document(MapDocument(*told))).encode(), name_document(name, after + 1)
+        document = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", subdirectory(prefix, checksums)
+        data, new = to_json(seal_document(MapDocument(*document))).encode(), name_document(name, after + 1)
         same = free and after > 0 and maps.read(name_document(name, after)) == data
         put = same or (free and maps.put_new(new, data))
         if not put and not (after and maps.read(new) == data):  # the answer to one's own may be lost
@@ -200,7 +200,8 @@ class Store:
         """
         place = self.runs_place.below(run_id)
         sizes = {
-            of.name.removeprefix(f"{run_id}/"): of.size_bytes for of in self.runs_place.entries(run_id, but=_STREAMS)
+            entry.name.removeprefix(f"{run_id}/"): entry.size_bytes
+            for entry in self.runs_place.entries(run_id, but=_STREAMS)
         }
         last = find_highest_numbers(sizes)
         known = self.known_run(run_id, last)
@@ -216,7 +217,9 @@ class Store:
                     manifest = read_as_at(place, document, Manifest)
                     if (manifest.run_id, manifest.recipe_id) != (run_id, recipe_id):
                         continue
-                    tables = {f"{recipe_id}/{file}": of.size_bytes for file, of in manifest.checksums.items()}
+                    tables = {
+                        f"{recipe_id}/{file}": checksum.size_bytes for file, checksum in manifest.checksums.items()
+                    }
                     if tables.items() <= sizes.items():
                         row = make_run_facts(manifest, name, {document: sizes[document], **about, **tables})
                         row = add_span(row, place.below(recipe_id), manifest)
@@ -323,37 +326,39 @@ class Store:
 
     def write_streams(self, run_id: str, streams: Streams, *, key: str) -> Mapping[str, Checksum]:
         """Put L1 into the store, and return the files; ``key`` names the read settings they were made with."""
-        told: dict[str, pa.Table] = {}
+        tables: dict[str, pa.Table] = {}
         for role, table in streams.tables.items():
             read_with = key, streams.robot, streams.gnss_crs, streams.power_averaged
             info = StreamInfo(*read_with, report=streams.report, sensor=streams.sensors[role])
-            told[role] = add_metadata(table, to_plain(info))
-        return put_tables(self.runs_place.below(run_id), told, folder=f"{_STREAMS}/")
+            tables[role] = add_metadata(table, to_plain(info))
+        return put_tables(self.runs_place.below(run_id), tables, folder=f"{_STREAMS}/")
 
     def read_streams(self, run_id: str, *, key: str) -> Streams | None:
         """Return L1 if it is there, whole, of this data model and made with these read settings; else None."""
         known = self.known_run(run_id)
         if known is None or known.streams_key != key:
             return None
-        tables, of = dict[str, pa.Table](), dict[str, StreamInfo]()
+        tables, infos = dict[str, pa.Table](), dict[str, StreamInfo]()
         try:
             for role, path in self.stream_files(run_id, known).items():
                 table = read_table(path)
-                of[role] = told = parse_typed(read_metadata(table), StreamInfo, path)
-                if told.key != key or told.data_model_version not in READ_TABLES:
+                infos[role] = info = parse_typed(read_metadata(table), StreamInfo, path)
+                if info.key != key or info.data_model_version not in READ_TABLES:
                     return None
                 tables[role] = table.replace_schema_metadata(None)
             if not tables:
                 return None
-            sensors = {role: each.sensor for role, each in of.items()}
-            return Streams(tables, sensors, told.robot, told.gnss_crs, told.power_averaged, told.report)
+            sensors = {role: each.sensor for role, each in infos.items()}
+            return Streams(tables, sensors, info.robot, info.gnss_crs, info.power_averaged, info.report)
         except (TableError, StoreError):
             return None
 
     def stream_files(self, run_id: str, known: RunJson) -> dict[str, Path]:
         """Return the files of L1 on this machine by role, proved; `StoreError` if one is not as it was written."""
         place = self.runs_place.below(run_id)
-        return {PurePosixPath(name).stem: place.proved(name, of) for name, of in sorted(known.streams.items())}
+        return {
+            PurePosixPath(name).stem: place.proved(name, checksum) for name, checksum in sorted(known.streams.items())
+        }
 
     def write_run(
         self,
@@ -366,7 +371,7 @@ class Store:
     ) -> Manifest:
         """Write one ingestion, its checksums added to the manifest; return that, or the one of others that is ``settled``."""
         place = self.runs_place.below(f"{manifest.run_id}/{manifest.recipe_id}")
-        told = {
+        kept_facts = {
             "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": to_plain(manifest.info.datum), "robot": manifest.robot,
         }  # fmt: skip
         tables = {
@@ -377,7 +382,7 @@ class Store:
         whole = self.read_rows(manifest.run_id).get(manifest.recipe_id)
         if whole is not None and settled(known := read_as_at(place, whole.manifest, Manifest)):
             return known
-        checksums = put_tables(place, {name: add_metadata(table, told) for name, table in tables.items()})
+        checksums = put_tables(place, {name: add_metadata(table, kept_facts) for name, table in tables.items()})
         after = find_highest_numbers(place.files()).get("manifest", 0)
         return put_next(place, "manifest", replace(manifest, checksums=checksums), after=after, settled=settled)
 

@@ -138,7 +138,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
     if run is None or result.verdict is None:
         return
     if result.is_new_problem or result.status == "damaged":
-        yield from (f"  damage:  {describe_finding(of)} [{of.code}]" for of in run.damage)
+        yield from (f"  damage:  {describe_finding(finding)} [{finding.code}]" for finding in run.damage)
     if is_new and not several:
         yield f"  verdict: {format_verdict(result.verdict)}"
         where = f"tcpipe inspect {shlex.quote(f'{store}/runs/{run.run_id}')}"

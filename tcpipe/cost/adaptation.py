@@ -70,8 +70,8 @@ class Metres:
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        values: dict[str, Any] = {of.name: getattr(self, of.name) for of in fields(self)}
-        values = {name: None if of is None else of[rows] for name, of in values.items()}
+        values: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        values = {name: None if value is None else value[rows] for name, value in values.items()}
         return Metres(**values)
 
 
@@ -108,7 +108,9 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
         _make_design(there, *usual),
         known.measured - known.predicted,
     )
-    spread, spread_there = (errors.compute_std(of.predicted, of.class_id, of.stated_std) for of in (known, there))
+    spread, spread_there = (
+        errors.compute_std(metres.predicted, metres.class_id, metres.stated_std) for metres in (known, there)
+    )
     neighbour, apart_m = _find_neighbour(errors), np.abs(known.distance_m[:, None] - known.distance_m)
     beside = np.eye(len(residual)) + neighbour * ((apart_m > 0.0) & (apart_m < _NEIGHBOUR_M))
     noise = spread[:, None] * beside * spread
@@ -143,9 +145,9 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     return Adapted(mean, mean + low, mean + high, _make_sum(float(total), half_sum, common_std))
 
 
-def _make_design(of: Metres, per_metre: float, per_second: float) -> Floats:
-    alike_m = np.column_stack([of.length_m, of.rise_m / _RISE_M, np.abs(of.turn_rad) / _TURN_RAD])
-    return np.column_stack([of.predicted, per_second * of.duration_s, per_metre * np.nan_to_num(alike_m)])
+def _make_design(metres: Metres, per_metre: float, per_second: float) -> Floats:
+    alike_m = np.column_stack([metres.length_m, metres.rise_m / _RISE_M, np.abs(metres.turn_rad) / _TURN_RAD])
+    return np.column_stack([metres.predicted, per_second * metres.duration_s, per_metre * np.nan_to_num(alike_m)])
 
 
 def _find_neighbour(errors: Errors) -> float:
@@ -154,16 +156,16 @@ def _find_neighbour(errors: Errors) -> float:
     return float(np.clip(errors.correlation[at] - errors.correlation[-1], -_MOST_NEIGHBOUR, _MOST_NEIGHBOUR))
 
 
-def _sum_neighbours(spread: Floats, of: Metres, neighbour: float) -> float:
+def _sum_neighbours(spread: Floats, metres: Metres, neighbour: float) -> float:
     """Return sum_ij of a_i a_j times the correlation R."""
-    products = (spread[1:] * spread[:-1])[np.diff(of.distance_m) < _NEIGHBOUR_M]
+    products = (spread[1:] * spread[:-1])[np.diff(metres.distance_m) < _NEIGHBOUR_M]
     return float((spread**2).sum() + 2.0 * neighbour * products.sum())
 
 
-def _sum_fading(values: Floats, of: Metres, fade_m: float) -> float:
+def _sum_fading(values: Floats, metres: Metres, fade_m: float) -> float:
     """Return sum_ij of a_i a_j times the correlation L."""
     total, carried = float((values**2).sum()), 0.0
-    for fades, before, here in zip(np.exp(-np.diff(of.distance_m) / fade_m), values[:-1], values[1:], strict=True):
+    for fades, before, here in zip(np.exp(-np.diff(metres.distance_m) / fade_m), values[:-1], values[1:], strict=True):
         carried = fades * (carried + before)
         total += 2.0 * here * carried
     return total
@@ -189,7 +191,7 @@ class Run:
 
     def checksum(self) -> str:
         """Return a hash of what adapts a model."""
-        arrays = [getattr(of, field.name) for of in self.metres.values() for field in fields(of)]
+        arrays = [getattr(metres, field.name) for metres in self.metres.values() for field in fields(metres)]
         return sha256(b"".join(np.ascontiguousarray(values).tobytes() for values in arrays)).hexdigest()
 
 
@@ -226,7 +228,7 @@ def compare_adaptations(
     The rest begins after the most metres, so that all rows are of the same metres; a run too short for some ``known_m`` is in none.
     """
     first_m = max(known_m)
-    for quantity, of in errors.items():
+    for quantity, error in errors.items():
         parts = [(run.metres[quantity], _find_driven(run.metres[quantity])) for run in runs]
         parts = [(metres, driven) for metres, driven in parts if (driven > first_m).sum() >= _LEAST_REST]
         if not parts:
@@ -234,16 +236,16 @@ def compare_adaptations(
         for metres_m in sorted(known_m):
             for predictor in (MODEL, MEAN) if metres_m else (MODEL,):
                 found = [
-                    (rest, _predict_rest(of, metres.take(driven <= metres_m), rest, predictor))
+                    (rest, _predict_rest(error, metres.take(driven <= metres_m), rest, predictor))
                     for metres, driven in parts
                     for rest in [metres.take(driven > first_m)]
                 ]
                 yield _measure(quantity, metres_m, predictor, found)
 
 
-def _find_driven(of: Metres) -> Floats:
+def _find_driven(metres: Metres) -> Floats:
     """Return the metres with labels up to the end of each."""
-    return np.asarray(np.cumsum(of.length_m))
+    return np.asarray(np.cumsum(metres.length_m))
 
 
 def _predict_rest(errors: Errors, known: Metres, rest: Metres, predictor: str) -> Adapted:
@@ -279,10 +281,10 @@ def _measure(quantity: str, metres_m: float, predictor: str, found: Sequence[tup
 
 def format_adaptations(found: Sequence[AdaptedErrors]) -> Iterator[str]:
     """Yield errors on the rest of runs as plain lines, a table by metres."""
-    for of in found:
-        unit, digits = ("s", 3) if of.quantity == "duration" else ("J", 1)
+    for row in found:
+        unit, digits = ("s", 3) if row.quantity == "duration" else ("J", 1)
         yield (
-            f"{of.quantity} after {of.metres:g} m, {of.predictor}: RMSE {of.rmse:.{digits}f} {unit}, 90 % intervals cover "
-            f"{of.coverage_percent:.1f} % of {of.samples} metres; sums off by {of.total_error_percent:.1f} %, "
-            f"{of.totals_inside} of {of.runs} inside"
+            f"{row.quantity} after {row.metres:g} m, {row.predictor}: RMSE {row.rmse:.{digits}f} {unit}, 90 % intervals cover "
+            f"{row.coverage_percent:.1f} % of {row.samples} metres; sums off by {row.total_error_percent:.1f} %, "
+            f"{row.totals_inside} of {row.runs} inside"
         )

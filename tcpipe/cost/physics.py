@@ -143,7 +143,7 @@ class Physics:
         resistances = [self.rolling_resistance(name) for term, name in self.terms if term == "rolling"]
         climb = self.of("grade")
         return bool(self.value[rolling].max() > 0.0 and (climb is None or climb[0] > 0.0)) and all(
-            of is None or of[0] < _PLAUSIBLE_RESISTANCE for of in resistances
+            resistance is None or resistance[0] < _PLAUSIBLE_RESISTANCE for resistance in resistances
         )
 
     def is_outlier(self, residual_watt: Floats) -> NDArray[np.bool_]:
@@ -211,16 +211,16 @@ def _list_determined_terms(metres: FitSamples, *, idle_watt: float | None, turni
 
 def _build_design_matrix(metres: FitSamples, terms: Sequence[tuple[str, str]]) -> Floats:
     """Return what each coefficient is multiplied with, shape (M, J)."""
-    of = {
+    properties = {
         "idle": np.ones_like(metres.velocity_mps),
         "drivetrain": metres.velocity_mps * np.sqrt(1.0 + metres.rise**2),  # wheels run along the surface
         "rolling": metres.velocity_mps,
         "grade": metres.velocity_mps * metres.rise,
         "turning": metres.mean_abs_yaw_rate_radps,
     }
-    own = {term: [name for kind, name in terms if kind == term and name != ALL] for term in of}
+    own = {term: [name for kind, name in terms if kind == term and name != ALL] for term in properties}
     columns = [
-        of[term] * (metres.terrain == name if name != ALL else ~np.isin(metres.terrain, own[term]))
+        properties[term] * (metres.terrain == name if name != ALL else ~np.isin(metres.terrain, own[term]))
         for term, name in terms
     ]
     return np.column_stack(columns)
@@ -311,9 +311,9 @@ def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> 
             for at, ((term, terrain), value) in enumerate(zip(found.terms, found.value.tolist(), strict=True))
         ),
         rolling_resistance={
-            name: (of[0], of[1])
+            name: (resistance[0], resistance[1])
             for term, name in found.terms
-            if term == "rolling" and (of := found.rolling_resistance(name)) is not None
+            if term == "rolling" and (resistance := found.rolling_resistance(name)) is not None
         },
         recovered_downhill=found.recovered,
         residual_watt=found.residual_watt,

@@ -100,7 +100,7 @@ class SumDistribution:
 
     def __add__(self, other: SumDistribution) -> SumDistribution:
         """Return the distribution of both paths together: on the same ground a model errs alike, so that standard deviations add up."""
-        return SumDistribution(*(getattr(self, of.name) + getattr(other, of.name) for of in fields(self)))
+        return SumDistribution(*(getattr(self, entry.name) + getattr(other, entry.name) for entry in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,10 +222,10 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     nothing = np.zeros(_CLASSES)
     return {
         name: replace(
-            _fit_class_errors(of, held.true[name], held, std.get(name, nothing), held.stated[name]),
+            _fit_class_errors(values, held.true[name], held, std.get(name, nothing), held.stated[name]),
             common_share=_find_common_share(residuals, name),
         )
-        for name, of in predicted.items()
+        for name, values in predicted.items()
     }
 
 
@@ -260,7 +260,7 @@ def propagate_stated(mean: Floats, covariance: Floats) -> dict[str, Floats]:
         "power": of_power, "velocity": of_velocity,
         "duration": of_velocity / velocity**4, "energy": np.maximum(energy, 0.0) / velocity**2,
     }  # fmt: skip
-    return {name: np.sqrt(of) for name, of in variances.items()}
+    return {name: np.sqrt(variance) for name, variance in variances.items()}
 
 
 _COMMON = {"duration": "duration_common_std_s", "energy": "energy_common_std_joule"}
@@ -352,7 +352,7 @@ def _drop_bias_of_a_fold(found: float, usual: float, predicted: Floats, true: Fl
     folds = np.unique(fold)
     if folds.size < 2:
         return found
-    others = [fold != of for of in folds]
+    others = [fold != other for other in folds]
     if min(map(np.count_nonzero, others)) < FEWEST:
         return usual
     parts = [found, *(_estimate_ratio(predicted[rows], true[rows], fold[rows])[0] for rows in others)]
@@ -394,7 +394,7 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
     lag_m, correlation = _estimate_correlation(standard, held)
     runs = int(np.unique(held.run).size)
     wider = float(stdtrit(_FEWEST_FREEDOM, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH if held.is_one_fold else 1.0
-    floor, share, stated_share = (float(of) * scale * wider for of in shares)
+    floor, share, stated_share = (float(part) * scale * wider for part in shares)
     found = Errors(
         floor, share, of_class, min(low, 0.0), max(high, 0.0), bias_std, lag_m, correlation, 0.0, runs, standard.size,
         stated_share=stated_share, usual_stated=float(stated.mean()),
@@ -413,9 +413,9 @@ def _estimate_run_variance(errors: Errors, error: Floats, spread: Floats, run: I
     runs = np.unique(run)
     if runs.size < 2:  # nothing but the farthest metres tell it
         return max(float(errors.correlation[-1]), 0.0)
-    weight = np.array([spread[run == of].sum() for of in runs])
-    means = np.array([error[run == of].sum() for of in runs]) / weight
-    of_metres = np.array([errors.compute_variance(spread[run == of], 0.0) for of in runs]) / weight**2
+    weight = np.array([spread[run == number].sum() for number in runs])
+    means = np.array([error[run == number].sum() for number in runs]) / weight
+    of_metres = np.array([errors.compute_variance(spread[run == number], 0.0) for number in runs]) / weight**2
     share = weight / weight.sum()
     wider = float(stdtrit(runs.size - 1.0, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH
     beyond = float(share @ (means - share @ means) ** 2) - float((share * (1.0 - share)) @ of_metres)

@@ -30,7 +30,7 @@ class ExtraFeatures:
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> ExtraFeatures:
         """Return some of them."""
-        return ExtraFeatures(*(getattr(self, of.name)[rows] for of in fields(self)))
+        return ExtraFeatures(*(getattr(self, entry.name)[rows] for entry in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +79,13 @@ def available_features(features: ExtraFeatures) -> tuple[ExtraFeature, ...]:
 
 def fill_unknown(inputs: Sequence[ExtraFeature], features: ExtraFeatures) -> ExtraFeatures:
     """Return the features with a model's usual values where one that it takes is unknown."""
-    values = {of.name: getattr(features, of.name) for of in inputs}
+    values = {feature.name: getattr(features, feature.name) for feature in inputs}
     return replace(
-        features, **{of.name: np.where(np.isfinite(values[of.name]), values[of.name], of.usual) for of in inputs}
+        features,
+        **{
+            feature.name: np.where(np.isfinite(values[feature.name]), values[feature.name], feature.usual)
+            for feature in inputs
+        },
     )
 
 
@@ -102,8 +106,8 @@ def _form_values(columns: Sequence[Floats]) -> tuple[Floats, Floats]:
 
 
 def _scale_values(inputs: Sequence[ExtraFeature], values: dict[str, Floats]) -> Floats:
-    columns = [np.where(np.isfinite(values[of.name]), values[of.name], of.usual) for of in inputs]
-    scaled = [(column - of.mean) / of.deviation for of, column in zip(inputs, columns, strict=True)]
+    columns = [np.where(np.isfinite(values[feature.name]), values[feature.name], feature.usual) for feature in inputs]
+    scaled = [(column - feature.mean) / feature.deviation for feature, column in zip(inputs, columns, strict=True)]
     return np.column_stack(scaled) if scaled else np.empty((len(next(iter(values.values()))), 0))
 
 

@@ -205,7 +205,7 @@ class Split:
         """Return which ids are not in the split, and how many of them are in others."""
         table = read_samples(self._columns.directory, ["sample_id", "split"])
         others = table.filter(pc.is_in(table.column("sample_id"), value_set=ids)).column("split").value_counts()
-        where = "".join(f"; {of['counts']} of them in {of['values']}" for of in others.to_pylist())
+        where = "".join(f"; {group['counts']} of them in {group['values']}" for group in others.to_pylist())
         more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
         return f"{self._columns.directory}: no sample {', '.join(ids[:_NAMED].to_pylist())}{more} in {self.name}{where}"
 

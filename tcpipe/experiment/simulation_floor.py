@@ -107,13 +107,13 @@ class Claim:
 
     def __str__(self) -> str:
         """Return the claim, its figure and its verdict as one line."""
-        told = "" if self.in_the_paper is None else f" ({self.in_the_paper:.2f} in the paper)"
+        comparison = "" if self.in_the_paper is None else f" ({self.in_the_paper:.2f} in the paper)"
         trainings = (
             "one training"
             if self.between_seeds is None
             else f"{self.seeds} trainings, {100.0 * self.between_seeds:.0f} % apart (1σ)"
         )
-        return f"{self.verdict}: {self.says}, {self.split}: RMSE of E {self.ratio} of its{told}; {trainings}"
+        return f"{self.verdict}: {self.says}, {self.split}: RMSE of E {self.ratio} of its{comparison}; {trainings}"
 
 
 def check_claims(runs: Sequence[Evaluation]) -> list[Claim]:

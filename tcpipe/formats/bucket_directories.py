@@ -86,7 +86,7 @@ class FetchedShards:
     def is_complete(self) -> bool:
         """Return whether each file is there, and as large as it was."""
         sizes = {entry.name: entry.size_bytes for entry in self.place.entries()}
-        return all(sizes.get(name) == of.size_bytes for name, of in self.checksums.items())
+        return all(sizes.get(name) == checksum.size_bytes for name, checksum in self.checksums.items())
 
     def _prove(self, names: set[str]) -> None:
         """Raise `StoreError` where a shard is not what its card says."""
@@ -168,7 +168,7 @@ def find_unlisted_files(url: str) -> list[str]:
     place = open_place(url)
     state = read_state(place)
     cards = [card for card in (find_newest(url, CARDS), _find_at(place, CARDS)) if card is not None]
-    listed = {of.place.where(name) for of in cards for name in (*_read_checksums(of), *_UNLISTED, of.name)}
+    listed = {card.place.where(name) for card in cards for name in (*_read_checksums(card), *_UNLISTED, card.name)}
     others = [entry.name for entry in place.entries() if place.where(entry.name) not in listed]
     return [place.where(name) for name in others if not _is_expected(name, state)]
 
@@ -190,7 +190,7 @@ def is_left_over(name: str, state: State) -> bool:
     found = _GENERATION.match(name)
     if found is None or state.problems:
         return False
-    return int(found[2]) <= state.number and found[1] not in {of.folder for of in state.generations}
+    return int(found[2]) <= state.number and found[1] not in {generation.folder for generation in state.generations}
 
 
 def require_card(url: str, cards: Sequence[str] = CARDS) -> FoundCard:
@@ -228,8 +228,10 @@ def _fetch_others(
     place: Place, root: Path, checksums: Mapping[str, Checksum], by_range: Callable[[str], bool]
 ) -> FetchedShards:
     """Bring what is not read ``by_range`` of a place's files below ``root``; return where the others are read."""
-    absent = [(name, of) for name, of in checksums.items() if not (by_range(name) or (root / name).exists())]
-    place.map(lambda of: _fetch_one(place, *of, root / of[0]), absent)
+    absent = [
+        (name, checksum) for name, checksum in checksums.items() if not (by_range(name) or (root / name).exists())
+    ]
+    place.map(lambda arguments: _fetch_one(place, *arguments, root / arguments[0]), absent)
     return FetchedShards(place, root, checksums)
 
 

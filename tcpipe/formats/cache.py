@@ -38,8 +38,8 @@ def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
         # Not synced: readers compare checksums. What a killed process leaves is removed in its turn.
         temporary.replace(path)
     except OSError as error:
-        told = f"{path}: cannot be written ({error.strerror or error}); TCPIPE_CACHE names another place for what is fetched"
-        raise StoreError(told) from error
+        message = f"{path}: cannot be written ({error.strerror or error}); TCPIPE_CACHE names another place for what is fetched"
+        raise StoreError(message) from error
     finally:
         with suppress(OSError):
             temporary.unlink()
@@ -71,7 +71,9 @@ def _find_cache_directory() -> Path:
     if given := os.environ.get("TCPIPE_CACHE"):
         return Path(given)
     base = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111  also without a home
-    if base.is_absolute() and os.access(next(of for of in (base, *base.parents) if of.exists()), os.W_OK):
+    if base.is_absolute() and os.access(
+        next(directory for directory in (base, *base.parents) if directory.exists()), os.W_OK
+    ):
         return base / "tcpipe"
     return Path(tempfile.gettempdir()) / f"tcpipe-cache-{os.getuid()}"
 

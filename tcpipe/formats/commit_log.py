@@ -104,7 +104,7 @@ def read_newest_commit(store: Place) -> Commit | None:
 def _list_commits(log: Place, after: int) -> list[int]:
     """Return the numbers of the commits after one, rising."""
     found = (COMMIT.fullmatch(name) for name in log.files(after=commit_name(after)))
-    return sorted(int(of[1]) for of in found if of)
+    return sorted(int(match[1]) for match in found if match)
 
 
 def _try_read_commit(log: Place, number: int) -> ReadCommit | StoreError:
@@ -189,7 +189,7 @@ def _list_snapshots(log: Place) -> list[str]:
 
 def _encode_snapshot(state: State, stamp: Stamp) -> bytes:
     entries, numbers = compact_state(state), dict[Finding, int]()
-    by_run = tuple(tuple(numbers.setdefault(of, len(numbers)) for of in row.findings) for row in entries.runs)
+    by_run = tuple(tuple(numbers.setdefault(finding, len(numbers)) for finding in row.findings) for row in entries.runs)
     entries = replace(entries, runs=tuple(replace(row, findings=()) for row in entries.runs))
     commit = Commit(state.number, state.digest, "snapshot", stamp.who, stamp.at, entries)
     text = to_compact_json(_Snapshot(commit, tuple(numbers), by_run))

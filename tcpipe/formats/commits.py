@@ -240,13 +240,13 @@ class State:
     @property
     def superseded(self) -> dict[str, str]:
         """Runs that another has taken the place of, and that other."""
-        latest = {of.run_id: of.by for of in self.supersessions}
+        latest = {supersession.run_id: supersession.by for supersession in self.supersessions}
         return {run_id: by for run_id, by in latest.items() if by is not None}
 
     @property
     def parties(self) -> set[str]:
         """Runs that another has taken the place of, or did once, and those others."""
-        return {name for of in self.supersessions for name in (of.run_id, of.by) if name}
+        return {name for supersession in self.supersessions for name in (supersession.run_id, supersession.by) if name}
 
     def find_rows(self, run_id: str) -> list[RunFacts]:
         """Return the ingestions of a run."""
@@ -275,20 +275,20 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
     generations = state.generations
     gone = state.superseded
     for commit in commits:
-        of, number = commit.entries, commit.number
-        supersessions += of.superseded
-        _supersede(runs, gone, of.superseded)
+        entries, number = commit.entries, commit.number
+        supersessions += entries.superseded
+        _supersede(runs, gone, entries.superseded)
         _add_runs(runs, gone, commit)
-        for sighting in of.seen:
+        for sighting in entries.seen:
             lineage = find_lineage(sighting.log)
             seen[lineage] = (*(old for old in seen.get(lineage, ()) if old != sighting), sighting)
-        failed.update({failure.key: failure for failure in of.failed})
-        acknowledged.update({problem.key: problem for problem in of.acknowledged})
-        _add_datasets(datasets, forgotten, of)
-        generations = _keep_generations((*generations, *of.generations)) if of.generations else generations
-        begun.update(_number(call, commit) for call in of.begun)
-        begun = {key: call for key, call in begun.items() if key not in of.ended}
-        calls = (*reversed(of.calls), *calls)[:LATEST_CALLS]
+        failed.update({failure.key: failure for failure in entries.failed})
+        acknowledged.update({problem.key: problem for problem in entries.acknowledged})
+        _add_datasets(datasets, forgotten, entries)
+        generations = _keep_generations((*generations, *entries.generations)) if entries.generations else generations
+        begun.update(_number(call, commit) for call in entries.begun)
+        begun = {key: call for key, call in begun.items() if key not in entries.ended}
+        calls = (*reversed(entries.calls), *calls)[:LATEST_CALLS]
     return replace(
         state, number=number, runs=runs, seen=seen, failed=failed, acknowledged=acknowledged, supersessions=supersessions,
         datasets=datasets, forgotten=frozenset(forgotten), generations=generations, begun=begun, calls=calls,
@@ -319,20 +319,22 @@ def _is_same(known: RunFacts, row: RunFacts) -> bool:
     return (known.segments_sha256, known.track_file) == (row.segments_sha256, row.track_file)
 
 
-def _add_datasets(datasets: dict[tuple[str, str], Dataset], forgotten: set[tuple[str, str]], of: Entries) -> None:
-    for dataset in of.forgotten:
+def _add_datasets(datasets: dict[tuple[str, str], Dataset], forgotten: set[tuple[str, str]], entries: Entries) -> None:
+    for dataset in entries.forgotten:
         forgotten.add((dataset.out, dataset.inputs))
         datasets.pop((dataset.out, dataset.inputs), None)
-    for dataset in of.datasets:
+    for dataset in entries.datasets:
         forgotten.discard((dataset.out, dataset.inputs))
         datasets[dataset.out, dataset.inputs] = dataset
 
 
 def _keep_generations(generations: tuple[Generation, ...]) -> tuple[Generation, ...]:
     """Return the newest two generations, and those that were not replaced for long when the newest was committed."""
-    times = [datetime.fromisoformat(of.at) for of in generations]
+    times = [datetime.fromisoformat(generation.at) for generation in generations]
     kept = [
-        of for of, (_, replaced) in zip(generations, pairwise(times), strict=False) if times[-1] - replaced <= _KEPT_FOR
+        generation
+        for generation, (_, replaced) in zip(generations, pairwise(times), strict=False)
+        if times[-1] - replaced <= _KEPT_FOR
     ]
     return (*kept, *generations[-1:])
 
@@ -346,7 +348,7 @@ def _number(call: Begun, commit: Commit) -> tuple[int, Begun]:
 def compact_state(state: State) -> Entries:
     """Return the entries of one commit that adds up to a state."""
     return Entries(
-        seen=tuple(sighting for of in state.seen.values() for sighting in of),
+        seen=tuple(sighting for sightings in state.seen.values() for sighting in sightings),
         runs=tuple(state.runs.values()),
         failed=tuple(state.failed.values()),
         acknowledged=tuple(state.acknowledged.values()),

@@ -122,7 +122,11 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
             raise DatasetError(f"{path}: no column {wanted!r} ({_COLUMN}); there are {there}")
         return wanted
     endings = ("", *(f"_{unit}" for unit in STAMP_UNITS))
-    found = [name for name in table.columns if name.lower() in {f"{of}{end}" for of in _TIME_NAMES for end in endings}]
+    found = [
+        name
+        for name in table.columns
+        if name.lower() in {f"{time_name}{end}" for time_name in _TIME_NAMES for end in endings}
+    ]
     if len(found) != 1:
         said = (
             f"{len(found)} columns tell the time ({', '.join(found)})"

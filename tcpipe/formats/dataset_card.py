@@ -145,9 +145,9 @@ class MapRegistration:
 def list_shifts(registrations: Iterable[MapRegistration]) -> dict[str, tuple[float, float, float]]:
     """Return by run the shift that was applied, x and y, and its DRMS [m]."""
     return {
-        of.run_id: (*of.shift_xy_m, of.applied_std_m)
-        for of in registrations
-        if of.shift_xy_m is not None and of.applied_std_m is not None
+        registration.run_id: (*registration.shift_xy_m, registration.applied_std_m)
+        for registration in registrations
+        if registration.shift_xy_m is not None and registration.applied_std_m is not None
     }
 
 
@@ -324,7 +324,7 @@ class DatasetCard:
     def attributions(self) -> tuple[str, ...]:
         """The licences of open data in its maps, each with the layers that contain such data."""
         layers: dict[str, dict[str, None]] = {}
-        for origin in (of for source in self.maps for of in source.origins):
+        for origin in (raster for source in self.maps for raster in source.origins):
             layers.setdefault(origin.licence, {})[origin.layer] = None
         return tuple(f"{', '.join(names)}: {licence}" for licence, names in layers.items())
 

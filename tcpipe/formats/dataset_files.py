@@ -404,7 +404,7 @@ def open_patches(
     px, samples = card.patch_px, card.samples
     layers = sort_layers(read_layers(card.layers, card.classes, directory / CARD))
     known = card.format in get_args(FileFormat)
-    uneven = any(of.bands and (not of.own_px or px % of.own_px) for of in layers.values())
+    uneven = any(layer.bands and (not layer.own_px or px % layer.own_px) for layer in layers.values())
     if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES) or uneven:
         raise DatasetError(
             f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: expected up to "

@@ -53,7 +53,9 @@ def format_number(name: str, value: float) -> str:
     """Return a number with the unit of its name's suffix, with three significant digits; counts and offsets as whole numbers."""
     if name.endswith(("_count", "_offset")):
         return f"{value:.0f}"
-    unit, factor = next((of for suffix, of in _UNITS.items() if name.endswith(suffix)), ("", 1.0))
+    unit, factor = next(
+        (unit_and_factor for suffix, unit_and_factor in _UNITS.items() if name.endswith(suffix)), ("", 1.0)
+    )
     value *= factor
     if not np.isfinite(value) or abs(value) >= _LARGEST_PLAIN:
         return f"{value:.{_DIGITS}g}{unit}"
@@ -110,16 +112,19 @@ def _find_purpose(finding: Finding, remedy: Remedy) -> str:
 def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
     """Return what helps against findings of one code: what it does, and the commands and lines of a recipe that do it; else the advice."""
     remedies: list[Remedy] = []
-    for remedy in (of for finding in findings for of in finding.remedies):
+    for remedy in (remedy_ for finding in findings for remedy_ in finding.remedies):
         if remedy not in remedies:
             remedies.append(remedy)
     if remedies and len(remedies) <= MOST_LINES:
         return [
             (
-                _find_purpose(findings[0], of),
-                [*([of.command] if of.command else []), *([_build_recipe_fragment(of).toml()] if of.recipe else [])],
+                _find_purpose(findings[0], remedy_),
+                [
+                    *([remedy_.command] if remedy_.command else []),
+                    *([_build_recipe_fragment(remedy_).toml()] if remedy_.recipe else []),
+                ],
             )
-            for of in remedies
+            for remedy_ in remedies
         ]
     entry = read_catalogue().get(findings[0].code)
     return [(entry.advice, [])] if entry and entry.advice else []
@@ -129,14 +134,14 @@ def format_finding(finding: Finding) -> str:
     """Return a finding as one line: what was observed, its remedies or the catalogue's advice, and its code."""
     entry = read_catalogue().get(finding.code)
     advice = entry.advice if entry else ""
-    remedy = ". ".join(describe_remedy(finding, of) for of in finding.remedies) or advice
+    remedy = ". ".join(describe_remedy(finding, remedy_) for remedy_ in finding.remedies) or advice
     return f"{describe_finding(finding)}{f'. {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
 
 
 def format_remedy_blocks(findings: Iterable[Finding]) -> list[str]:
     """Return the recipes of remedies that fit in no line, each once, as they stand in a file."""
-    remedies = (of for finding in findings for of in finding.remedies if _is_block(of))
-    blocks = dict.fromkeys(_build_recipe_fragment(of).toml() for of in remedies)
+    remedies = (remedy for finding in findings for remedy in finding.remedies if _is_block(remedy))
+    blocks = dict.fromkeys(_build_recipe_fragment(remedy).toml() for remedy in remedies)
     return [line for block in blocks for line in block.splitlines()]
 
 
@@ -152,7 +157,7 @@ def _build_recipe_fragment(remedy: Remedy) -> RecipeFragment:
 def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more: str = "") -> list[str]:
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
     ordered = sort_findings(findings)
-    found = [of for of in ordered if of.severity != "note"]
+    found = [finding for finding in ordered if finding.severity != "note"]
     return list_findings(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
 
 
@@ -171,9 +176,9 @@ def _count_rest(findings: int, notes: int, more: str) -> list[str]:
     return [f"and {rest}{f': {more}' if more else ''}"] if rest else []
 
 
-def format_verdict(verdict: Verdict, of: Sequence[Affected] = AFFECTED) -> str:
+def format_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) -> str:
     """Return the grades as one line, the worst first: ``energy not usable; position and time usable with care``."""
-    labels = {grade: [name for name in of if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
+    labels = {grade: [name for name in quantities if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
     return "; ".join(f"{_join(names)} {grade}" for grade, names in labels.items() if names)
 
 
@@ -205,12 +210,12 @@ class FindingGroup(Generic[K]):
     @cached_property
     def findings(self) -> list[Finding]:
         """All of them, the worst first."""
-        return sort_findings(finding for of in self.of.values() for finding in of)
+        return sort_findings(finding for findings in self.of.values() for finding in findings)
 
     @cached_property
     def severity(self) -> Severity:
         """The worst of their severities."""
-        return min((finding.severity for of in self.of.values() for finding in of), key=rank_severity)
+        return min((finding.severity for findings in self.of.values() for finding in findings), key=rank_severity)
 
 
 def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[FindingGroup[K]]:
@@ -218,15 +223,15 @@ def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[Find
     found: dict[str, dict[K, tuple[Finding, ...]]] = {}
     for key, each in findings:
         for finding in each:
-            of = found.setdefault(finding.code, {})
-            of[key] = (*of.get(key, ()), finding)
+            findings_by_subject = found.setdefault(finding.code, {})
+            findings_by_subject[key] = (*findings_by_subject.get(key, ()), finding)
     catalogue = read_catalogue()
 
     def rank(group: FindingGroup[K]) -> tuple[int, int, int]:
         entry = catalogue.get(group.code)
         return rank_severity(group.severity), -len(entry.affects if entry else ()), -len(group.of)
 
-    return sorted((FindingGroup(code, of) for code, of in found.items()), key=rank)
+    return sorted((FindingGroup(code, grouped) for code, grouped in found.items()), key=rank)
 
 
 def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") -> str:
@@ -235,8 +240,8 @@ def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") 
     if len(group.of) == 1 and len(findings) == 1:
         key, line = next(iter(group.of)), format_finding(findings[0])
         return line if key == findings[0].subject.name else f"{key}: {line}"
-    shared = findings[0].remedies if all(of.remedies == findings[0].remedies for of in findings) else ()
-    remedy = ". ".join(describe_remedy(findings[0], of) for of in shared)
+    shared = findings[0].remedies if all(finding.remedies == findings[0].remedies for finding in findings) else ()
+    remedy = ". ".join(describe_remedy(findings[0], remedy_) for remedy_ in shared)
     return format_count(group.code, len(group.of), total, what, _describe_range(findings), remedy=remedy)
 
 
@@ -251,7 +256,7 @@ def describe_group(group: FindingGroup[K], total: int | None, what: str) -> str:
 
 
 def _describe_range(findings: Sequence[Finding]) -> str:
-    subjects = ", ".join(sorted({of.subject.name for of in findings})[:_MOST_SUBJECTS])
+    subjects = ", ".join(sorted({finding.subject.name for finding in findings})[:_MOST_SUBJECTS])
     return "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(findings[0].code), findings))))
 
 
@@ -271,7 +276,7 @@ def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
     name = next((name for _, name, _, _ in fields if name in findings[0].numbers), None)
     if name is None:
         return ""
-    values = [of.numbers[name] for of in findings if name in of.numbers]
+    values = [finding.numbers[name] for finding in findings if name in finding.numbers]
     low, high = format_number(name, min(values)), format_number(name, max(values))
     return low if low == high else f"{low} to {high}"
 
@@ -287,15 +292,15 @@ def format_mixed_groups(
     groups: Sequence[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
 ) -> list[str]:
     """Return the same of groups of different things, each with the arguments of `format_group`."""
-    found = [of for of in groups if of[0].severity != "note"]
-    ordered = sorted(found, key=lambda of: rank_severity(of[0].severity))[:most]
+    found = [group for group in groups if group[0].severity != "note"]
+    ordered = sorted(found, key=lambda group: rank_severity(group[0].severity))[:most]
     return list_mixed_groups(ordered) + _count_rest(len(found) - most, len(groups) - len(found), more)
 
 
 def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
     """Return every group as a line, the worst first, notes too."""
     lines = []
-    for group, total, what in sorted(groups, key=lambda of: rank_severity(of[0].severity)):
+    for group, total, what in sorted(groups, key=lambda entry: rank_severity(entry[0].severity)):
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines

@@ -77,8 +77,8 @@ def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
     )
     yield from ("", f"![the maps from above]({picture})", "", "## Labels, over train alone", "")
     yield from ("| label | mean | standard deviation | least | most |", "|---|---|---|---|---|")
-    for name, of in card.label_statistics_of_train.items():
-        figures = (of.mean, of.std, of.min, of.max)
+    for name, statistics in card.label_statistics_of_train.items():
+        figures = (statistics.mean, statistics.std, statistics.min, statistics.max)
         yield f"| `{name}` | " + " | ".join("–" if value is None else f"{value:.4g}" for value in figures) + " |"
     yield from ("", "## Layers of a patch", "", "| layer | stored as | unit |", "|---|---|---|")
     for name, layer in list(card.layers.items())[:_SHOWN_LAYERS]:
@@ -188,7 +188,8 @@ def format_croissant(
         sets.append({"@type": "cr:FileSet", "@id": "shards", **kind})
         layers = read_layers(card.layers, card.classes, Path())
         patches = [
-            _patch_field(of.name, math.prod(of.patch_shape(card.patch_px)), of.stored.kind) for of in layers.values()
+            _patch_field(layer.name, math.prod(layer.patch_shape(card.patch_px)), layer.stored.kind)
+            for layer in layers.values()
         ]
         columns = pa.schema([samples.field("sample_id"), samples.field("split"), *patches])
         about = "One record a sample with its patch, split by split: rows of the patch one after another."

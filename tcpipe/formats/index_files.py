@@ -101,8 +101,8 @@ class RunFacts(Ingestion):
 def make_run_facts(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFacts:
     """Return the row of an ingestion; ``name`` is that of its manifest, ``files`` as in the row."""
     label, place = manifest.info.report.facts.label, f"runs/{manifest.run_id}/{manifest.recipe_id}"
-    named = {PurePosixPath(of).name: of for of in manifest.checksums}
-    if gone := [of for of in ("segments.parquet", "track.parquet", "rejections.parquet") if of not in named]:
+    named = {PurePosixPath(path).name: path for path in manifest.checksums}
+    if gone := [file for file in ("segments.parquet", "track.parquet", "rejections.parquet") if file not in named]:
         raise StoreError(f"{place}: its manifest lists no {gone[0]}; ingest the log again")
     return convert_record(
         manifest,
@@ -121,7 +121,10 @@ def make_run_facts(manifest: Manifest, name: str, files: Mapping[str, int]) -> R
 
 
 def _read_terms(fit: PhysicsFit) -> dict[str, tuple[float, float]]:
-    return {of.term if of.terrain == "all" else f"{of.term} on {of.terrain}": (of.value, of.std) for of in fit.terms}
+    return {
+        term.term if term.terrain == "all" else f"{term.term} on {term.terrain}": (term.value, term.std)
+        for term in fit.terms
+    }
 
 
 def read_known_log(known: RunJson) -> KnownLog:
@@ -149,8 +152,8 @@ def _pick(record: object, names: Iterable[str]) -> dict[str, object]:
 
 
 _CELLS: Mapping[str, Callable[[RunFacts], object]] = {
-    "findings": lambda row: [_pick(of, ("code", "severity")) for of in row.findings],
-    "damage": lambda row: [of.code for of in row.damage],
+    "findings": lambda row: [_pick(finding, ("code", "severity")) for finding in row.findings],
+    "damage": lambda row: [finding.code for finding in row.damage],
     "verdict": lambda row: _pick(row.verdict, AFFECTED),
     "log": lambda row: row.log and {"source": _pick(row.log.source, ("paths", "sha256", "size_bytes"))},
 }
@@ -191,8 +194,10 @@ def _describe_state(digest: str) -> dict[bytes, bytes]:
 
 
 def _make_table(rows: Sequence[RunFacts]) -> pa.Table:
-    cells = (map(_CELLS.get(of.name, attrgetter(of.name)), rows) for of in _SCHEMA)
-    return pa.table([_to_column([*of], field.type) for of, field in zip(cells, _SCHEMA, strict=True)], schema=_SCHEMA)
+    cells = (map(_CELLS.get(field.name, attrgetter(field.name)), rows) for field in _SCHEMA)
+    return pa.table(
+        [_to_column([*values], field.type) for values, field in zip(cells, _SCHEMA, strict=True)], schema=_SCHEMA
+    )
 
 
 def _to_column(values: list[object], kind: pa.DataType) -> pa.Array:
@@ -207,5 +212,5 @@ def _to_text(value: object) -> object:
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, Mapping):
-        return {str(_to_text(key)): _to_text(of) for key, of in value.items()}
-    return [_to_text(of) for of in value] if isinstance(value, tuple | list) else value
+        return {str(_to_text(key)): _to_text(item) for key, item in value.items()}
+    return [_to_text(item) for item in value] if isinstance(value, tuple | list) else value

@@ -35,8 +35,8 @@ MOST_BYTES = 32 << 20
 def to_plain(value: Any) -> Any:
     """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
     if is_dataclass(value) and not isinstance(value, type):
-        told = ((of.name, getattr(value, of.name), of.metadata.get("json", ())) for of in fields(value))
-        value = {name: item for name, item, left_out in told if not (left_out and item in left_out)}
+        entries = ((entry.name, getattr(value, entry.name), entry.metadata.get("json", ())) for entry in fields(value))
+        value = {name: item for name, item, left_out in entries if not (left_out and item in left_out)}
     elif isinstance(value, Enum):
         value = value.value
     elif hasattr(value, "tolist"):  # numpy scalars and arrays
@@ -58,7 +58,7 @@ def convert_record(record: object, cls: Callable[..., T], **more: object) -> T:
 
 @cache
 def _field_names(cls: Callable[..., object]) -> tuple[str, ...]:
-    return tuple(of.name for of in fields(cls))  # type: ignore[arg-type]
+    return tuple(entry.name for entry in fields(cls))  # type: ignore[arg-type]
 
 
 def to_compact_json(value: object) -> bytes:

@@ -327,7 +327,7 @@ def _is_unanswered(error: Exception) -> bool:
     status = _STATUS.search(str(error))
     if status:
         return int(status[1]) >= 500 or int(status[1]) in _TRY_AGAIN
-    return not any(of in str(error) for of in (*_DENIED, "InvalidCertificate", "InvalidContentType"))
+    return not any(pattern in str(error) for pattern in (*_DENIED, "InvalidCertificate", "InvalidContentType"))
 
 
 def _tell_no_answer(bucket: str, patience: _Patience, error: Exception, *, waited_s: float) -> None:
@@ -376,7 +376,9 @@ def _describe_store_error(url: str, error: Exception, code: str | None, what: st
     from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
 
     text, scheme = str(error), url.partition("://")[0].lower()
-    denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in text for of in _DENIED)
+    denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(
+        pattern in text for pattern in _DENIED
+    )
     if denied and scheme in _CREDENTIALS:
         return _describe_denial(scheme, text, code, what)
     if code == "NoSuchBucket":
@@ -406,10 +408,10 @@ def _describe_no_answer(error: Exception) -> str:
     """Return which address does not answer, how, and what to check."""
     text = str(error)
     address, status = _ADDRESS.search(text), _STATUS.search(text)
-    told = next((words for of, words in _NO_ANSWER.items() if of in text), "the connection broke")
-    told = f"it answers {status[0]}" if status else told
+    answer = next((words for pattern, words in _NO_ANSWER.items() if pattern in text), "the connection broke")
+    answer = f"it answers {status[0]}" if status else answer
     where = hide_secrets(address[0]) if address else "the store"
-    return f"no answer from {where}: {told}; check that it runs and that the address is right"
+    return f"no answer from {where}: {answer}; check that it runs and that the address is right"
 
 
 def _check_endpoints(scheme: str) -> None:

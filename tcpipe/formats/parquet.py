@@ -85,14 +85,14 @@ def make_storable(table: pa.Table) -> pa.Table:
     return table
 
 
-def _add_struct_member(of: pa.DataType) -> pa.DataType:
+def _add_struct_member(dtype: pa.DataType) -> pa.DataType:
     """Return the type with a member in every struct that has none."""
-    if pa.types.is_struct(of):
-        fields = [field.with_type(_add_struct_member(field.type)) for field in of]
+    if pa.types.is_struct(dtype):
+        fields = [field.with_type(_add_struct_member(field.type)) for field in dtype]
         return pa.struct(fields or [pa.field(EMPTY_MEMBER, pa.uint8())])
-    if pa.types.is_fixed_size_list(of):
-        return pa.list_(_add_struct_member(of.value_type), of.list_size)
-    return pa.list_(_add_struct_member(of.value_type)) if pa.types.is_list(of) else of
+    if pa.types.is_fixed_size_list(dtype):
+        return pa.list_(_add_struct_member(dtype.value_type), dtype.list_size)
+    return pa.list_(_add_struct_member(dtype.value_type)) if pa.types.is_list(dtype) else dtype
 
 
 @contextmanager
@@ -196,7 +196,7 @@ def _iterate_pages(data: memoryview, chunk: pq.ColumnChunkMetaData) -> Iterator[
     while at < end:
         header, at = _read_struct(data, at)
         uncompressed, compressed = header.get(2, -1), header.get(3, -1)
-        held = next((of for number in (5, 7, 8) if isinstance(of := header.get(number), dict)), {})
+        held = next((page for number in (5, 7, 8) if isinstance(page := header.get(number), dict)), {})
         values = held.get(1, 0)
         if not all(isinstance(value, int) and value >= 0 for value in (uncompressed, compressed, values)):
             raise ValueError("the header of a page is damaged")
@@ -274,9 +274,9 @@ def read_range(path: Path, column: str) -> tuple[int, int]:
         groups = [about.row_group(index) for index in range(about.num_row_groups)]
         at = about.schema.to_arrow_schema().get_field_index(column)
         found = [group.column(at).statistics for group in groups if at >= 0 and group.num_rows]
-    if not found or not all(of is not None and of.has_min_max for of in found):
+    if not found or not all(statistics is not None and statistics.has_min_max for statistics in found):
         raise StoreError(f"{path}: has no statistics of {column}")
-    return min(int(of.min) for of in found), max(int(of.max) for of in found)
+    return min(int(statistics.min) for statistics in found), max(int(statistics.max) for statistics in found)
 
 
 _WGS84 = "EPSG:4326"

@@ -218,8 +218,8 @@ def _iterate_table_lines(head: str, here: Any, default: Any, definitions: Mappin
     """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
     cls: type = type(default)
     definition = definitions[cls.__name__]
-    told = (f"# {line}" for line in definition["description"].splitlines() if line)
-    yield from ("", *told, head if here else f"## {head}")
+    comments = (f"# {line}" for line in definition["description"].splitlines() if line)
+    yield from ("", *comments, head if here else f"## {head}")
     for name, kind in read_annotations(cls).items():
         value, usual = getattr(here or default, name), getattr(default, name)
         for line in _iterate_key_lines(definition["properties"][name], name, value, usual, format_values(kind)):
@@ -247,7 +247,7 @@ def load_shipped_profiles() -> Profiles:
 
 def load_profiles(recipe: Recipe | IngestSections) -> Profiles:
     """Return what a recipe knows, and beyond that the package."""
-    of_tables = [of for name, table in recipe.tables.items() if (of := table.make_power_source(name))]
+    of_tables = [source for name, table in recipe.tables.items() if (source := table.make_power_source(name))]
     return Profiles(recipe.robots, [*recipe.power_sources, *of_tables]).before(load_shipped_profiles())
 
 

@@ -270,7 +270,9 @@ def remove_if_empty(place: str | Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if made and not any(path for of in ("runs/*", "maps/*-*.json", f"{SPOOL}/*/*") for path in store.glob(of)):
+        if made and not any(
+            path for pattern in ("runs/*", "maps/*-*.json", f"{SPOOL}/*/*") for path in store.glob(pattern)
+        ):
             for own in ("log", "index"):
                 shutil.rmtree(store / own, ignore_errors=True)
             (store / MARK).unlink(missing_ok=True)

@@ -74,9 +74,12 @@ class ShardedArray:
                 )
             else:
                 with path.open("rb", buffering=0) as file:
-                    of = file.fileno()
+                    descriptor = file.fileno()
                     data = self._encoded_at(
-                        shard, place, lambda: os.fstat(of).st_size, lambda at, size: os.pread(of, size, at)
+                        shard,
+                        place,
+                        lambda: os.fstat(descriptor).st_size,
+                        lambda at, size: os.pread(descriptor, size, at),
                     )
             if data is None:
                 out[...] = self.fill

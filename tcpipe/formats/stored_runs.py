@@ -57,9 +57,9 @@ class RunDirectory:
     @property
     def streams_key(self) -> str:
         """Names the read settings of the streams that it was made from, as ``run.json`` has it while these are there."""
-        told = self.manifest
-        key = read_key(told.recipe, told.robot_requested, definitions=told.message_definitions)
-        return f"{key}-{told.tcpipe_version}"
+        manifest = self.manifest
+        key = read_key(manifest.recipe, manifest.robot_requested, definitions=manifest.message_definitions)
+        return f"{key}-{manifest.tcpipe_version}"
 
     @property
     def where(self) -> str:
@@ -92,7 +92,7 @@ class RunDirectory:
         return self.table("rejections")
 
     def _name(self, name: str) -> str:
-        found = next((of for of in self.manifest.checksums if PurePosixPath(of).name == name), None)
+        found = next((file for file in self.manifest.checksums if PurePosixPath(file).name == name), None)
         if found is None:
             raise StoreError(f"{self.where}: its manifest lists no {name}; ingest the log again")
         return found
@@ -221,7 +221,7 @@ def put_tables(place: Place, tables: Mapping[str, pa.Table], *, folder: str = ""
 
 def subdirectory(prefix: str, checksums: Mapping[str, Checksum]) -> dict[str, Checksum]:
     """Return checksums by the names that their files have where ``prefix`` lies."""
-    return {f"{prefix}/{name}": of for name, of in checksums.items()}
+    return {f"{prefix}/{name}": checksum for name, checksum in checksums.items()}
 
 
 _LENT = ("imu", "wheel_odometry", "visual_odometry")
@@ -261,6 +261,6 @@ def lend_streams(place: Place, streams: Streams, stored: Mapping[str, Checksum])
     """
     if place.path is None:
         return streams
-    files = {PurePosixPath(name).stem: place.local(name, of) for name, of in stored.items()}
+    files = {PurePosixPath(name).stem: place.local(name, checksum) for name, checksum in stored.items()}
     held = {role: table for role, table in streams.tables.items() if role not in _LENT}
     return replace(streams, tables=_LentTables(held, {role: path for role, path in files.items() if role in _LENT}))

@@ -58,7 +58,10 @@ def _check_headers(stream: BinaryIO, size: int) -> None:
     names = set[str]()
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
-        if any(of.compress_type != zipfile.ZIP_STORED for of in members) or sum(of.file_size for of in members) > size:
+        if (
+            any(member.compress_type != zipfile.ZIP_STORED for member in members)
+            or sum(member.file_size for member in members) > size
+        ):
             raise ValueError("compressed, or larger than the file; expected plain arrays")
         for member in members:
             with archive.open(member) as array:
@@ -83,7 +86,9 @@ def check_arrays(
     arrays: Mapping[str, NDArray[np.generic]], forms: Mapping[str, ArrayForm], optional: Collection[str] = ()
 ) -> None:
     """Raise `ModelError` unless arrays have these names, types and shapes; those that are ``optional`` may be missing."""
-    if wrong := _find_wrong_form({name: (of.dtype.name, of.shape) for name, of in arrays.items()}, forms, optional):
+    if wrong := _find_wrong_form(
+        {name: (array.dtype.name, array.shape) for name, array in arrays.items()}, forms, optional
+    ):
         raise ModelError(f"contains the weights of another model: {wrong}; train the model again")
 
 
@@ -98,10 +103,10 @@ def _find_wrong_form(
         if name not in forms:
             return f"{name[:80]!r} is not of it"
         wanted = forms[name]
-        for of, length in zip(wanted[1], shape, strict=False):
-            if isinstance(of, str) and isinstance(length, int):
-                lengths.setdefault(of, length)
-        bound = tuple(lengths.get(of, of) if isinstance(of, str) else of for of in wanted[1])
+        for axis, length in zip(wanted[1], shape, strict=False):
+            if isinstance(axis, str) and isinstance(length, int):
+                lengths.setdefault(axis, length)
+        bound = tuple(lengths.get(axis, axis) if isinstance(axis, str) else axis for axis in wanted[1])
         if (dtype, shape) != (wanted[0], bound):
             return f"{name} is {shape} of {dtype}, expected {bound} of {wanted[0]}"
     return None

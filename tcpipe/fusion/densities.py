@@ -10,7 +10,7 @@
 - ``turns[role].white_rad2ps``: the variance of the angle grows by so much a second; ``bias``: Gauss-Markov error of the turn rate around
   its mean, in rad/s.
 
-``told`` is the share told by the data: 0 is only the prior, 1 only the data. Densities are never evidence against a sensor.
+``data_share`` is the share that the data determine: 0 is only the prior, 1 only the data. Densities are never evidence against a sensor.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Floats = NDArray[np.float64]
 class GaussMarkov:
     """A stationary process with covariance ``variance * exp(-|dt| / time_s)``; variance in the unit squared of what it errs in.
 
-    ``told``: share of the variance that the data tell; the rest is the prior's.
+    ``data_share``: share of the variance that the data determine; the rest is the prior's.
     """
 
     variance: float
     time_s: float
-    told: float = 0.0
+    data_share: float = 0.0
 
     def difference_variance(self, time_s: Floats) -> Floats:
         """Return the variance of the change over each time difference [s]: the structure function."""
@@ -62,14 +62,14 @@ class FixNoise:
     white_m2 : [m²], variance of the part that is independent from fix to fix.
     correlated : one Gauss-Markov process [m] whose structure function is nearest to the fitted sum of processes between 1 and 40 s.
     processes : the fitted processes themselves, by correlation time.
-    white_told : share of ``white_m2`` that the data tell.
+    white_data_share : share of ``white_m2`` that the data determine.
     """
 
     claimed_m2: float
     white_m2: float
     correlated: GaussMarkov
     processes: tuple[GaussMarkov, ...]
-    white_told: float = 0.0
+    white_data_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class OdometryNoise:
 
     velocity_m2ps: float
     scale: GaussMarkov
-    velocity_told: float = 0.0
+    velocity_data_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class TurnNoise:
 
     white_rad2ps: float
     bias: GaussMarkov
-    white_told: float = 0.0
+    white_data_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,9 +326,9 @@ class _Fit:
         if name not in self._names:
             return prior, 0.0
         row = self._names.index(name)
-        told = self._compute_data_share(np.eye(len(self._names))[row])
+        data_share = self._compute_data_share(np.eye(len(self._names))[row])
         fitted = float(self._variances[row])
-        return (fitted if told >= DETERMINED else max(fitted, prior)), told
+        return (fitted if data_share >= DETERMINED else max(fitted, prior)), data_share
 
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
         """Return the Gauss-Markov process that is nearest to the sum of those of these names.
@@ -341,14 +341,16 @@ class _Fit:
         factors = np.zeros(len(self._names))
         for tau, row, _ in parts:
             factors[row] = -2.0 * np.expm1(-_TOLD_S / tau)
-        told = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
+        data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         shape = np.zeros((_SUMMARY_S.size, len(self._names)))
         for tau, row, _ in parts:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
         unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
         fitted = shape @ self._variances + _CAUTION * unsure
-        untold = (self._longest_s < _SUMMARY_S) | (told < DETERMINED)
-        return _summarize(np.where(untold, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), told)
+        untold = (self._longest_s < _SUMMARY_S) | (data_share < DETERMINED)
+        return _summarize(
+            np.where(untold, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), data_share
+        )
 
     def find_parts(self, *names: str) -> list[tuple[float, int, float]]:
         """Return correlation time [s], row and variance of each process of these names."""
@@ -360,19 +362,19 @@ class _Fit:
         names = (f"{name} process", f"{name} moving")
         correlated = self.find_process(prior.correlated, *names)
         processes = tuple(GaussMarkov(variance, tau) for tau, _, variance in sorted(self.find_parts(*names)))
-        white, told = self.find_density(f"{name} white", prior.white_m2)
+        white, data_share = self.find_density(f"{name} white", prior.white_m2)
         white = max(white, _FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2)
-        return FixNoise(prior.claimed_m2, white, correlated, processes or prior.processes, told)
+        return FixNoise(prior.claimed_m2, white, correlated, processes or prior.processes, data_share)
 
     def find_odometry_noise(self, role: str, prior: OdometryNoise) -> OdometryNoise:
         """Return the noise of an odometry's velocity."""
-        density, told = self.find_density(f"{role} velocity", prior.velocity_m2ps)
-        return OdometryNoise(density, self.find_process(prior.scale, f"{role} scale"), told)
+        density, data_share = self.find_density(f"{role} velocity", prior.velocity_m2ps)
+        return OdometryNoise(density, self.find_process(prior.scale, f"{role} scale"), data_share)
 
     def find_turn_noise(self, role: str, prior: TurnNoise) -> TurnNoise:
         """Return the noise of a yaw rate."""
-        density, told = self.find_density(f"{role} turn", prior.white_rad2ps)
-        return TurnNoise(density, self.find_process(prior.bias, f"{role} bias"), told)
+        density, data_share = self.find_density(f"{role} turn", prior.white_rad2ps)
+        return TurnNoise(density, self.find_process(prior.bias, f"{role} bias"), data_share)
 
 
 def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
@@ -418,13 +420,15 @@ def _find_fix_prior(name: str, horizontal: FixNoise, vertical: FixNoise) -> tupl
     if kind == "moving":
         return 0.0, _MOVING * fixes.claimed_m2
     usual, usual_std = _share_process(fixes.correlated, float(time_s), FIX_S), _ONE_TIME * fixes.claimed_m2
-    told = vertical.correlated.told
-    if axis == "up" or told <= 0.0:
+    data_share = vertical.correlated.data_share
+    if axis == "up" or data_share <= 0.0:
         return usual, usual_std
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
     alike = ratio * sum(each.variance for each in vertical.processes if each.time_s == float(time_s))
     total = max(ratio * sum(each.variance for each in vertical.processes), horizontal.correlated.variance)
-    return told * alike + (1.0 - told) * usual, told * _UNLIKE * total + (1.01 - told) * usual_std
+    return data_share * alike + (1.0 - data_share) * usual, data_share * _UNLIKE * total + (
+        1.01 - data_share
+    ) * usual_std
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:
@@ -439,14 +443,14 @@ def _share_process(process: GaussMarkov, tau_s: float, taus_s: Sequence[float]) 
     return float(process.variance * max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
 
 
-def _summarize(structure: Floats, told: float) -> GaussMarkov:
+def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
     """Return the process whose structure function is nearest to one at `_SUMMARY_S`, in the logarithm."""
     if not (structure > 0.0).all():
-        return GaussMarkov(0.0, _TOLD_S, told)
+        return GaussMarkov(0.0, _TOLD_S, data_share)
     shape = -2.0 * np.expm1(-_SUMMARY_S / _SUMMARY_TAU_S[:, None])
     ratio = np.log(structure / shape)
     best = int(np.argmin(ratio.std(1)))
-    return GaussMarkov(float(np.exp(ratio[best].mean())), float(_SUMMARY_TAU_S[best]), told)
+    return GaussMarkov(float(np.exp(ratio[best].mean())), float(_SUMMARY_TAU_S[best]), data_share)
 
 
 def make_prior_model(measurements: Measurements) -> NoiseModel:
@@ -516,16 +520,20 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
     for name, fixes in ((GNSS, noise.horizontal), (f"{GNSS} height", noise.vertical)):
         if fixes is not None:
             correlated = fixes.correlated.difference_variance(_TIME_S)
-            fitted = [(2.0 * fixes.white_m2 + 0.0 * _TIME_S, fixes.white_told), (correlated, fixes.correlated.told)]
+            fitted = [
+                (2.0 * fixes.white_m2 + 0.0 * _TIME_S, fixes.white_data_share),
+                (correlated, fixes.correlated.data_share),
+            ]
             found[name] = _make_facts("m", fitted, 2.0 * fixes.claimed_m2 + 0.0 * _TIME_S)
     for role, odometry in m.odometries().items():
         speed_mps, own = np.abs(odometry.velocity_mps[:, 0]), noise.odometries[role]
         driving = speed_mps > _DRIVING_MPS
         usual_mps = float(np.median(speed_mps[driving])) if driving.any() else 0.0
         scales = [
-            (usual_mps**2 * each.integral_variance(_TIME_S), each.told) for each in (own.scale, noise.shared_scale)
+            (usual_mps**2 * each.integral_variance(_TIME_S), each.data_share)
+            for each in (own.scale, noise.shared_scale)
         ]
-        fitted = [(own.velocity_m2ps * _TIME_S, own.velocity_told), *scales]
+        fitted = [(own.velocity_m2ps * _TIME_S, own.velocity_data_share), *scales]
         found[role] = _make_facts("m", fitted, _sum_white(odometry.stamp_ns, odometry.variance_m2ps2[:, 0]))
     for role, turns in noise.turns.items():
         if role == IMU and m.imu is not None:
@@ -533,8 +541,8 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
         else:
             claimed = _sum_white(m.odometries()[role].stamp_ns, m.odometries()[role].yaw_rate_var)
         fitted = [
-            (turns.white_rad2ps * _TIME_S, turns.white_told),
-            (turns.bias.integral_variance(_TIME_S), turns.bias.told),
+            (turns.white_rad2ps * _TIME_S, turns.white_data_share),
+            (turns.bias.integral_variance(_TIME_S), turns.bias.data_share),
         ]
         found[f"{role} turn"] = _make_facts("rad", fitted, claimed)
     return found

@@ -496,8 +496,8 @@ def _make_facts(  # noqa: PLR0917
         verdicts[role] = np.concatenate([tests.verdict[rows[kind][1], kind] for kind in kinds])
     return StretchFacts(
         nis_mean=nis,
-        measurements={role: int(of.size) for role, of in verdicts.items()},
-        rejected={role: int((of == REJECTED).sum()) for role, of in verdicts.items()},
+        measurements={role: int(verdict.size) for role, verdict in verdicts.items()},
+        rejected={role: int((verdict == REJECTED).sum()) for role, verdict in verdicts.items()},
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,

@@ -113,8 +113,8 @@ class BodyVelocities:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """Axes along which most rows have a velocity, shape (3,)."""
-        told: NDArray[np.bool_] = (self.variance_m2ps2 < _UNMEASURED_M2PS2).mean(0) > 0.5
-        return told
+        is_measured: NDArray[np.bool_] = (self.variance_m2ps2 < _UNMEASURED_M2PS2).mean(0) > 0.5
+        return is_measured
 
 
 @dataclass(frozen=True, slots=True)

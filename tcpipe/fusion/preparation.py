@@ -375,12 +375,12 @@ def _iterate_slices(rows: int) -> Iterator[slice]:
 
 def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
     """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it has none."""
-    told = [columns[f"quat_{c}"] for c in "xyzw"]
-    if any(np.isnan(component).all() for component in told):
+    components = [columns[f"quat_{c}"] for c in "xyzw"]
+    if any(np.isnan(component).all() for component in components):
         return np.broadcast_to(np.nan, (usable.size, 4))
     found = np.empty((usable.size, 4))
     for piece in _iterate_slices(usable.size):
-        unit = normalize(np.stack([component[usable[piece]] for component in told], -1))
+        unit = normalize(np.stack([component[usable[piece]] for component in components], -1))
         found[piece] = multiply(unit, invert(quat_xyzw))
     return found
 
@@ -504,15 +504,17 @@ def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, qua
     """
     known = np.isfinite(velocity_mps[:, :2]).all(1) & np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1)
     stamp, place, quat = stamp_ns[known], pose_m[known, :2], quat_xyzw[known]
-    told = np.nan_to_num(velocity_mps[known])
+    measured_mps = np.nan_to_num(velocity_mps[known])
     step_s = np.diff(stamp) * 1e-9
     good = (step_s > 0) & (step_s <= _MAX_INCREMENT_S)
     way = np.diff(place, axis=0)[good] / step_s[good, None]
     moving = np.linalg.norm(way, axis=1) > _MOVES_MPS
     if moving.sum() < _FEWEST:
         return False
-    turned = rotate(quat, told)
-    as_told, as_turned = (_compute_misfit((v[1:] + v[:-1])[good, :2] / 2.0, way, moving) for v in (told, turned))
+    turned = rotate(quat, measured_mps)
+    as_told, as_turned = (
+        _compute_misfit((v[1:] + v[:-1])[good, :2] / 2.0, way, moving) for v in (measured_mps, turned)
+    )
     return as_told < _FITS and as_turned > _FITS_NOT
 
 

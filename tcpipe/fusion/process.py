@@ -84,8 +84,8 @@ def is_gliding(measurements: Measurements) -> bool:
 
 def is_turned_by_course(measurements: Measurements) -> bool:
     """Return whether only the course over ground shows how the robot turns."""
-    told = measurements.imu is not None or turn_sources(measurements)
-    return not told and measurements.gnss is not None and not is_gliding(measurements)
+    has_turn_sensor = measurements.imu is not None or turn_sources(measurements)
+    return not has_turn_sensor and measurements.gnss is not None and not is_gliding(measurements)
 
 
 def _compute_fix_velocity_std_mps(gnss: Positions) -> float:
@@ -114,9 +114,9 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
         return None
     slope = ((up[rows:] - up[:-rows]) / np.maximum(way_m, _CHORD_M))[climbs].clip(-_STEEPEST, _STEEPEST)
     noise = float(2.0 * np.median(gnss.variance_m2[:, 2]) / np.median(way_m[climbs]) ** 2)
-    told = float(np.mean(slope**2)) - noise
+    excess = float(np.mean(slope**2)) - noise
     slopes_seen = max(1.0, float(np.sum(way_m[climbs])) / rows / _SLOPE_LASTS_M)
-    return float(np.sqrt(told)) * (1.0 + float(np.sqrt(0.5 / slopes_seen))) if told > noise else None
+    return float(np.sqrt(excess)) * (1.0 + float(np.sqrt(0.5 / slopes_seen))) if excess > noise else None
 
 
 def level_stds_rad(measurements: Measurements) -> tuple[float, float]:

@@ -113,15 +113,15 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         at, values, variances = at[inside], values[inside], variances[inside]
         offset_s = (source_ns[inside] - stamp_ns[at]) * 1e-9
         count = np.bincount(at, minlength=size)
-        told, width = count > 0, values.shape[1]
+        has_samples, width = count > 0, values.shape[1]
 
-        def mean(of: Floats) -> Floats:
-            return np.bincount(at, of, size)[told] / count[told]
+        def mean(values_: Floats) -> Floats:
+            return np.bincount(at, values_, size)[has_samples] / count[has_samples]
 
         for axis in range(width):
-            value[told, kind, axis] = mean(values[:, axis])
-            variance[told, kind, axis] = mean(variances[:, axis]) / count[told]
-        tau[told, kind] = mean(offset_s)
+            value[has_samples, kind, axis] = mean(values[:, axis])
+            variance[has_samples, kind, axis] = mean(variances[:, axis]) / count[has_samples]
+        tau[has_samples, kind] = mean(offset_s)
 
     for kind, role, source in ((state.WHEELS, WHEELS, m.wheels), (state.VISUAL, VISUAL, m.visual)):
         if source is not None:
@@ -213,7 +213,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     relative = claimed[:, 0] / np.median(claimed[:, 0])
     of_run, scatter = noise.odometries[role], _estimate_scatter(source.velocity_mps[:, 0])
     density = max(of_run.velocity_m2ps, _LEAST_M2PS)
-    if of_run.velocity_told < DETERMINED:  # what is claimed beyond the scatter of the samples lasts
+    if of_run.velocity_data_share < DETERMINED:  # what is claimed beyond the scatter of the samples lasts
         density = max(density, _LASTING_S * (float(np.median(claimed[:, 0])) - scatter))
     found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
     for axis in range(1, 3):

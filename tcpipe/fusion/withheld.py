@@ -196,7 +196,7 @@ def compare_fixes(
         second = (fixes.stamp_ns[inside] - start_ns) // 1_000_000_000
         inside = inside[np.unique(second, return_index=True)[1]]
         ends = [np.searchsorted(fixes.stamp_ns, start_ns, "right") - 1, np.searchsorted(fixes.stamp_ns, end_ns)]
-        at_s, ends_s = (compute_seconds(fixes.stamp_ns[of], start_ns) for of in (inside, ends))
+        at_s, ends_s = (compute_seconds(fixes.stamp_ns[rows], start_ns) for rows in (inside, ends))
         line = [np.interp(at_s, ends_s, fixes.position_enu_m[ends, axis]) for axis in (0, 1)]
         straight.append(np.hypot(*(np.stack(line) - fixes.position_enu_m[inside, :2].T)))
         chosen.append(inside)

@@ -103,7 +103,9 @@ def _fit_baselines(
 
 def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[Samples, Predictor, Prediction]:
     """Return a fitted kind, and what the other folds say of each sample; NaN where these are too few, which centres nothing."""
-    turn = tuple(of.name for of in available_features(read_extra_features(train)) if of.name == "turn_radpm")
+    turn = tuple(
+        feature.name for feature in available_features(read_extra_features(train)) if feature.name == "turn_radpm"
+    )
     if kind.features is None:  # trees take the turn, but not the commanded speed
         kind = type(kind.__name__, (kind,), {"features": turn})
     split = train.with_channels(*kind.channels) if kind.channels else train
@@ -165,11 +167,11 @@ def describe_ratios(found: Sequence[BaselineResult]) -> list[str]:
     lines = []
     for split in SPLITS:
         for quantity, called in (("E", "energy E"), ("T", "time T")):
-            if (of := rank_model(found, split, quantity)) is not None:
-                ratio, groups = of.best.rmse_ratio, f"{of.best.groups} {of.best.drawn_by}"
+            if (rank := rank_model(found, split, quantity)) is not None:
+                ratio, groups = rank.best.rmse_ratio, f"{rank.best.groups} {rank.best.drawn_by}"
                 few = f"{groups} are too few for an interval"
                 interval = few if ratio.low is None else f"95 % CI {ratio.low:.2f} to {ratio.high:.2f}, {groups}"
-                best = f"RMSE ratio to '{of.best.baseline}', the best baseline, {ratio.value:.2f}"
+                best = f"RMSE ratio to '{rank.best.baseline}', the best baseline, {ratio.value:.2f}"
                 lines.append(f"{split}, {called}: {best} ({interval})")
     return lines
 
@@ -223,7 +225,11 @@ def make_energy_table(
                 PER_CLASS
             ].keys()
             networks[GRASS_ONLY] = {class_id: networks[PER_CLASS][class_id] for class_id in grass}
-    known = set.intersection(*(set(of) for name, of in networks.items() if name != GRASS_ONLY)) if networks else set()
+    known = (
+        set.intersection(*(set(class_names) for name, class_names in networks.items() if name != GRASS_ONLY))
+        if networks
+        else set()
+    )
     errors, results = dict[str, dict[str, Errors]](), list[BaselineResult]()
     for split, part in sets.items():
         rows = np.flatnonzero(np.isin(part.class_ids, list(known)) | (not known))

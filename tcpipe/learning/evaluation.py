@@ -152,7 +152,9 @@ def evaluate(
     )
     findings = (*lacking, *_find_mismatches(ours, data, sets, energy), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
-    return evaluation, make_predictions_table(sets, {name: of.costs for name, of in said.items()}, spreads)
+    return evaluation, make_predictions_table(
+        sets, {name: predicted.costs for name, predicted in said.items()}, spreads
+    )
 
 
 def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:
@@ -325,9 +327,9 @@ def _find_large_errors(part: SplitErrors, subject: Subject) -> Iterator[Finding]
         if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
             yield make_finding(f"{name}-far-off", subject, error_fraction=error)
     overall = (part.errors["E"][ALL].mape_percent or 0.0) / 100.0
-    for class_name, of in part.errors["E"].items():
-        error, names = (of.mape_percent or 0.0) / 100.0, {"split": subject.name}
-        is_counted = class_name != ALL and of.mape_count >= read_threshold("class-far-off", "min_sample_count")
+    for class_name, scores in part.errors["E"].items():
+        error, names = (scores.mape_percent or 0.0) / 100.0, {"split": subject.name}
+        is_counted = class_name != ALL and scores.mape_count >= read_threshold("class-far-off", "min_sample_count")
         if is_counted and error > read_threshold("class-far-off", "min_error_ratio") * overall > 0.0:
             of_class = Subject("class", class_name)
             yield make_finding("class-far-off", of_class, names=names, error_fraction=error, overall_fraction=overall)
@@ -336,15 +338,15 @@ def _find_large_errors(part: SplitErrors, subject: Subject) -> Iterator[Finding]
 def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
     """Yield that the model does not beat curves over class and slope, and of energy that it does not beat the best baseline."""
     for name, quantity in _QUANTITIES.items():
-        of = rank_model(found.baselines, subject.name, quantity)
-        if of is None:
+        rank = rank_model(found.baselines, subject.name, quantity)
+        if rank is None:
             continue
-        if of.beats_curves is False and found.model.training.kind not in CURVES:
+        if rank.beats_curves is False and found.model.training.kind not in CURVES:
             yield make_finding(f"{name}-no-better-than-curves", subject)
-        if quantity == "E" and not of.beats_all:
-            best, ratio = of.best.baseline, of.best.rmse_ratio.value or 0.0
+        if quantity == "E" and not rank.beats_all:
+            best, ratio = rank.best.baseline, rank.best.rmse_ratio.value or 0.0
             kind = next(kind for kind, baseline in BASELINE_OF_KIND.items() if baseline == best)
-            is_other = of.is_worse and kind != found.model.training.kind
+            is_other = rank.is_worse and kind != found.model.training.kind
             remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
             names = {"baseline": best}
             yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)

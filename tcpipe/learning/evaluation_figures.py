@@ -156,7 +156,9 @@ def make_slope_section(table: pa.Table) -> Section:
     """Return the RMSE of E by split, class and range of slope, as a heat map."""
     part = table.filter(pc.is_valid(table.column("slope_rad")))
     off, ranges = compute_errors_joule(part), find_slope_ranges(to_floats(part, "slope_rad"))
-    energy, low, high = (to_floats(part, make_column_name("E", of)) for of in ("", "predicted_low", "predicted_high"))
+    energy, low, high = (
+        to_floats(part, make_column_name("E", kind)) for kind in ("", "predicted_low", "predicted_high")
+    )
     is_outside = (energy < low) | (energy > high)
     splits, classes = (to_texts(part.column(name)) for name in ("split", "terrain_name"))
     lines = list(dict.fromkeys(zip(splits.tolist(), classes.tolist(), strict=True)))

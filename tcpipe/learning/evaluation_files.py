@@ -51,12 +51,14 @@ class EvaluationResult:
         lines = list[str]()
         for split, part in self.values.splits.items():
             figures = (
-                f"{quantity} {of.mape_percent or float('nan'):.2f} % ({of.mape_count})"
-                for quantity, of in ((quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES)
+                f"{quantity} {error.mape_percent or float('nan'):.2f} % ({error.mape_count})"
+                for quantity, error in ((quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES)
             )
             lines.append(f"{split}: {part.samples} samples, MAPE (of so many labels) {', '.join(figures)}")
             lines += [
-                f"{split}: 90 % intervals of {name} cover {of}" for name, of in part.coverage.items() if name in "TE"
+                f"{split}: 90 % intervals of {name} cover {coverage}"
+                for name, coverage in part.coverage.items()
+                if name in "TE"
             ]
             lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
@@ -104,8 +106,8 @@ def run_evaluation(
         write_json(place / JSON, found)  # last: with it the evaluation is whole
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
     name = values.dataset.name
-    of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
-    lead = f"Model {Path(model).name} on dataset {name}: errors of time T and energy E{of}."
+    note = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
+    lead = f"Model {Path(model).name} on dataset {name}: errors of time T and energy E{note}."
     samples = read_evaluated_samples(place, dataset)
     write_text(
         place / PAGE,
@@ -139,7 +141,7 @@ def _make_key(
     model: str | Path, dataset: str | Path, config: EvaluateConfig, own: list[str], *, simulated: bool
 ) -> str:
     """Return what tells one evaluation from another."""
-    told = [
+    lines = [
         seal_document(read_model_card(fetch_directory(model))),
         compute_dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
         asdict(config),
@@ -147,7 +149,7 @@ def _make_key(
         __version__,
         *own,
     ]
-    return digest(told)
+    return digest(lines)
 
 
 ADAPTATION = "adaptation.json"

@@ -127,8 +127,8 @@ def _make_baselines_section(found: Evaluation) -> Section:
             f"RMSE of {quantity}: model over baseline",
             [
                 (f"{split}: {name}", astuple(row.rmse_ratio))
-                for (name, split, of), row in by_cell.items()
-                if of == quantity
+                for (name, split, row_quantity), row in by_cell.items()
+                if row_quantity == quantity
             ],
         )
         for quantity in ("E", "T")

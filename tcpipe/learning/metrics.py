@@ -96,7 +96,7 @@ def _compute_scores(off: Array, measured: Array, spread: Spread) -> tuple[float,
     return 100.0 * float(held.mean()), float(nll.mean()), float(crps.mean())
 
 
-_SCORES = tuple(of.name for of in fields(Errors))[4:]
+_SCORES = tuple(entry.name for entry in fields(Errors))[4:]
 
 
 def average_draws(draws: Iterable[Errors]) -> Errors:

@@ -185,7 +185,7 @@ def format_readme(card: ModelCard) -> str:
         outputs=", ".join(card.inputs.outputs), chord=f"{card.chord_m:g}", px=card.inputs.patch_px,
         depth=len(card.inputs.planes), channels=", ".join(card.inputs.channels), patch=f"{card.inputs.patch_m:g}",
         velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
-        extra_features=", ".join(f"{of.name} (usually {of.usual:.3g})" for of in card.inputs.extra_features),
+        extra_features=", ".join(f"{feature.name} (usually {feature.usual:.3g})" for feature in card.inputs.extra_features),
         includes="; ".join(map(_escape_markdown, card.label_includes)), robot=card.robot,
         config=card.training.config, about=find_kind(card.training.kind).about, told=card.training,
         dataset=dataset, classes=", ".join(counts),

@@ -84,7 +84,7 @@ class Model:
     @property
     def takes_turns(self) -> bool:
         """Whether it is told how far a metre turns, and its predictions hold what that costs."""
-        return any(of.name == "turn_radpm" for of in self.card.inputs.extra_features)
+        return any(feature.name == "turn_radpm" for feature in self.card.inputs.extra_features)
 
     @cached_property
     def errors(self) -> dict[str, Errors] | None:
@@ -123,8 +123,8 @@ class Model:
         class_id = np.zeros(len(patches), np.int64) if features is None else features.class_id
         stated = np.sqrt(np.diagonal(said.covariance, axis1=1, axis2=2)).T
         std = np.stack([
-            errors[name].compute_std(value, class_id, of)
-            for name, value, of in zip(("power", "velocity"), said.mean.T, stated, strict=True)
+            errors[name].compute_std(value, class_id, stated_std)
+            for name, value, stated_std in zip(("power", "velocity"), said.mean.T, stated, strict=True)
         ])  # fmt: skip
         covariance = std.T[:, :, None] * std.T[:, None, :]
         covariance[:, [0, 1], [1, 0]] *= estimate_correlation(self.residuals)
@@ -194,7 +194,7 @@ def choose_model(
 
 def set_speed(model: Model, speed_mps: float) -> Model:
     """Return the model asked for a commanded speed [m/s] instead of the usual one; `UsageError` if it knows no such speed."""
-    command = next((of for of in model.card.inputs.extra_features if of.name == "command_mps"), None)
+    command = next((feature for feature in model.card.inputs.extra_features if feature.name == "command_mps"), None)
     if command is None:
         raise UsageError(
             f"{model.name}: has no input for the commanded speed; remove --speed, or train it with --extra-features"
@@ -205,7 +205,8 @@ def set_speed(model: Model, speed_mps: float) -> Model:
             f"--speed {speed_mps:g}: {model.name} was trained at commanded speeds of {low:.3g} to {high:.3g} m/s; give one of these"
         )
     extra_features = tuple(
-        replace(of, usual=speed_mps) if of is command else of for of in model.card.inputs.extra_features
+        replace(feature, usual=speed_mps) if feature is command else feature
+        for feature in model.card.inputs.extra_features
     )
     card = replace(model.card, inputs=replace(model.card.inputs, extra_features=extra_features))
     return replace(model, card=card, checksum=digest([model.checksum, speed_mps]))

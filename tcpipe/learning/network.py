@@ -100,7 +100,7 @@ class Network(nn.Module):
 
     def _list_weights(self) -> dict[str, Any]:
         """Return a view of every weight, without the count of batches that no fixed share asks for."""
-        own = {name: of for name, of in self.state_dict().items() if not name.endswith("num_batches_tracked")}
+        own = {name: weight for name, weight in self.state_dict().items() if not name.endswith("num_batches_tracked")}
         return {_make_weight_name(name): _reorder_axes(value) for name, value in own.items()}
 
 

@@ -83,9 +83,11 @@ def _load_file(source: str, path: Path, name: str) -> OwnKind:
     # Bytecode in a cache may be of an earlier file: what runs is what the digest is of.
     with report_errors(source):
         exec(compile(code, module.__file__, "exec"), vars(module))  # noqa: S102  the user names this file
-    own = {key: of for key, of in vars(module).items() if getattr(of, "__module__", "") == module.__name__}
+    own = {key: item for key, item in vars(module).items() if getattr(item, "__module__", "") == module.__name__}
     models = {
-        key: of for key, of in own.items() if hasattr(of, "predict") or (inspect.isfunction(of) and key == "predict")
+        key: item
+        for key, item in own.items()
+        if hasattr(item, "predict") or (inspect.isfunction(item) and key == "predict")
     }
     if name:
         models = {name: getattr(module, name)} if hasattr(module, name) else {}

@@ -85,12 +85,12 @@ class PhysicsModel(Predictor):
         del inputs
         check_arrays(arrays, {**_FORMS, **list_curve_arrays(1)}, optional=("drivetrain_newton",))
         speed, rest = read_curves("linear", arrays)
-        if not all(np.isfinite(of).all() for of in rest.values()):
+        if not all(np.isfinite(values).all() for values in rest.values()):
             raise ModelError("contains coefficients that are not finite; train the model again")
         return cls(speed, **{"drivetrain_newton": np.array(0.0), **rest})
 
 
-_NUMBERS = tuple(of.name for of in fields(PhysicsModel) if of.name != "speed")
+_NUMBERS = tuple(entry.name for entry in fields(PhysicsModel) if entry.name != "speed")
 
 
 _FORMS: Mapping[str, ArrayForm] = {
@@ -135,8 +135,8 @@ def find_idle_power(split: Split) -> float | None:
 
 
 def _evaluate_all(found: Physics, term: str) -> Floats:
-    told = found.of(term)
-    return np.array(0.0 if told is None else told[0])
+    coefficient = found.of(term)
+    return np.array(0.0 if coefficient is None else coefficient[0])
 
 
 def _collect_by_class(found: Physics, term: str) -> Floats:
@@ -203,7 +203,7 @@ def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]]) -> tuple[Curves,
     functions = (
         _evaluate_functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
     )
-    finite = all(np.isfinite(of).all() for of in (curves.knots_rad, curves.pooled, curves.own))
+    finite = all(np.isfinite(values).all() for values in (curves.knots_rad, curves.pooled, curves.own))
     if len(curves.pooled) != functions or not finite or len(curves.class_id) > _MOST_CLASSES:
         raise ModelError("contains curves that no training makes; train the model again")
     return curves, rest

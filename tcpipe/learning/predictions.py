@@ -47,27 +47,27 @@ class Measured:
     def take(self, rows: NDArray[np.int64]) -> Measured:
         """Return some of the samples."""
         costs, deviations, own_deviations = (
-            {name: values[rows] for name, values in of.items()}
-            for of in (self.costs, self.deviations, self.own_deviations)
+            {name: values[rows] for name, values in quantities.items()}
+            for quantities in (self.costs, self.deviations, self.own_deviations)
         )
         return Measured(self.split.take(rows), costs, deviations, own_deviations, self.class_ids[rows], self.names)
 
 
 def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     """Return what was measured, with the names of classes by id; samples without a label are left out."""
-    of = split.energy
-    with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column(of.energy).astype(np.float64))
+    energy = split.energy
+    with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column(energy.energy).astype(np.float64))
     chosen = split.take(with_label)
     labels = chosen.labels.astype(np.float64)
-    std = {"w": of.power_std, "v": "velocity_std_mps", "T": "duration_std_s", "E": of.energy_std}
+    std = {"w": energy.power_std, "v": "velocity_std_mps", "T": "duration_std_s", "E": energy.energy_std}
     deviations = {cost: chosen.column(name).astype(np.float64) for cost, name in std.items()}
     own_deviations = {cost: chosen.own_std(name) for cost, name in std.items()}
-    plain = {name: chosen.column(name).astype(np.float64) for name in ("duration_s", of.energy, "terrain_class")}
+    plain = {name: chosen.column(name).astype(np.float64) for name in ("duration_s", energy.energy, "terrain_class")}
     class_ids = np.nan_to_num(plain["terrain_class"], nan=_UNKNOWN[0]).astype(np.int64)
     known = dict([_UNKNOWN, *names.items()])
     return Measured(
         chosen,
-        {"w": labels[:, 0], "v": labels[:, 1], "T": plain["duration_s"], "E": plain[of.energy]},
+        {"w": labels[:, 0], "v": labels[:, 1], "T": plain["duration_s"], "E": plain[energy.energy]},
         deviations,
         own_deviations,
         class_ids,
@@ -103,12 +103,12 @@ class Predicted:
         if not is_energy:
             of_metre = propagate_stated(np.column_stack([power, velocity]), said.covariance)
             stated = {name: of_metre[CALLED[name]] * (chord_m if name in "TE" else 1.0) for name in names}
-        return cls(*({name: of[name] for name in names} for of in (costs, uncentred, stated)))
+        return cls(*({name: values[name] for name in names} for values in (costs, uncentred, stated)))
 
     def take(self, rows: NDArray[np.int64]) -> Predicted:
         """Return some of the samples."""
-        parts = (getattr(self, of.name) for of in fields(self))
-        return Predicted(*({name: values[rows] for name, values in of.items()} for of in parts))
+        parts = (getattr(self, entry.name) for entry in fields(self))
+        return Predicted(*({name: values[rows] for name, values in part.items()} for part in parts))
 
 
 def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)) -> Predicted:
@@ -169,25 +169,26 @@ def check_origin(card: ModelCard, data: Dataset, name: str) -> None:
 
 def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = False) -> None:
     """Raise an error with every reason for which a model cannot be asked about a dataset, of another robot too if that may be."""
-    told = data.card
+    dataset_card = data.card
     problems = [
-        f"classes: in the model {clause}" for clause in ClassTable(card.classes).differences(read_class_table(told))
+        f"classes: in the model {clause}"
+        for clause in ClassTable(card.classes).differences(read_class_table(dataset_card))
     ]
     same = (
-        ("patch_px", card.inputs.patch_px, told.patch_px),
-        ("patch_m", card.inputs.patch_m, told.patch_m),
-        ("segment.chord_m", card.chord_m, told.recipe.segment.chord_m),
-        ("label.velocity", card.label_velocity, told.label.velocity),
-        *(() if any_robot else (("robot", card.robot, ", ".join(told.robots)),)),
+        ("patch_px", card.inputs.patch_px, dataset_card.patch_px),
+        ("patch_m", card.inputs.patch_m, dataset_card.patch_m),
+        ("segment.chord_m", card.chord_m, dataset_card.recipe.segment.chord_m),
+        ("label.velocity", card.label_velocity, dataset_card.label.velocity),
+        *(() if any_robot else (("robot", card.robot, ", ".join(dataset_card.robots)),)),
     )
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
-    if len(card.inputs.outputs) != len(told.label.columns):
+    if len(card.inputs.outputs) != len(dataset_card.label.columns):
         problems.append(
-            f"it predicts only {', '.join(card.inputs.outputs)}, expected {' and '.join(told.label.columns)}"
+            f"it predicts only {', '.join(card.inputs.outputs)}, expected {' and '.join(dataset_card.label.columns)}"
         )
-    absent = [name for name in card.layout.layers if name not in told.layers]
+    absent = [name for name in card.layout.layers if name not in dataset_card.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:
         raise ModelError(*(f"{name} does not fit {data.path}: {problem}" for problem in problems))
@@ -203,23 +204,35 @@ def collect_runs(model: Model, data: Dataset) -> list[Run]:
         parts.append(
             {name: part.split.column(name) for name in ("run_id", "start_ns", "arc_length_m")}
             | {name: getattr(features, name) for name in ("class_id", "slope_rad", "turn_radpm")}
-            | {f"{what} {q}": of[q] for what, of in (("measured", part.costs), ("predicted", said.costs)) for q in "TE"}
+            | {
+                f"{what} {q}": costs[q]
+                for what, costs in (("measured", part.costs), ("predicted", said.costs))
+                for q in "TE"
+            }
         )
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order, found = np.lexsort((columns["start_ns"], columns["run_id"].astype(np.str_))), list[Run]()
     columns = {name: values[order] for name, values in columns.items()}
     for run in np.unique(columns["run_id"]).tolist():
         here = columns["run_id"] == run
-        of = {name: values[here].astype(np.float64) for name, values in columns.items() if name != "run_id"}
-        step_m = np.diff(of["start_ns"]) * 1e-9 * (of["arc_length_m"] / of["measured T"])[:-1]
-        length_m = of["arc_length_m"]
+        run_columns = {name: values[here].astype(np.float64) for name, values in columns.items() if name != "run_id"}
+        step_m = (
+            np.diff(run_columns["start_ns"]) * 1e-9 * (run_columns["arc_length_m"] / run_columns["measured T"])[:-1]
+        )
+        length_m = run_columns["arc_length_m"]
         metres = {
             CALLED[q]: Metres(
-                of[f"predicted {q}"], of[f"measured {q}"], of["class_id"].astype(np.int64), np.insert(np.cumsum(step_m), 0, 0.0),
-                length_m, of["predicted T"], length_m * np.tan(of["slope_rad"]), of["turn_radpm"] * length_m,
+                run_columns[f"predicted {q}"],
+                run_columns[f"measured {q}"],
+                run_columns["class_id"].astype(np.int64),
+                np.insert(np.cumsum(step_m), 0, 0.0),
+                length_m,
+                run_columns["predicted T"],
+                length_m * np.tan(run_columns["slope_rad"]),
+                run_columns["turn_radpm"] * length_m,
             )
             for q in "TE"
-        }  # fmt: skip
+        }
         found.append(Run(str(run), metres))
     return found
 
@@ -255,7 +268,7 @@ def make_predictions_table(
     sets: Mapping[str, Measured], said: Mapping[str, Mapping[str, Array]], spreads: Mapping[str, Mapping[str, Spread]]
 ) -> pa.Table:
     """Return one row a labelled sample: what was measured, what a model said, and how sure it was; null where it did not say."""
-    fields = [of.field() for of in _KEYS]
+    fields = [column.field() for column in _KEYS]
     fields += [
         Column(make_column_name(q, part), pa.float64(), UNITS[q], doc, nullable=True).field()
         for q in QUANTITIES
@@ -272,11 +285,11 @@ def make_predictions_table(
             "slope_rad": found.split.column("slope_rad").astype(np.float64),
         }
         values = {
-            make_column_name(q, part): of
+            make_column_name(q, part): columns
             for q in QUANTITIES
-            for part, of in zip(_PARTS, _iterate_parts(found, said[name], spreads[name], q), strict=True)
+            for part, columns in zip(_PARTS, _iterate_parts(found, said[name], spreads[name], q), strict=True)
         }
-        arrays = [pa.array((keys | values)[of.name], of.type, from_pandas=True) for of in schema]
+        arrays = [pa.array((keys | values)[field.name], field.type, from_pandas=True) for field in schema]
         parts.append(pa.Table.from_arrays(arrays, schema=schema))
     return pa.concat_tables(parts)
 

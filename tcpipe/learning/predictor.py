@@ -83,7 +83,7 @@ class Prediction:
     @classmethod
     def concatenate(cls, parts: Sequence[Prediction]) -> Prediction:
         """Return predictions one after another."""
-        return cls(np.concatenate([of.mean for of in parts]), np.concatenate([of.covariance for of in parts]))
+        return cls(np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts]))
 
     def take(self, rows: NDArray[np.bool_]) -> Prediction:
         """Return some of them."""

@@ -84,9 +84,9 @@ class ResidualModel(Predictor):
 
         outputs = len(inputs.outputs)
         forms = {**list_curve_arrays(outputs), "scale": ("float64", (outputs,))}
-        weights = {name: of for name, of in arrays.items() if name not in forms}
+        weights = {name: array for name, array in arrays.items() if name not in forms}
         network = load_network(SmallNetwork, inputs.depth, outputs, arrays=weights)
-        rest = {name: of for name, of in arrays.items() if name in forms}
+        rest = {name: array for name, array in arrays.items() if name in forms}
         check_arrays(rest, forms)
         curves, rest = read_curves("linear", rest)
         return cls(curves, cast("SmallNetwork", network), rest["scale"], inputs)

@@ -186,7 +186,7 @@ class Forest:
                 f"trees of {self.feature.max() + 1} features or more, got {features.shape[1]}; train the model again"
             )
         out = np.zeros((len(features), int(self.output.max()) + 1))
-        _descend(np.ascontiguousarray(features), *(getattr(self, of.name) for of in fields(self)), out)
+        _descend(np.ascontiguousarray(features), *(getattr(self, entry.name) for entry in fields(self)), out)
         return out
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -243,13 +243,13 @@ def grow(
         errors, by_fold = np.zeros(most), []
         for fold in np.unique(folds):
             held = folds == fold
-            told: dict[str, dict[str, list[float]]] = {}
+            scores: dict[str, dict[str, list[float]]] = {}
             data = lightgbm.Dataset(features[~held], label[~held], weight=weight[~held])
             other = lightgbm.Dataset(features[held], label[held], weight=weight[held], reference=data)
             by_fold.append((held, lightgbm.train(
-                rules, data, most, valid_sets=[other], callbacks=[lightgbm.record_evaluation(told)]
+                rules, data, most, valid_sets=[other], callbacks=[lightgbm.record_evaluation(scores)]
             )))  # fmt: skip
-            found = told["valid_0"]["l2"]  # ends where nothing can be split
+            found = scores["valid_0"]["l2"]  # ends where nothing can be split
             errors += weight[held].sum() * np.array(found + found[-1:] * (most - len(found)))
         rounds = int(np.argmin(errors)) + 1
         for held, booster in by_fold:
@@ -358,10 +358,10 @@ def fit_table(
     config : settings of LightGBM.
     """
     slope_rad, class_id = find_slope_and_class(features, channels, class_count)
-    told = cross_fit_curves(slope_rad, class_id, labels, folds)
-    forest, held_out = grow(features, labels - told, weights, folds, config)
+    curve_labels = cross_fit_curves(slope_rad, class_id, labels, folds)
+    forest, held_out = grow(features, labels - curve_labels, weights, folds, config)
     curves = fit_curves("linear", slope_rad, class_id, labels)
-    return TableModel(curves, forest, tuple(channels), class_count), told + held_out
+    return TableModel(curves, forest, tuple(channels), class_count), curve_labels + held_out
 
 
 @dataclass(frozen=True, slots=True)
@@ -397,8 +397,8 @@ class BoostingModel(Predictor):
         """Return the model of these arrays."""
         forms = {**_FOREST_FORMS, **list_curve_arrays(len(inputs.outputs))}
         check_arrays(arrays, {**forms, **_COMPONENT_FORMS}, optional=_COMPONENT_FORMS)
-        components = {name: of for name, of in arrays.items() if name in _COMPONENT_FORMS}
-        curves, rest = read_curves("linear", {name: of for name, of in arrays.items() if name not in components})
+        components = {name: array for name, array in arrays.items() if name in _COMPONENT_FORMS}
+        curves, rest = read_curves("linear", {name: array for name, array in arrays.items() if name not in components})
         table = TableModel(curves, read_forest(rest), inputs.planes, inputs.class_count)
         return cls(table, inputs, Components(**{**_NO_COMPONENTS, **components}))
 
@@ -438,8 +438,10 @@ class BoostingModel(Predictor):
         )
 
     def _compute_features(self, patches: Patches) -> Floats:
-        of = self.inputs
-        return compute_patch_features(patches, channels=of.planes, class_count=of.class_count, patch_m=of.patch_m)
+        inputs = self.inputs
+        return compute_patch_features(
+            patches, channels=inputs.planes, class_count=inputs.class_count, patch_m=inputs.patch_m
+        )
 
 
 _TOGETHER = 256

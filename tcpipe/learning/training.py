@@ -138,7 +138,9 @@ def _compute_losses(samples: Samples, predicted: Array) -> Array:
         return np.asarray(np.square((predicted - samples.labels) / samples.labels.std())[:, 0])
     said = compute_costs(predicted[:, 0], np.maximum(predicted[:, 1], LEAST_VELOCITY_MPS), 1.0)
     true = compute_costs(samples.labels[:, 0], samples.labels[:, 1], 1.0)
-    losses = [np.square((said[of] - true[of]) / max(float(true[of].std()), 1e-9)) for of in ("T", "E")]
+    losses = [
+        np.square((said[quantity] - true[quantity]) / max(float(true[quantity].std()), 1e-9)) for quantity in ("T", "E")
+    ]
     return np.asarray(np.sum(losses, axis=0))
 
 
@@ -302,8 +304,8 @@ def make_samples(
 def _find_extra_features(used: Split, wanted: Sequence[str] | None, data: Dataset) -> tuple[ExtraFeature, ...]:
     """Return those of the wanted features that the samples have; `DatasetError` where --extra-features finds none."""
     names = _CALLED if wanted is None else wanted
-    found = tuple(of for of in available_features(read_extra_features(used)) if of.name in names)
-    lacking = [_CALLED[name] for name in names if name not in {of.name for of in found}]
+    found = tuple(feature for feature in available_features(read_extra_features(used)) if feature.name in names)
+    lacking = [_CALLED[name] for name in names if name not in {feature.name for feature in found}]
     if lacking and not found and wanted is None:
         raise DatasetError(
             f"{data.path}: its samples have no {' and no '.join(lacking)}; ingest the logs again and build the dataset again, "
@@ -329,13 +331,13 @@ def find_training_range(split: Split) -> TrainingRange:
         for name in layers.keys() - PAPER_LAYERS.keys():
             means.setdefault(name, []).append(split.view.form.known[name].compute_means(layers[name]))
     slopes = {name: split.column(name) for name in ("slope_rad", "cross_slope_rad")}
-    ranges = {name: (float(np.min(of)), float(np.max(of))) for name, of in slopes.items()}
+    ranges = {name: (float(np.min(slope)), float(np.max(slope))) for name, slope in slopes.items()}
     if reliefs_m:
         ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))
     class_ids = split.column("terrain_class").astype(np.float64)
     ids, counts = np.unique(class_ids[np.isfinite(class_ids)].astype(int), return_counts=True)
     class_counts = dict(zip(ids.tolist(), counts.tolist(), strict=True))
-    own = {name: LayerRange.of(np.concatenate(of)) for name, of in sorted(means.items())}
+    own = {name: LayerRange.of(np.concatenate(parts)) for name, parts in sorted(means.items())}
     return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges, own)
 
 

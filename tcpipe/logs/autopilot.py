@@ -47,7 +47,9 @@ class Autopilot:
         row = np.searchsorted(time_us, at_us, side="right") - 1
         stale = (row < 0) | (at_us - time_us[row] > within_us)
         return {
-            name: np.where(stale, np.nan, of[row].astype(np.float64)) for name, of in fields.items() if of.ndim == 1
+            name: np.where(stale, np.nan, field[row].astype(np.float64))
+            for name, field in fields.items()
+            if field.ndim == 1
         }
 
 
@@ -75,7 +77,7 @@ def make_role_messages(log: Autopilot) -> tuple[list[RoleMessages], list[Finding
         for name in present if role == "power" else present[:1]:
             try:
                 time_us, values = convert(log, name, *log.messages[name])
-                lacking = "" if all(np.shape(of) == time_us.shape for of in values.values()) else "single numbers"
+                lacking = "" if all(np.shape(value) == time_us.shape for value in values.values()) else "single numbers"
             except (KeyError, ValueError, TypeError) as error:
                 lacking = str(error.args[0])
             if lacking:
@@ -86,14 +88,18 @@ def make_role_messages(log: Autopilot) -> tuple[list[RoleMessages], list[Finding
             type_name = GPS_FIXES[1] if of_gps_fix else MAPPED_TYPES[role]
             columns = values if of_gps_fix else make_message_fields(role, values, len(time_us))
             made.append(RoleMessages(f"/{name}/{topic}", type_name, time_us, columns, frame))
-    if any(of.type_name == MAPPED_TYPES["gnss"] for of in made) and _find_ellipsoidal(log) is None:
+    if any(messages.type_name == MAPPED_TYPES["gnss"] for messages in made) and _find_ellipsoidal(log) is None:
         findings.append(make_finding("geoid-separation-missing", GNSS))
     return made, findings
 
 
 def select_fields(columns: Columns) -> Columns:
     """Return the fields that can be converted: single numbers, and lists where a list is expected."""
-    return {name: of for name, of in columns.items() if of.dtype.kind in "iuf" and (of.ndim == 1 or name in _LISTS)}
+    return {
+        name: column
+        for name, column in columns.items()
+        if column.dtype.kind in "iuf" and (column.ndim == 1 or name in _LISTS)
+    }
 
 
 _LISTS = ("gyro_rad", "accelerometer_m_s2", "wheel_speed")
@@ -187,7 +193,7 @@ def _convert_px4_fix(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> 
 def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     known = (f["vel_ned_valid"] != 0) & (f["fix_type"] >= _IN_3D)
     axes = {"east": f["vel_e_m_s"], "north": f["vel_n_m_s"], "up": -f["vel_d_m_s"]}
-    values = {name: np.where(known, of, np.nan) for name, of in axes.items()}
+    values = {name: np.where(known, axis, np.nan) for name, axis in axes.items()}
     return time_us, values | {f"{name}_std": f["s_variance_m_s"] for name in axes}
 
 
@@ -249,7 +255,7 @@ def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Co
 
 def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
     broken = (f.get("GH", 1) == 0) | (f.get("AH", 1) == 0)
-    rate, force = ([np.where(broken, np.nan, f[f"{of}{axis}"]) for axis in "XYZ"] for of in ("Gyr", "Acc"))
+    rate, force = ([np.where(broken, np.nan, f[f"{sensor}{axis}"]) for axis in "XYZ"] for sensor in ("Gyr", "Acc"))
     return time_us, _turn_axes("angular_velocity", *rate) | _turn_axes("linear_acceleration", *force)
 
 
@@ -314,7 +320,7 @@ _SOURCES: dict[str, dict[str, tuple[str, _Convert]]] = {
 """Names of messages, best first, and how they are converted, by autopilot and topic."""
 
 _BESIDE = "GPA STER rover_rate_setpoint"
-CONVERTED = {name for of in _SOURCES.values() for names, _ in of.values() for name in names.split()} | {
+CONVERTED = {name for columns in _SOURCES.values() for names, _ in columns.values() for name in names.split()} | {
     *_BESIDE.split()
 }
 """Names of messages that are read here."""

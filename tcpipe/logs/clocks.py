@@ -138,9 +138,9 @@ class AlignedClocks:
 def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> AlignedClocks:
     """Return the timeline of each topic that plays a role, and what the clocks did; ``clock_published``: /clock has messages."""
     stamped = {
-        name: (of.log_time_ns, of.header_ns)
-        for name, of in topics.items()
-        if of.header_ns is not None and of.prefer != "log"
+        name: (topic.log_time_ns, topic.header_ns)
+        for name, topic in topics.items()
+        if topic.header_ns is not None and topic.prefer != "log"
     }
     simulated = find_simulated_clock(stamped, published=clock_published)
     if simulated is not None:
@@ -166,8 +166,10 @@ def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int
     if size > _MOST_BINS:  # log times are no clock's
         return []
     stamps = [_bring_to_log_clock(times) for times in used]
-    counts = np.array([np.bincount(((of - zero) // STEP_NS).clip(0, size), minlength=size + 1) for of in stamps])
-    usual = np.array([np.median(of[of > 0]) for of in counts])
+    counts = np.array(
+        [np.bincount(((stamp_ns - zero) // STEP_NS).clip(0, size), minlength=size + 1) for stamp_ns in stamps]
+    )
+    usual = np.array([np.median(count[count > 0]) for count in counts])
     regular = counts[usual >= _FEWEST_IN_BIN] / usual[usual >= _FEWEST_IN_BIN, None]
     if len(regular) < _FEWEST_REGULAR:
         return []
@@ -198,19 +200,19 @@ def _settle_after_setting_back(
 ) -> AlignedClocks:
     """Return the timelines without what lies in times that the clock passed twice: what of it is earlier nobody can tell."""
     kept = {
-        name: np.flatnonzero(~np.any([(a <= of.log_time_ns) & (of.log_time_ns < b) for a, b, _ in spans], axis=0))
-        for name, of in topics.items()
+        name: np.flatnonzero(~np.any([(a <= topic.log_time_ns) & (topic.log_time_ns < b) for a, b, _ in spans], axis=0))
+        for name, topic in topics.items()
     }
-    rest = {name: select_times(of, kept[name]) for name, of in topics.items()}
+    rest = {name: select_times(topic, kept[name]) for name, topic in topics.items()}
     steps = [ClockStep(end_ns, -size_s, ()) for _, end_ns, size_s in spans]
     settled = _settle_steps(rest, steps)
     timelines = {
         name: replace(
-            of,
-            row=kept[name][of.row],
-            dropped=of.dropped | {"clock_set_back": len(topics[name].log_time_ns) - len(kept[name])},
+            timeline,
+            row=kept[name][timeline.row],
+            dropped=timeline.dropped | {"clock_set_back": len(topics[name].log_time_ns) - len(kept[name])},
         )
-        for name, of in settled.timelines.items()
+        for name, timeline in settled.timelines.items()
     }
     return replace(settled, timelines=timelines)
 
@@ -229,7 +231,9 @@ def _settle_steps(topics: Mapping[str, TopicTimes], of_host: Sequence[ClockStep]
     # A header that does not rule has no say about the others' clock either.
     trusted = {name: steps for name, steps in steps_of.items() if reasons[name] is None}
     steps = _find_common_steps({name: topics[name].log_time_ns for name in topics}, trusted)
-    steps += [of for of in of_host if all(abs(of.log_time_ns - each.log_time_ns) > _TOGETHER_NS for each in steps)]
+    steps += [
+        step for step in of_host if all(abs(step.log_time_ns - each.log_time_ns) > _TOGETHER_NS for each in steps)
+    ]
     steps.sort(key=lambda step: step.log_time_ns)
     drafts = {
         name: _make_draft(times, reasons[name], _assign_epochs(name, times, steps, trusted.get(name, [])))
@@ -249,14 +253,16 @@ def _make_simulated_timeline(name: str, times: TopicTimes, clock: SimulatedClock
     if times.prefer == "header" and times.header_ns is not None:
         draft = _Draft("header", RECIPE, times.header_ns, known, epoch, {}, median, 0)
         return _make_timeline(times, draft, [0])
-    told = clock.at(times.log_time_ns)
+    clock_ns = clock.at(times.log_time_ns)
     why = _find_simulated_problem(name, times, clock)
     if why is None and times.header_ns is not None:
-        stamps = np.where(known, times.header_ns, told)
+        stamps = np.where(known, times.header_ns, clock_ns)
         draft = _Draft("header", "simulated-time", stamps, every, epoch, {}, median, int(np.count_nonzero(~known)))
         return _make_timeline(times, draft, [0])
-    draft = _Draft("log", str(why), told, every, epoch, {}, median, 0)
-    return replace(_make_timeline(times, draft, [0]), moved_s=(float(np.median(told - times.log_time_ns)) / SECOND_NS,))
+    draft = _Draft("log", str(why), clock_ns, every, epoch, {}, median, 0)
+    return replace(
+        _make_timeline(times, draft, [0]), moved_s=(float(np.median(clock_ns - times.log_time_ns)) / SECOND_NS,)
+    )
 
 
 def _find_simulated_problem(name: str, times: TopicTimes, clock: SimulatedClock) -> str | None:
@@ -514,7 +520,7 @@ def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: 
     counting = [name for name, (_, header) in used.items() if _is_counting_clock(header, published=published)]
     if not counting or 2 * len(counting) <= len(used):
         return None
-    log, clock = max((used[name] for name in counting), key=lambda of: len(of[0]))
+    log, clock = max((used[name] for name in counting), key=lambda pair: len(pair[0]))
     ahead = np.concatenate(([True], clock[1:] > np.maximum.accumulate(clock)[:-1]))
     log, first = np.unique(log[ahead], return_index=True)
     return SimulatedClock(log, clock[ahead][first], frozenset(counting)) if len(log) > 1 else None

@@ -206,7 +206,7 @@ def find_other_unit(expression: Expression, unit: str) -> str | None:
     """Return the unit that an expression's columns state, if it is not the field's own but of its quantity (for rad/s also a speed's)."""
     others = UNITS[unit] | (UNITS["m/s"] if unit == "rad/s" else {})
     named = [split_unit(column)[1] for column, _ in expression.operands()]
-    return next((of for of in named if of and others.get(of, 1.0) != 1.0), None)
+    return next((unit for unit in named if unit and others.get(unit, 1.0) != 1.0), None)
 
 
 def _choose_factor(unit: str, expression: Expression, name: str, units: Mapping[str, str] | None) -> float | str:
@@ -328,7 +328,7 @@ def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) 
     values: dict[str, Floats] = {}
     for name, of_field in found.items():
         parts = of_field.expression.operands()
-        unfit = [why for of in parts if (why := _find_misfit(columns[of[0]], *of, may_be_text=name == "quality"))]
+        unfit = [why for part in parts if (why := _find_misfit(columns[part[0]], *part, may_be_text=name == "quality"))]
         problems += [f"{where}.{name}: {why}" for why in unfit]
         if not unfit:
             values[name] = of_field.evaluate(partial(_read_column, columns), rows)
@@ -397,7 +397,7 @@ def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
         match = next((name for name in names if re.fullmatch(pattern, simplify_name(name))), None)
         if match is not None and match not in found.values():
             found[field] = match
-    return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}
+    return found if all(field in found for field, definition in MAPPED[role].items() if definition.needed) else {}
 
 
 def list_number_fields(topic: Topic) -> list[str]:
@@ -411,11 +411,11 @@ def list_number_fields(topic: Topic) -> list[str]:
 
 
 def _iterate_below(messages: Mapping[str, FieldTypes], type_name: str, prefix: str = "") -> Iterator[str]:
-    for name, of in messages.get(type_name, ()):
-        dotted = f"{prefix}{name}{'' if of.length is None else '[]'}"
+    for name, message in messages.get(type_name, ()):
+        dotted = f"{prefix}{name}{'' if message.length is None else '[]'}"
         if dotted.count("[]") > 1:
             continue
-        if of.name in BASE_TYPES - {"string", "wstring"}:
+        if message.name in BASE_TYPES - {"string", "wstring"}:
             yield dotted
         elif dotted.count(".") < _DEEPEST:
-            yield from _iterate_below(messages, of.name, f"{dotted}.")
+            yield from _iterate_below(messages, message.name, f"{dotted}.")

@@ -70,7 +70,10 @@ def find_quality(names: Iterable[str]) -> list[str]:
     """Return the first name that may be a fix quality, with the codes that are likeliest: ``gga: quality``; [] where none is."""
     likely = {"gga": r"(.*[_.])?(qual(ity)?|mode|fix_?(type|mode)?)", "navsat": r"(.*[_.])?status"}
     found = [
-        f"{codes}: {name}" for codes, of in likely.items() for name in names if re.fullmatch(of, simplify_name(name))
+        f"{codes}: {name}"
+        for codes, pattern in likely.items()
+        for name in names
+        if re.fullmatch(pattern, simplify_name(name))
     ]
     return found[:1]
 
@@ -84,7 +87,7 @@ def classify_fixes(values: Array, codes: str) -> Floats:
         return found
     for word in set(values.tolist()):
         text = str(word or "no").lower()
-        found[values == word] = next((of for pattern, of in _WORDS if re.search(pattern, text)), _NO_FIX)
+        found[values == word] = next((quality for pattern, quality in _WORDS if re.search(pattern, text)), _NO_FIX)
     return found
 
 

@@ -94,9 +94,9 @@ def count_frames(columns: Columns, type_name: str) -> dict[str, int]:
     name = "child_frame_id" if type_name == roles.ODOMETRY else "header.frame_id"
     if name not in columns or type_name in (roles.POSE_STAMPED, roles.POSE_WITH_COVARIANCE_STAMPED):
         return {}
-    told = columns[name]
-    alike = told.size > 0 and told.strides[0] == 0
-    texts, counts = (told[:1], [told.size]) if alike else np.unique(told.astype(str), return_counts=True)
+    column = columns[name]
+    alike = column.size > 0 and column.strides[0] == 0
+    texts, counts = (column[:1], [column.size]) if alike else np.unique(column.astype(str), return_counts=True)
     found: dict[str, int] = {}
     for text, count in zip(texts, counts, strict=True):
         found[text.lstrip("/")] = found.get(text.lstrip("/"), 0) + int(count)
@@ -313,12 +313,12 @@ def _compute_course_velocity(speed: Floats, course_rad: Floats, var: Floats) -> 
 
 def _read_velocity_sentences(columns: Columns) -> Readings:
     texts = [str(sentence) for sentence in columns["sentence"]]
-    told, gga = read_over_ground(texts), read_gga(texts)
-    of_told = {name: values[told.row] for name, values in columns.items()}
+    ground_velocity, gga = read_over_ground(texts), read_gga(texts)
+    of_told = {name: values[ground_velocity.row] for name, values in columns.items()}
     at_ns = of_told[LOG_TIME].astype(np.int64)
-    time_of_day_ns = told.time_of_day_ns
+    time_of_day_ns = ground_velocity.time_of_day_ns
     if (
-        told.row.size and gga.row.size and (time_of_day_ns < 0).all()
+        ground_velocity.row.size and gga.row.size and (time_of_day_ns < 0).all()
     ):  # VTG has no time: that of the fix which came with it
         beside_ns = columns[LOG_TIME].astype(np.int64)[gga.row]
         after = np.clip(np.searchsorted(beside_ns, at_ns), 1, max(1, gga.row.size - 1))
@@ -326,17 +326,25 @@ def _read_velocity_sentences(columns: Columns) -> Readings:
         nearest = np.where(before_is_nearer, after - 1, np.minimum(after, gga.row.size - 1))
         near = np.abs(beside_ns[nearest] - at_ns) < _BESIDE_NS
         time_of_day_ns = np.where(near, gga.time_of_day_ns[nearest], -1)
-    over_ground, variances = _compute_course_velocity(told.speed_mps, told.course_rad, np.full(told.row.size, np.nan))
-    unknown = np.full((told.row.size, 1), np.nan)
-    values = _make_ground_velocity(np.hstack((over_ground, unknown)), np.hstack((variances, unknown)), told.status)
-    drops = {"broken": told.broken, "no_fix": told.status < 0, "not_finite": ~np.isfinite(over_ground.sum(-1))}
+    over_ground, variances = _compute_course_velocity(
+        ground_velocity.speed_mps, ground_velocity.course_rad, np.full(ground_velocity.row.size, np.nan)
+    )
+    unknown = np.full((ground_velocity.row.size, 1), np.nan)
+    values = _make_ground_velocity(
+        np.hstack((over_ground, unknown)), np.hstack((variances, unknown)), ground_velocity.status
+    )
+    drops = {
+        "broken": ground_velocity.broken,
+        "no_fix": ground_velocity.status < 0,
+        "not_finite": ~np.isfinite(over_ground.sum(-1)),
+    }
     found = _select_rows(
-        of_told, values, drops, notes={"course_unknown": int((told.speed_mps < _HELD_COURSE_MPS).sum())}
+        of_told, values, drops, notes={"course_unknown": int((ground_velocity.speed_mps < _HELD_COURSE_MPS).sum())}
     )
     own_time_ns = add_date(time_of_day_ns[found.row], found.log_time_ns)
-    others = len(texts) - len(told.row)
+    others = len(texts) - len(ground_velocity.row)
     dropped = {**({"no_velocity": others} if others else {}), **found.dropped}
-    return replace(found, row=told.row[found.row], dropped=dropped, own_time_ns=own_time_ns)
+    return replace(found, row=ground_velocity.row[found.row], dropped=dropped, own_time_ns=own_time_ns)
 
 
 _BESIDE_NS = 500_000_000

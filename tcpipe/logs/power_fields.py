@@ -69,22 +69,22 @@ def match_power_fields(names: Iterable[str]) -> PowerFields | None:
     Fields whose names differ by sides or numbers alone belong together: each at its own voltage where there are as many, else added.
     """
     named = [found for name in names if (found := _read_name(name))]
-    watt, amp, volt = ([of for of in named if of.quantity == what] for what in ("power", "current", "voltage"))
+    watt, amp, volt = ([field for field in named if field.quantity == what] for what in ("power", "current", "voltage"))
     drawn, others = _choose(amp or watt)
     if not drawn:
         return None
     quantity = drawn[0].quantity
-    volt, _ = _choose([of for of in volt if of.core == drawn[0].core] or volt)
-    by_side = {of.side: of.name for of in volt}
+    volt, _ = _choose([field for field in volt if field.core == drawn[0].core] or volt)
+    by_side = {field.side: field.name for field in volt}
     if quantity == "power":
-        rails: list[dict[str, str]] = [{"power": " + ".join(of.name for of in drawn)}]
-    elif len(drawn) > 1 and all(of.side in by_side for of in drawn):
-        rails = [{"voltage": _take_first_element(by_side[of.side]), "current": of.name} for of in drawn]
+        rails: list[dict[str, str]] = [{"power": " + ".join(field.name for field in drawn)}]
+    elif len(drawn) > 1 and all(field.side in by_side for field in drawn):
+        rails = [{"voltage": _take_first_element(by_side[field.side]), "current": field.name} for field in drawn]
     else:
-        rails = [{"current": " + ".join(of.name for of in drawn)}]
+        rails = [{"current": " + ".join(field.name for field in drawn)}]
         rails = [{"voltage": _take_first_element(volt[0].name)} | rails[0]] if volt else rails
     used = [*drawn, *(volt if "voltage" in rails[0] else [])]
-    scales = {of.quantity: of.scale for of in used if of.scale != 1.0}
+    scales = {field.quantity: field.scale for field in used if field.scale != 1.0}
     return PowerFields(tuple(rails), scales, _find_doubt(drawn, others))
 
 
@@ -114,29 +114,31 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
 def _read_name(name: str) -> _Named | None:
     bare, unit, in_brackets = split_unit(name.replace("`", "").removesuffix("[]"))
     (core, side), own = split_sides(bare), split_words(bare.rpartition(".")[2])
-    quantity = next((what for word in reversed(own) for what, of in _QUANTITIES.items() if of.fullmatch(word)), None)
+    quantity = next(
+        (what for word in reversed(own) for what, pattern in _QUANTITIES.items() if pattern.fullmatch(word)), None
+    )
     measured, scale = _UNITS.get(unit or "", (quantity, 1.0))
     of_rail = any(_SUPPLY.fullmatch(word) or _DRIVES.fullmatch(word) for word in core)
     is_stated = in_brackets and (of_rail or {"u", "v", "i", "p"} & set(own))  # as U_bat [V]
     quantity = quantity or (measured if is_stated or (of_rail and scale != 1.0) else None)  # "wheel_v" is a velocity
     if quantity is None or measured != quantity or any(_OTHER.fullmatch(word) for word in own):
         return None
-    rest = tuple(word for word in core if not any(of.fullmatch(word) for of in _QUANTITIES.values()))
+    rest = tuple(word for word in core if not any(pattern.fullmatch(word) for pattern in _QUANTITIES.values()))
     return _Named(name, quantity, scale, rest, side)
 
 
 def _choose(named: Sequence[_Named]) -> tuple[list[_Named], list[_Named]]:
     """Return the fields that belong together, those of the supply first, and the others that could be meant as well."""
     groups: dict[tuple[str, ...], list[_Named]] = {}
-    for of in named:
-        groups.setdefault(of.core, []).append(of)
+    for field in named:
+        groups.setdefault(field.core, []).append(field)
     ranked = sorted(groups.values(), key=_rank)
-    return (ranked or [[]])[0], [of for group in ranked[1:] if _rank(group) == _rank(ranked[0]) for of in group]
+    return (ranked or [[]])[0], [field for group in ranked[1:] if _rank(group) == _rank(ranked[0]) for field in group]
 
 
 def _rank(group: Sequence[_Named]) -> tuple[bool, bool]:
     """Return whether the fields are not named like the supply, and whether they are named like a motor."""
-    supply, phase = (any(of.fullmatch(word) for word in group[0].core) for of in (_SUPPLY, _PHASE))
+    supply, phase = (any(pattern.fullmatch(word) for word in group[0].core) for pattern in (_SUPPLY, _PHASE))
     return not supply, phase
 
 
@@ -147,7 +149,7 @@ def _take_first_element(name: str) -> str:
 
 def _find_doubt(drawn: Sequence[_Named], others: Sequence[_Named]) -> str:
     if others:
-        return f"{', '.join(of.name for of in others)} could be meant as well"
+        return f"{', '.join(other.name for other in others)} could be meant as well"
     if _rank(drawn) == (True, True):
         return "uncomment if these are drawn from the battery; currents of motor phases are larger"
     return ""

@@ -153,7 +153,7 @@ def assign_roles(
     wanted = {str(role): names for role, names in chosen.items()}
     name, robot_why = find_robot(listed.values(), robot, known.robots)
     types = {**ROLE_TYPES, "power": tuple(dict.fromkeys([*known.types(), *FLOAT_TYPES]))}
-    propulsion = [of for of in known.types(propulsion=True) if of not in FLOAT_TYPES]
+    propulsion = [type_name for type_name in known.types(propulsion=True) if type_name not in FLOAT_TYPES]
     decided = _Decisions(types, propulsion, known.refusals())
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
         decided.problems.append(
@@ -172,7 +172,7 @@ def assign_roles(
     }
     poses, velocities = found.pop("pose", []), found.pop("gnss_velocity", [])
     if not found.get("gnss", velocities):
-        found["gnss"] = [of for of in velocities if of[2].type_name in GPS_FIXES]
+        found["gnss"] = [candidate for candidate in velocities if candidate[2].type_name in GPS_FIXES]
     robots = find_robot_namespaces({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
     if robots:
         decided.problems += ask_which_robot(robots)
@@ -183,7 +183,9 @@ def assign_roles(
     _decide_pose(decided, poses, taken="gnss" in {*decided.roles, *decided.undecided} or "pose" in wanted)
     if "gnss_velocity" not in settled:
         apart = [
-            of for of in velocities if "gnss" not in decided.roles or of[2].name not in decided.roles["gnss"].topics
+            candidate
+            for candidate in velocities
+            if "gnss" not in decided.roles or candidate[2].name not in decided.roles["gnss"].topics
         ]
         _decide_velocity(decided, apart + _collect_own_velocities(decided, listed.values(), ignored))
     elif "gnss_velocity" in decided.roles and "gnss" not in decided.roles:
@@ -201,7 +203,7 @@ def assign_roles(
             *find_missing_roles({*decided.roles, *decided.undecided}),
             *find_left_out(decided.passed_over),
             *proposed,
-            *find_undecodable(listed.values(), {of for types in decided.types.values() for of in types}),
+            *find_undecodable(listed.values(), {type_name for types in decided.types.values() for type_name in types}),
         ),
         decided.choices,
     )
@@ -229,7 +231,7 @@ def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> Non
     """Let a pose made elsewhere play, where its name clearly says so, there is one such, and nothing else tells a position."""
     best = [] if taken else _select_best("pose", candidates) if candidates else []
     for _, why, topic in candidates:
-        if [topic] == [of for _, of in best]:
+        if [topic] == [other for _, other in best]:
             decided.roles["pose"] = PlayedRole("pose", (topic.name,), topic.type_name, f"{why}, and there is no GNSS")
         elif topic.type_name == ODOMETRY:
             decided.pass_over(
@@ -268,7 +270,11 @@ def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
 def _collect_own_velocities(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
     """Return the topics of NMEA sentences, which may tell places and velocities at once, and the fixes that do."""
     fixes = decided.roles["gnss"].topics if "gnss" in decided.roles else ()
-    both = [of for of in topics if of.type_name == NMEA_SENTENCE or (of.type_name in GPS_FIXES and of.name in fixes)]
+    both = [
+        topic
+        for topic in topics
+        if topic.type_name == NMEA_SENTENCE or (topic.type_name in GPS_FIXES and topic.name in fixes)
+    ]
     rank = ROLE_TYPES["gnss_velocity"].index
     return [((rank(topic.type_name),), "", topic) for topic in both if _is_usable(decided, topic, ignored)]
 
@@ -565,7 +571,7 @@ def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[
     could = {name: why for name, why in decided.left_out.items() if name in able}
     if could:
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
-        readable = {of.name for of in topics if of.problem is None and not of.name.startswith(OVERLAY)}
+        readable = {topic.name for topic in topics if topic.problem is None and not topic.name.startswith(OVERLAY)}
         name = next((name for name in could if name in readable), "")
         lines.append(f"not used: {reasons}")
         if name:

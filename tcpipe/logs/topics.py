@@ -121,7 +121,9 @@ def _merge_damage(subject: Subject, places: Sequence[Damage]) -> Finding:
 def split_notes(findings: Iterable[Finding]) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
     """Return the findings that tell of a loss, and the notes."""
     found = list(findings)
-    return tuple(of for of in found if of.severity != "note"), tuple(of for of in found if of.severity == "note")
+    return tuple(finding for finding in found if finding.severity != "note"), tuple(
+        finding for finding in found if finding.severity == "note"
+    )
 
 
 def _add_known(counts: Iterable[int | None]) -> int | None:
@@ -272,16 +274,16 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
         return name, "given"
     listed = sorted(topics, key=lambda topic: topic.name)
     if by_type := _find_only_topic(
-        (n, t) for t in listed for n, of in robots.items() if t.type_name in of.status_types
+        (n, t) for t in listed for n, robot in robots.items() if t.type_name in robot.status_types
     ):
         return by_type[0], f"topic {by_type[1].name} is {by_type[1].type_name}"
-    if by_name := _find_only_topic((n, t) for t in listed for n, of in robots.items() if _is_called(of, t)):
+    if by_name := _find_only_topic((n, t) for t in listed for n, robot in robots.items() if _is_called(robot, t)):
         return by_name[0], f"topic {by_name[1].name} has its name"
     for topic in listed:
         if topic.type_name == _POWER_OF_ANY_CLEARPATH:
-            if other := next((found for of in listed if (found := _SERIAL_NUMBER.search(of.name.lower()))), None):
+            if other := next((found for topic in listed if (found := _SERIAL_NUMBER.search(topic.name.lower()))), None):
                 return GENERIC, f"topics are named after the platform {other[1].upper()}, which has no profile"
-            first = next((n for n, of in robots.items() if of.platform == _FIRST_TO_PUBLISH_IT), GENERIC)
+            first = next((n for n, robot in robots.items() if robot.platform == _FIRST_TO_PUBLISH_IT), GENERIC)
             return first, f"topic {topic.name} is {topic.type_name}, and nothing names another platform"
     return GENERIC, "no topic identifies the robot"
 

@@ -194,31 +194,31 @@ class _Cursors:
         finished: NDArray[np.bool_] = self._good & (left >= 0) & (left <= self._dialect.padding)
         return finished
 
-    def values(self, of: WireType, rows: Int64Array) -> Values:
+    def values(self, wire_type: WireType, rows: Int64Array) -> Values:
         """Step over one value in each of the ``rows``: all messages, none, or some of those without a grid."""
         self._steps += 1
         if self._steps > _MAX_STEPS:
             raise RaggedError(f"more than {_MAX_STEPS} steps")
-        match of:
+        match wire_type:
             case Scalar():
-                dtype = np.dtype(self._dialect.byte_order + of.code)
+                dtype = np.dtype(self._dialect.byte_order + wire_type.code)
                 return Scalars(self.take(rows, dtype.itemsize, dtype.itemsize), dtype)
             case Text():
                 lengths = self.count(rows)
                 kept = np.maximum(lengths - self._dialect.terminator, 0)
                 return Runs(self.take(rows, lengths, 1), np.broadcast_to(kept, len(rows)), None)
             case Record():
-                return self.record(of, rows)
+                return self.record(wire_type, rows)
             case Array():
-                return self.array(of, rows)
+                return self.array(wire_type, rows)
 
-    def record(self, of: Record, rows: Int64Array) -> Fields:
-        if not of.fields:  # CDR has no empty structures: rosidl puts one byte there
+    def record(self, record: Record, rows: Int64Array) -> Fields:
+        if not record.fields:  # CDR has no empty structures: rosidl puts one byte there
             self.take(rows, self._dialect.empty_record_bytes, 1)
-        return Fields(len(rows), tuple(self.values(field, rows) for _, field in of.fields))
+        return Fields(len(rows), tuple(self.values(field, rows) for _, field in record.fields))
 
-    def array(self, of: Array, rows: Int64Array) -> Values:
-        counts = self.count(rows) if of.length is None else of.length
+    def array(self, array: Array, rows: Int64Array) -> Values:
+        counts = self.count(rows) if array.length is None else array.length
         if isinstance(self._bases, Grid) and len(rows):
             if counts > self._sizes[0] - self._at:  # an element takes a byte at least
                 raise LayoutError(f"{counts} elements")
@@ -226,31 +226,31 @@ class _Cursors:
             endless = counts > self._sizes[rows] - self._positions[rows]
             self._good[rows[endless]] = False
             counts = np.where(endless, 0, counts)
-        if isinstance(of.element, Scalar):
-            dtype = np.dtype(self._dialect.byte_order + of.element.code)
+        if isinstance(array.element, Scalar):
+            dtype = np.dtype(self._dialect.byte_order + array.element.code)
             sizes = counts * dtype.itemsize
             places = self.take(rows, sizes, np.where(counts > 0, dtype.itemsize, 1))
             return Runs(places, np.broadcast_to(sizes, len(rows)), dtype)
         each = np.broadcast_to(counts, len(rows))
-        return Lists(each, self.regular(of.element, rows, each) or self.elements(of.element, rows, each))
+        return Lists(each, self.regular(array.element, rows, each) or self.elements(array.element, rows, each))
 
-    def elements(self, of: Text | Record, rows: Int64Array, counts: Int64Array) -> Values:
+    def elements(self, element: Text | Record, rows: Int64Array, counts: Int64Array) -> Values:
         """Step over the first elements of all lists, then over the second ones, and so on."""
         if not counts.any():
-            return self.values(of, rows[:0])
+            return self.values(element, rows[:0])
         pieces, places = [], []
         starts = np.cumsum(counts) - counts
         for index in range(int(counts.max())):
             longer = np.flatnonzero(counts > index)
-            pieces.append(self.values(of, rows[longer]))
+            pieces.append(self.values(element, rows[longer]))
             places.append(starts[longer] + index)
         order = np.empty(int(counts.sum()), np.int64)
         order[np.concatenate(places)] = np.arange(len(order))
         return _join_values(pieces, order)
 
-    def regular(self, of: Text | Record, rows: Int64Array, counts: Int64Array) -> Values | None:
+    def regular(self, element: Text | Record, rows: Int64Array, counts: Int64Array) -> Values | None:
         """Step over all elements at once where each takes the same room wherever it stands; None where they do not."""
-        size, stride, alignment = _find_regular_size(of, self._dialect.max_alignment)
+        size, stride, alignment = _find_regular_size(element, self._dialect.max_alignment)
         if not size or counts.max(initial=0) < 2:
             return None
         sizes = np.where(counts > 0, stride * (counts - 1) + size, 0)
@@ -265,18 +265,18 @@ class _Cursors:
             owners = np.repeat(np.arange(len(rows)), counts)
             places = begin[owners] + stride * (np.arange(len(owners)) - (np.cumsum(counts) - counts)[owners])
         total = int(counts.sum())
-        return _Cursors(self._data, places, np.full(total, size), self._dialect).values(of, np.arange(total))
+        return _Cursors(self._data, places, np.full(total, size), self._dialect).values(element, np.arange(total))
 
     def count(self, rows: Int64Array) -> int | Int64Array:
         """Step over a length in each row; return them, as one number where all messages have the same."""
         places, dtype = self.take(rows, 4, 4), np.dtype(self._dialect.byte_order + "u4")
         if isinstance(places, Grid):
-            told = places.view(self._data, dtype).astype(np.int64)
-            if (told == told[0]).all():
-                return int(told[0])
+            counts = places.view(self._data, dtype).astype(np.int64)
+            if (counts == counts[0]).all():
+                return int(counts[0])
             self._positions[:] = self._at  # from here on each has its own
             self._bases = _list_offsets(self._bases)
-            return told
+            return counts
         good = self._good[rows]
         found = np.zeros(len(rows), np.int64)
         found[good] = self._counts[places[good]].view(dtype)
@@ -315,7 +315,7 @@ def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
             return Scalars(np.concatenate(scalars)[order], dtype)
         case Runs(dtype=dtype):
             runs = [(_list_offsets(p.places), p.lengths) for p in pieces if isinstance(p, Runs)]
-            offsets, lengths = (np.concatenate(of)[order] for of in zip(*runs, strict=True))
+            offsets, lengths = (np.concatenate(parts)[order] for parts in zip(*runs, strict=True))
             return Runs(offsets, lengths, dtype)
         case Fields():
             columns = zip(*(p.fields for p in pieces if isinstance(p, Fields)), strict=True)
@@ -329,17 +329,17 @@ def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
 
 
 @cache
-def _find_regular_size(of: WireType, max_alignment: int) -> tuple[int, int, int]:
+def _find_regular_size(wire_type: WireType, max_alignment: int) -> tuple[int, int, int]:
     """Return size, distance and alignment of values that follow one another, where these are the same wherever they stand; (0, 0, 1) else.
 
     They are where the first field has the largest alignment.
     """
-    match of:
+    match wire_type:
         case Scalar():
-            size = np.dtype(of.code).itemsize
+            size = np.dtype(wire_type.code).itemsize
             return size, size, min(size, max_alignment)
-        case Record() if of.fields:
-            parts = [_find_regular_size(field, max_alignment) for _, field in of.fields]
+        case Record() if wire_type.fields:
+            parts = [_find_regular_size(field, max_alignment) for _, field in wire_type.fields]
             alignment = parts[0][2]
             position = 0
             for size, _, own in parts:
@@ -347,8 +347,8 @@ def _find_regular_size(of: WireType, max_alignment: int) -> tuple[int, int, int]
                     return 0, 0, 1
                 position += -position % own + size
             return position, position + -position % alignment, alignment
-        case Array() if of.length:
-            size, stride, alignment = _find_regular_size(of.element, max_alignment)
-            return (stride * (of.length - 1) + size if size else 0), 0, alignment
+        case Array() if wire_type.length:
+            size, stride, alignment = _find_regular_size(wire_type.element, max_alignment)
+            return (stride * (wire_type.length - 1) + size if size else 0), 0, alignment
         case _:
             return 0, 0, 1

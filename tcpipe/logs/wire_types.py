@@ -86,7 +86,7 @@ def compute_least_bytes(wire_type: WireType, *, empty_bytes: int) -> int:
         case Record():
             if not wire_type.fields:
                 return empty_bytes
-            return sum(compute_least_bytes(of, empty_bytes=empty_bytes) for _, of in wire_type.fields)
+            return sum(compute_least_bytes(field_type, empty_bytes=empty_bytes) for _, field_type in wire_type.fields)
         case Array():
             return (wire_type.length or 0) * compute_least_bytes(wire_type.element, empty_bytes=empty_bytes)
 
@@ -95,7 +95,7 @@ def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
     """Return whether a message could hold any number of elements in no bytes at all."""
     match wire_type:
         case Record():
-            return any(is_boundless(of, empty_bytes=empty_bytes) for _, of in wire_type.fields)
+            return any(is_boundless(field_type, empty_bytes=empty_bytes) for _, field_type in wire_type.fields)
         case Array():
             weightless = wire_type.length is None and not compute_least_bytes(
                 wire_type.element, empty_bytes=empty_bytes
@@ -107,12 +107,12 @@ def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
 
 def record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
     """Make a record; how wide it unfolds follows from its fields."""
-    return Record(name, fields, sum(count_leaves(of) for _, of in fields))
+    return Record(name, fields, sum(count_leaves(field_type) for _, field_type in fields))
 
 
-def iterate_flat_fields(of: Record, prefix: str = "") -> Iterator[tuple[str, WireType]]:
+def iterate_flat_fields(record: Record, prefix: str = "") -> Iterator[tuple[str, WireType]]:
     """Yield the columns of a message: nested messages unfold into dotted names, arrays stay whole."""
-    for name, wire_type in of.fields:
+    for name, wire_type in record.fields:
         if isinstance(wire_type, Record):
             yield from iterate_flat_fields(wire_type, f"{prefix}{name}.")
         else:

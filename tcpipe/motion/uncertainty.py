@@ -31,8 +31,8 @@ def compute_displacement_std_m(
     start_std_m: Floats,
     end_std_m: Floats,
     smoothed: bool,
-    told_s: Sequence[float],
-    told_std_m: Floats,
+    lags_s: Sequence[float],
+    lag_std_m: Floats,
 ) -> Floats:
     """Return the standard deviation of the displacement between two estimated positions [m], shape (M,).
 
@@ -44,26 +44,26 @@ def compute_displacement_std_m(
         change = np.maximum(change, np.sqrt(np.maximum(start_std_m**2 - end_std_m**2, 0.0)))
     short, long = velocity_std_mps * duration_s, np.hypot(start_std_m, end_std_m)
     drift = np.divide(short * long, np.hypot(short, long), out=np.zeros_like(short), where=long > 0.0)
-    known_s = np.array(told_s)
-    linear = np.where(known_s <= duration_s[:, None], told_std_m * duration_s[:, None] / known_s, np.nan)
-    told = interpolate_durations_m(duration_s, told_s=told_s, told_std_m=told_std_m)
+    known_s = np.array(lags_s)
+    linear = np.where(known_s <= duration_s[:, None], lag_std_m * duration_s[:, None] / known_s, np.nan)
+    displacement_std_m = interpolate_durations_m(duration_s, lags_s=lags_s, lag_std_m=lag_std_m)
     modelled = np.maximum(np.fmin(drift, np.fmin.reduce(linear, axis=1)), change)
-    return np.where(np.isnan(told), modelled, told)
+    return np.where(np.isnan(displacement_std_m), modelled, displacement_std_m)
 
 
-def interpolate_durations_m(duration_s: Floats, *, told_s: Sequence[float], told_std_m: Floats) -> Floats:
+def interpolate_durations_m(duration_s: Floats, *, lags_s: Sequence[float], lag_std_m: Floats) -> Floats:
     """Return the displacement error over each duration [s] from that over some, [m], shape (M,); NaN where that is unknown.
 
-    Between two durations it is a power of time, below the shortest that of a constant velocity error. ``told_s`` [s] are L durations,
-    increasing; ``told_std_m`` [m], shape (M, L), is above 0 or NaN.
+    Between two lags it is a power of time, below the shortest that of a constant velocity error. ``lags_s`` [s] are L lags,
+    increasing; ``lag_std_m`` [m], shape (M, L), is above 0 or NaN.
     """
-    known = np.array(told_s)
+    known = np.array(lags_s)
     after = np.clip(np.searchsorted(known, duration_s), 1, len(known) - 1)
     row = np.arange(len(duration_s))
-    low, high = told_std_m[row, after - 1], told_std_m[row, after]
+    low, high = lag_std_m[row, after - 1], lag_std_m[row, after]
     share = np.log(duration_s / known[after - 1]) / np.log(known[after] / known[after - 1])
     std_m: Floats = np.where(
-        duration_s < known[0], told_std_m[:, 0] * duration_s / known[0], low ** (1.0 - share) * high**share
+        duration_s < known[0], lag_std_m[:, 0] * duration_s / known[0], low ** (1.0 - share) * high**share
     )
     return np.where(duration_s <= known[-1], std_m, np.nan)
 
@@ -84,8 +84,8 @@ def compute_chord_ahead_std_m(
     chord_m: float,
     slowest_mps: float,
     smoothed: bool,
-    told_s: Sequence[float],
-    told_std_m: Floats,
+    lags_s: Sequence[float],
+    lag_std_m: Floats,
 ) -> Floats:
     """Return for each row the displacement error over the next chord at the row's speed [m], shape (N,).
 
@@ -102,8 +102,8 @@ def compute_chord_ahead_std_m(
         start_std_m=position_std_m,
         end_std_m=position_std_m[end],
         smoothed=smoothed,
-        told_s=told_s,
-        told_std_m=told_std_m,
+        lags_s=lags_s,
+        lag_std_m=lag_std_m,
     )
 
 

@@ -38,7 +38,10 @@ def compute_vibration_mps2(stamp_ns: Stamps, specific_force_mps2: Floats, start_
     if 1.0 / period_s < _RATE_TOLERANCE * LEAST_RATE_HZ:
         return unknown
     mean = specific_force_mps2.mean(axis=0)
-    square = sum(_filter_band(axis - of, period_s) ** 2 for axis, of in zip(specific_force_mps2.T, mean, strict=True))
+    square = sum(
+        _filter_band(axis - mean_mps2, period_s) ** 2
+        for axis, mean_mps2 in zip(specific_force_mps2.T, mean, strict=True)
+    )
     total = np.concatenate(([0.0], np.cumsum(square)))
     begin, end = (np.searchsorted(stamp_ns, at_ns, side="right") for at_ns in (start_ns, end_ns))
     mean_square = np.divide(total[end] - total[begin], end - begin, out=unknown.copy(), where=end > begin)

@@ -273,7 +273,7 @@ def _read_stored(run: Path | str) -> tuple[Streams, FuseConfig] | None:
         return None
     store, runs = found
     if len(runs) > 1:
-        names = ", ".join(of.recipe_id for of in runs)
+        names = ", ".join(run.recipe_id for run in runs)
         raise UsageError(f"{run}: was ingested under several recipes; give one of them: {run}/… {names}")
     streams = store.read_streams(runs[0].run_id, key=runs[0].streams_key)
     if streams is None:

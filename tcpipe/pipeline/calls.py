@@ -163,7 +163,7 @@ def make_call(command: str, works_on: Sequence[str], options: object = None) -> 
 
 def find_settled_calls(state: State, call: Begun) -> list[int]:
     """Return the numbers of the calls that do not run and whose work another call does."""
-    return [of.number for of in list_begun_calls(state) if of.state != "running" and _is_done_by(of, call)]
+    return [begun.number for begun in list_begun_calls(state) if begun.state != "running" and _is_done_by(begun, call)]
 
 
 def _is_done_by(call: Begun, other: Begun) -> bool:
@@ -244,7 +244,7 @@ def estimate(calls: Sequence[CallRecord], command: str, amount: int, *, jobs: in
     What was measured counts as one more call, of as much work as takes as long as a call alone: few samples tell little of a million.
     """
     like = [call for call in calls if call.command == command and _parse_amount(call)]
-    of = "logs" if command == INGEST else "samples"
+    unit = "logs" if command == INGEST else "samples"
     rates, source = MEASURED[command], "from default figures: this store has no earlier calls"
     if like:
         done, alone = sum(_parse_amount(call) for call in like), rates.call_s / rates.cpu_s
@@ -252,7 +252,7 @@ def estimate(calls: Sequence[CallRecord], command: str, amount: int, *, jobs: in
         written = sum(call.written_bytes for call in like) + rates.written_bytes * alone
         rates = Rates((more_s + rates.call_s) / (done + alone), written / (done + alone), rates.call_s)
         source = f"by {len(like)} earlier call{'s' * (len(like) > 1)}"
-    return Estimate(of, amount, rates.call_s + rates.cpu_s * amount / jobs, int(rates.written_bytes * amount), source)
+    return Estimate(unit, amount, rates.call_s + rates.cpu_s * amount / jobs, int(rates.written_bytes * amount), source)
 
 
 def stored_bytes(store: Store, run_ids: Sequence[str]) -> int:
@@ -282,4 +282,4 @@ def _parse_amount(call: CallRecord) -> int:
 
 def _read_cpu_s() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(of.ru_utime + of.ru_stime for of in used) + read_cluster_cpu_s()
+    return sum(usage.ru_utime + usage.ru_stime for usage in used) + read_cluster_cpu_s()

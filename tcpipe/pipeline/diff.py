@@ -87,7 +87,9 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     moved = _count_moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
     causes = tuple(_iterate_causes(*cards))
     (ours, theirs) = (_find_all(card) for card in cards)
-    gone, new = (tuple(of[key] for key in of if key not in other) for of, other in ((ours, theirs), (theirs, ours)))
+    gone, new = (
+        tuple(runs[key] for key in runs if key not in other) for runs, other in ((ours, theirs), (theirs, ours))
+    )
     same = not (causes or moved or gone or new or any(counts[name] for name in _CHANGES))
     return Difference(
         a=str(a),
@@ -106,15 +108,15 @@ def diff(a: str | Path, b: str | Path) -> Difference:
 def _find_all(card: DatasetCard) -> dict[tuple[str, str, Subject], Finding]:
     """Return every finding of a dataset by its run or map, its code and its subject."""
     every = [("", card.findings), *card.findings_by_run.items(), *card.findings_by_map.items()]
-    return {(where, of.code, of.subject): of for where, findings in every for of in findings}
+    return {(where, finding.code, finding.subject): finding for where, findings in every for finding in findings}
 
 
 def _compute_shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
     values = {name: [_read_values(table, name) for table in tables] for name in _LABELS if all(map(len, tables))}
     return {
         name: {
-            f"{what}_{end}": float(getattr(of, what)())
-            for end, of in zip("ab", both, strict=True)
+            f"{what}_{end}": float(getattr(samples, what)())
+            for end, samples in zip("ab", both, strict=True)
             for what in ("mean", "std")
         }
         for name, both in values.items()
@@ -143,8 +145,8 @@ def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, floa
 def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
     """Return the rows of samples of one run that share most of the longer one's time: on another track a run is cut elsewhere."""
     runs = pc.unique(b.column("run_id"))
-    run = [pc.index_in(of.column("run_id"), value_set=runs).fill_null(-1).to_numpy() for of in (b, a)]
-    begin_b, end_b, begin_a, end_a = (to_integers(of, f"{end}_ns") for of in (b, a) for end in ("start", "end"))
+    run = [pc.index_in(table.column("run_id"), value_set=runs).fill_null(-1).to_numpy() for table in (b, a)]
+    begin_b, end_b, begin_a, end_a = (to_integers(table, f"{end}_ns") for table in (b, a) for end in ("start", "end"))
     order = np.lexsort((np.concatenate([begin_b, begin_a + (end_a - begin_a) // 2]), np.concatenate(run)))
     latest = np.maximum.accumulate(np.where(order < len(b), np.arange(len(order)), 0))  # that began before each middle
     of_a = order >= len(b)
@@ -219,7 +221,10 @@ def _iterate_causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
         yield f"region: {'added' if a.split.region is None else 'removed' if b.split.region is None else 'another one'}"
     if a.split.kept != b.split.kept:
         yield f"kept split: {_format_value(to_plain(a.split.kept))} → {_format_value(to_plain(b.split.kept))}"
-    yield from _exclusion_causes({of.name: of for of in a.exclusions}, {of.name: of for of in b.exclusions})
+    yield from _exclusion_causes(
+        {exclusion.name: exclusion for exclusion in a.exclusions},
+        {exclusion.name: exclusion for exclusion in b.exclusions},
+    )
     if a.format != b.format:
         yield f"format: {a.format} → {b.format}"
 
@@ -239,8 +244,8 @@ def _exclusion_causes(a: Mapping[str, Exclusion], b: Mapping[str, Exclusion]) ->
     for name in sorted({*a, *b}):
         was, now = a.get(name), b.get(name)
         if was is None or now is None:
-            which, of = ("removed", was) if now is None else ("added", now)
-            yield f"exclusion: {which} {name} ({of.samples if of else 0} samples): {of.reason if of else ''}"
+            which, exclusion = ("removed", was) if now is None else ("added", now)
+            yield f"exclusion: {which} {name} ({exclusion.samples if exclusion else 0} samples): {exclusion.reason if exclusion else ''}"
         elif was != now:
             yield f"exclusion: {name} is another list: {was.samples} → {now.samples} samples, {was.reason} → {now.reason}"
 
@@ -284,7 +289,10 @@ def _iterate_lines(found: Difference) -> Iterator[str]:
         if change["largest"] > 0.0:
             count = f"{change['samples']:.0f} samples"
             yield f"{name} of {count}: changed by {change['median']:.3g} in the median, by {change['largest']:.3g} at most"
-    for name, of in found.labels.items():
-        if not np.allclose((of["mean_a"], of["std_a"]), (of["mean_b"], of["std_b"])):
-            means, deviations = f"{of['mean_a']:.4g} → {of['mean_b']:.4g}", f"{of['std_a']:.4g} → {of['std_b']:.4g}"
+    for name, label in found.labels.items():
+        if not np.allclose((label["mean_a"], label["std_a"]), (label["mean_b"], label["std_b"])):
+            means, deviations = (
+                f"{label['mean_a']:.4g} → {label['mean_b']:.4g}",
+                f"{label['std_a']:.4g} → {label['std_b']:.4g}",
+            )
             yield f"{name} of all samples: mean {means}, deviation {deviations}"

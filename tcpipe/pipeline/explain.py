@@ -186,7 +186,9 @@ def _read_history(
         masks=tuple(_iterate_masks(run, *window)),
         rejected=tuple(_iterate_rejections(run, *window)),
         map=_map(source, sample, card),
-        recipe_differs_in={key: of for key, of in flatten_recipe(card.recipe).items() if of != _DEFAULTS.get(key)},
+        recipe_differs_in={
+            key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
+        },
         versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
         made_from="segments" if streams is None else "streams",
     )
@@ -298,7 +300,9 @@ def _sample_segment(segment: Mapping[str, Value], source: MapFile, card: Dataset
     """Sample one segment, given as a row of values, moved as the dataset's run was."""
     row = {column.name: pa.array([segment[column.name]], column.dtype) for column in PLACED_SEGMENTS.columns}
     table = pa.Table.from_arrays(list(row.values()), schema=PLACED_SEGMENTS.arrow())
-    shifts = list_shifts(entry for of in card.maps if of.name == source.name for entry in of.registration)
+    shifts = list_shifts(
+        entry for map_source in card.maps if map_source.name == source.name for entry in map_source.registration
+    )
     return sample_segments(table, source, card.recipe.sample, gnss_crs=card.recipe.read.gnss_crs, shifts=shifts)
 
 
@@ -379,7 +383,7 @@ def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
     """Return a recipe's values by dotted key; a table whose keys are the user's own is one value."""
     flat: dict[str, Setting] = {}
     for key, value in to_plain(asdict(recipe)).items():
-        flat |= {f"{key}.{name}": of for name, of in value.items()} if isinstance(value, Mapping) else {key: value}
+        flat |= {f"{key}.{name}": item for name, item in value.items()} if isinstance(value, Mapping) else {key: value}
     return flat
 
 

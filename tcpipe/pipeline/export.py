@@ -180,7 +180,7 @@ def _refuse_what_is_ours(out: Path) -> None:
 
 
 def _refuse_others_files(index: Mapping[str, IndexEntry], made_from: ExportOrigin, paths: Mapping[str, Path]) -> None:
-    others = {of.file: of.made_from.log for of in index.values() if of.made_from.log != made_from.log}
+    others = {topic.file: topic.made_from.log for topic in index.values() if topic.made_from.log != made_from.log}
     taken = sorted({others[path.name] for path in paths.values() if path.name in others})
     if taken:
         out = next(iter(paths.values())).parent
@@ -209,9 +209,11 @@ def _make_exported(
     status: Literal["done", "unchanged"], entries: Mapping[str, IndexEntry], wanted: Sequence[str], log: str, out: Path
 ) -> Exported:
     found = {name: entries[name] for name in wanted}
-    files = tuple(ExportedTopic(name, of.type, out / of.file, of.rows) for name, of in found.items() if of.file)
-    damage = dict.fromkeys(finding for of in found.values() for finding in of.damage)
-    notes = dict.fromkeys(finding for of in found.values() for finding in of.notes)
+    files = tuple(
+        ExportedTopic(name, topic.type, out / topic.file, topic.rows) for name, topic in found.items() if topic.file
+    )
+    damage = dict.fromkeys(finding for topic in found.values() for finding in topic.damage)
+    notes = dict.fromkeys(finding for topic in found.values() for finding in topic.notes)
     return Exported(log, out, status, files, tuple(damage), tuple(notes), 3 if damage else 0)
 
 

@@ -158,7 +158,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
     """Log a line for each pattern of time windows that fits no run of the store."""
     run_ids = sorted({row.run_id for row in state.runs.values()})
     more = f" and {len(run_ids) - _MOST_RUNS} more" if len(run_ids) > _MOST_RUNS else ""
-    for pattern, window in {of.run: of for of in windows}.items():
+    for pattern, window in {time_window.run: time_window for time_window in windows}.items():
         if run_ids and not any(map(window.is_for, run_ids)):
             text = (
                 "recipe mask.windows (or its CSV file): run = %r fits no run, so its windows have no effect; runs: %s%s"
@@ -274,8 +274,8 @@ def _commit(
 ) -> Iterator[tuple[int, IngestResult]]:
     """Commit what became of logs, and yield it with what the log says of it; a run that cannot be committed has failed for now."""
     before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
-    for index, task, of in ended:
-        more, notes[index] = _make_entries(log, task, of)
+    for index, task, ingested in ended:
+        more, notes[index] = _make_entries(log, task, ingested)
         entries = Entries(*((*getattr(entries, name.name), *getattr(more, name.name)) for name in fields(Entries)))
     others = dict[str, str]()
 
@@ -293,22 +293,27 @@ def _commit(
     except StoreError as error:
         if not entries.runs:
             logger.error("%s", error)  # noqa: TRY400  one line
-        ended = [(index, task, _fail_commit(of, error) if of.rows else of) for index, task, of in ended]
+        ended = [
+            (index, task, _fail_commit(ingested, error) if ingested.rows else ingested)
+            for index, task, ingested in ended
+        ]
     keep_state_here(log.store.place, log.state)
-    for index, _, of in ended:
-        result = replace(of.result, notes=(*of.result.notes, *notes[index]))
+    for index, _, ingested in ended:
+        result = replace(ingested.result, notes=(*ingested.result.notes, *notes[index]))
         if result.run and (by := others.get(result.run.run_id)):
-            result = _adopt_committed_run(log.state.runs.get((by, result.run.recipe_id)), by, result, of.source)
+            result = _adopt_committed_run(log.state.runs.get((by, result.run.recipe_id)), by, result, ingested.source)
         queue.release_claim(index, result)
-        yield index, _judge_result(log.state, result, of.source, before=before)
+        yield index, _judge_result(log.state, result, ingested.source, before=before)
 
 
-def _fail_commit(of: Ingested, error: StoreError) -> Ingested:
+def _fail_commit(ingested: Ingested, error: StoreError) -> Ingested:
     """Return that a run is in the store and no commit names it: the next call finds it there."""
-    problems = tuple(f"{of.result.log}: {problem}" for problem in error.problems)
-    findings = find_failure(of.result.log, type(error).__name__)
+    problems = tuple(f"{ingested.result.log}: {problem}" for problem in error.problems)
+    findings = find_failure(ingested.result.log, type(error).__name__)
     return replace(
-        of, result=IngestResult(of.result.log, "failed", causes=findings, problems=problems, transient=True), rows=()
+        ingested,
+        result=IngestResult(ingested.result.log, "failed", causes=findings, problems=problems, transient=True),
+        rows=(),
     )
 
 
@@ -326,10 +331,10 @@ def _adopt_committed_run(made: RunFacts | None, run_id: str, result: IngestResul
     )
 
 
-def _make_entries(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries, tuple[str, ...]]:
+def _make_entries(log: LogWriter, task: IngestTask, ingested: Ingested) -> tuple[Entries, tuple[str, ...]]:
     """Return what a commit has of the result of a log, and what is to be said of runs that it supersedes."""
-    source, result, sha256 = of.source, of.result, of.result.sha256
-    entries, notes = Entries(runs=of.rows), list[str]()
+    source, result, sha256 = ingested.source, ingested.result, ingested.result.sha256
+    entries, notes = Entries(runs=ingested.rows), list[str]()
     new = sha256 is not None and bool(source.files) and not log.state.has_seen(source.sighting(sha256))
     run_id = result.run.run_id if result.run else None
     if run_id and sha256 and (new or result.status != "unchanged" or run_id in log.state.parties):
@@ -353,8 +358,12 @@ def _judge_result(state: State, result: IngestResult, source: LogSource, *, befo
     if result.run is None or not select_problems(result.findings):
         return result
     problems = find_problems(result.run)
-    told = {of.key for old in before.find_rows(result.run.run_id) for of in find_problems(old)}
-    return replace(result, known=all(of.key in told for of in problems), acknowledged=is_acknowledged(problems, state))
+    reported = {problem.key for old in before.find_rows(result.run.run_id) for problem in find_problems(old)}
+    return replace(
+        result,
+        known=all(problem.key in reported for problem in problems),
+        acknowledged=is_acknowledged(problems, state),
+    )
 
 
 _CONTAINED = 0.9

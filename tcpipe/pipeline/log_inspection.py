@@ -182,7 +182,9 @@ def _read(
         for name, table in tables.items():
             found.setdefault(name, TopicStamps()).add(table)
     times = {name: stamps.topic_times() for name, stamps in found.items()}
-    clocks = {name: of for name, of in times.items() if of.header_ns is not None and len(of.log_time_ns)}
+    clocks = {
+        name: stamps for name, stamps in times.items() if stamps.header_ns is not None and len(stamps.log_time_ns)
+    }
     published = any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values())
     settled = settle_clocks(clocks, clock_published=published)
     clock = settled.simulated
@@ -225,7 +227,11 @@ def _find_slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, 
             topic.type_name, name, known.power_sources, platform=robot.platform, husky_power=recipe.read.husky_power
         )
         rate_hz = topic.rate_hz and round(topic.rate_hz, 2)
-        if isinstance(choices, Finding) or rate_hz is None or not any(of.current or of.energy for of in choices[0]):
+        if (
+            isinstance(choices, Finding)
+            or rate_hz is None
+            or not any(source.current or source.energy for source in choices[0])
+        ):
             continue  # a voltage alone may be slow
         averaged = {"auto": choices[0][0].averaged, "yes": True, "no": False}[recipe.read.power_averaged]
         if is_too_slow(rate_hz, averaged=averaged):
@@ -321,7 +327,9 @@ def _find_repeated_rows(table: pa.Table, rows: Ints) -> Mask:
             break
         own, before = (column.take(pa.array(rows[left] - back)).combine_chunks() for back in (0, 1))
         if pa.types.is_primitive(column.type) and not pa.types.is_boolean(column.type):
-            values = [np.ascontiguousarray(of.to_numpy()).view(f"V{of.type.byte_width}") for of in (own, before)]
+            values = [
+                np.ascontiguousarray(column.to_numpy()).view(f"V{column.type.byte_width}") for column in (own, before)
+            ]
             same[left] = values[0] == values[1]  # bit by bit: a NaN equals itself
         else:
             same[left] = [own.slice(row, 1).equals(before.slice(row, 1)) for row in range(len(left))]

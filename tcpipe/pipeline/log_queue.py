@@ -279,6 +279,6 @@ class LogQueue:
             if step.is_todo and (at in self._own or step.state != "failed_transient")
         ]
 
-    def _make_key(self, of: str) -> str:
+    def _make_key(self, name: str) -> str:
         task = self._tasks[0]
-        return digest([of, ingest_key(task.recipe), task.robot, task.definitions, __version__])
+        return digest([name, ingest_key(task.recipe), task.robot, task.definitions, __version__])

@@ -309,7 +309,7 @@ def _stat_files(path: Path) -> list[os.stat_result]:
         return []
     if stat.S_ISDIR(seen.st_mode):
         names = (f"{place}/{name}" for place, _, held in walk_folders(path) for name in held)
-        return [of for file in sorted(names) if stat.S_ISREG((of := os.stat(file)).st_mode)]  # noqa: PTH116
+        return [status for file in sorted(names) if stat.S_ISREG((status := os.stat(file)).st_mode)]  # noqa: PTH116
     return [seen] if stat.S_ISREG(seen.st_mode) else []
 
 

@@ -142,10 +142,10 @@ def _bring_store(source: Place, target: Place) -> Migrated:
             units.setdefault("/".join(name.split("/")[: 2 if name.startswith("runs/") else 1]), []).append(name)
         elif target != source and name.startswith(f"{LOG}/"):
             log.append(name)
-    done = run_side_by_side(lambda of: _bring_unit(source, target, of, there), [*units.values()])
-    copied = sum(of.copied for of in done) + sum(_put(target, name, source.read(name), there) for name in log)
-    changed = [] if is_current else [target.where(name) for of in done for name in of.changed]
-    problems = [line for of in done for line in of.problems]
+    done = run_side_by_side(lambda unit: _bring_unit(source, target, unit, there), [*units.values()])
+    copied = sum(unit.copied for unit in done) + sum(_put(target, name, source.read(name), there) for name in log)
+    changed = [] if is_current else [target.where(name) for unit in done for name in unit.changed]
+    problems = [line for unit in done for line in unit.problems]
     records = [name for name in names if name.startswith(_RECORDS)]
     if records or read_layout(target) != DATA_MODEL_VERSION:
         problems += _write_log(Store(target.where()), source, records)
@@ -184,8 +184,8 @@ def _bring_unit(source: Place, target: Place, names: Sequence[str], there: Mappi
     try:
         for name in folders.pop("", ()):
             copied += _put(target, name, source.read(name), there)
-        for prefix, of in folders.items():
-            copied += _copy_folder(source, target, prefix, {name: listed.get(name) for name in of}, there)
+        for prefix, folder in folders.items():
+            copied += _copy_folder(source, target, prefix, {name: listed.get(name) for name in folder}, there)
     except StoreError as error:
         return _Unit((), copied, (*problems, *error.problems))
     put = [name for name, data in documents.items() if _put(target, name, data, there)]
@@ -208,8 +208,8 @@ def _copy_folder(
 
     `StoreError` where a file is not what the documents have of it.
     """
-    digests = {name: of or source.checksum(name) or Checksum(0, "") for name, of in wanted.items()}
-    if all(there.get(name) == of.size_bytes for name, of in digests.items()) and not find_changed_files(
+    digests = {name: checksum or source.checksum(name) or Checksum(0, "") for name, checksum in wanted.items()}
+    if all(there.get(name) == digest.size_bytes for name, digest in digests.items()) and not find_changed_files(
         target, digests, digests
     ):
         return 0
@@ -228,14 +228,14 @@ def _copy_folder(
 
 def _is_converted(name: str) -> bool:
     """Return whether a file is a document of a run."""
-    of = split_number(name.rpartition("/")[2]) if name.startswith("runs/") else None
-    return of is not None and of[0] in ("run", "manifest", "tags")
+    number = split_number(name.rpartition("/")[2]) if name.startswith("runs/") else None
+    return number is not None and number[0] in ("run", "manifest", "tags")
 
 
 def _read_checksums(document: Document, above: str) -> dict[str, Checksum]:
     """Return what a document has of files, by their name in the store."""
     found = {**document.get("checksums", {}), **document.get("streams", {})}
-    return {f"{above}/{name}": parse_typed(of, Checksum, above) for name, of in found.items()}
+    return {f"{above}/{name}": parse_typed(checksum, Checksum, above) for name, checksum in found.items()}
 
 
 def _bring(found: Document, data: bytes, name: str, where: str) -> bytes:
@@ -282,8 +282,10 @@ def _bring_document(found: Document, where: str) -> Document:
             "findings": findings,
             "runs": [_convert_findings(run, "run", run["run_id"]) for run in found["runs"]],
         }
-        document |= {"maps": [_convert_findings(_rename_top_keys(of), "map", of["name"]) for of in found["maps"]]}
-        rules = {of.name for of in fields(SplitConfig)} - {"buffer_m"}  # the recipe has them
+        document |= {
+            "maps": [_convert_findings(_rename_top_keys(entry), "map", entry["name"]) for entry in found["maps"]]
+        }
+        rules = {entry.name for entry in fields(SplitConfig)} - {"buffer_m"}  # the recipe has them
         document |= {"split": _remove_keys(found["split"], *rules)}
         if found.get("redaction"):  # their descriptions name tags and files
             document |= {"added_columns": dict.fromkeys(found.get("added_columns", ()), "")}
@@ -293,16 +295,16 @@ def _bring_document(found: Document, where: str) -> Document:
 def _bring_counts(counts: Mapping[str, int]) -> dict[str, Any]:
     """Return the counts of a manifest with those of messages by role."""
     ending = "_messages"
-    messages = {name.removesuffix(ending): of for name, of in counts.items() if name.endswith(ending)}
+    messages = {name.removesuffix(ending): count for name, count in counts.items() if name.endswith(ending)}
     return {**_remove_keys(counts, *(f"{role}{ending}" for role in messages)), "messages": messages}
 
 
 def _rename_top_keys(document: Document) -> dict[str, Any]:
-    return {EARLIER_DOCUMENT_KEYS.get(name, name): of for name, of in document.items()}
+    return {EARLIER_DOCUMENT_KEYS.get(name, name): value for name, value in document.items()}
 
 
 def _remove_keys(document: Document, *names: str) -> dict[str, Any]:
-    return {name: of for name, of in document.items() if name not in names}
+    return {name: value for name, value in document.items() if name not in names}
 
 
 def _convert_findings(found: Document, kind: SubjectKind, name: str) -> dict[str, Any]:
@@ -326,12 +328,12 @@ def _write_log(store: Store, source: Place, record_names: Sequence[str]) -> list
             records.setdefault(name.split("/")[1], []).append({**found, "key": Path(name).stem})
         except StoreError as error:
             problems += error.problems
-    outlines = {of["run_id"]: of["outline"] for of in records.get("outlines", ())}
+    outlines = {record["run_id"]: record["outline"] for record in records.get("outlines", ())}
     names = store.run_ids()
     for start in range(0, len(names), _TOGETHER):
         run_ids = names[start : start + _TOGETHER]
         read = source.map(store.read_rows, run_ids)
-        rows = [row for of in read for row in of.values() if not is_committed(row, log.state)]
+        rows = [row for rows_by_log in read for row in rows_by_log.values() if not is_committed(row, log.state)]
         known = (replace(row, log=row.log and replace(row.log, outline=outlines.get(row.run_id, ""))) for row in rows)
         log.commit("ingested", Entries(runs=tuple(known)))
     log.commit("seen", lambda state: _convert_records(records, state))
@@ -343,31 +345,40 @@ def _convert_records(records: Mapping[str, Sequence[Document]], state: State) ->
     """Return what records say and a state does not."""
 
     def read(kind: str, cls: type[T]) -> list[T]:
-        return [parse_typed(of, cls, kind) for of in records.get(kind, ())]
+        return [parse_typed(record, cls, kind) for record in records.get(kind, ())]
 
-    replaced = {(of.out, of.inputs) for of in read("replaced", Dataset)}
-    superseded = sorted(records.get("superseded", ()), key=lambda of: (of["number"], of["by"] is None))
-    failed = ({**of, "problems": of["lines"], "version": of.get("version") or ""} for of in records.get("failed", ()))
+    replaced = {(dataset.out, dataset.inputs) for dataset in read("replaced", Dataset)}
+    superseded = sorted(records.get("superseded", ()), key=lambda record: (record["number"], record["by"] is None))
+    failed = (
+        {**record, "problems": record["lines"], "version": record.get("version") or ""}
+        for record in records.get("failed", ())
+    )
     accepted = chain(*map(_iterate_acknowledged, records.get("accepted", ())))
-    calls = sorted(read("calls", CallRecord), key=lambda of: of.begin)
+    calls = sorted(read("calls", CallRecord), key=lambda call: call.begin)
     return Entries(
-        seen=tuple(of for of in read("logs", LogSnapshot) if not state.has_seen(of)),
-        failed=tuple(of for of in parse_typed([*failed], list[Failure], "failed") if of.key not in state.failed),
-        acknowledged=tuple(of for of in accepted if of.key not in state.acknowledged),
-        superseded=() if state.supersessions else tuple(Superseded(of["run_id"], of["by"]) for of in superseded),
+        seen=tuple(snapshot for snapshot in read("logs", LogSnapshot) if not state.has_seen(snapshot)),
+        failed=tuple(
+            failure for failure in parse_typed([*failed], list[Failure], "failed") if failure.key not in state.failed
+        ),
+        acknowledged=tuple(problem for problem in accepted if problem.key not in state.acknowledged),
+        superseded=()
+        if state.supersessions
+        else tuple(Superseded(record["run_id"], record["by"]) for record in superseded),
         datasets=tuple(
-            of for of in read("datasets", Dataset) if (of.out, of.inputs) not in {*replaced, *state.datasets}
+            dataset
+            for dataset in read("datasets", Dataset)
+            if (dataset.out, dataset.inputs) not in {*replaced, *state.datasets}
         ),
         calls=() if state.calls else tuple(calls),
     )
 
 
-def _iterate_acknowledged(of: Document) -> Iterator[Problem]:
+def _iterate_acknowledged(document: Document) -> Iterator[Problem]:
     """Yield the problems of which somebody said so; that a call was killed is not carried over."""
-    name = of.get("run_id") or " + ".join(of["log"])
-    kind: SubjectKind = "run" if of.get("run_id") else "log"
+    name = document.get("run_id") or " + ".join(document["log"])
+    kind: SubjectKind = "run" if document.get("run_id") else "log"
     for code in {"damaged": ("log-damaged", "no-segments"), "empty": ("no-segments",), "failed": ("log-failed",)}.get(
-        of["kind"], ()
+        document["kind"], ()
     ):
         finding = Finding(code, "error", Subject(kind, name), "rejected")
-        yield Problem(finding, of["content"], tuple(of["log"]), of.get("run_id"))
+        yield Problem(finding, document["content"], tuple(document["log"]), document.get("run_id"))

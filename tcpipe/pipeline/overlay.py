@@ -140,8 +140,11 @@ class _Clock:
             mine, known = epoch == number, self._epoch == number
             known = known if known.any() else np.ones_like(known)
             begin = self._stamp_ns[known][0]  # differences are exact in float64, times since 1970 are not
-            at, of = (stamp_ns[mine] - begin).astype(np.float64), (self._stamp_ns[known] - begin).astype(np.float64)
-            times[mine] += np.rint(np.interp(at, of, self._behind_ns[known])).astype(np.int64)
+            at, known_ns = (
+                (stamp_ns[mine] - begin).astype(np.float64),
+                (self._stamp_ns[known] - begin).astype(np.float64),
+            )
+            times[mine] += np.rint(np.interp(at, known_ns, self._behind_ns[known])).astype(np.int64)
         return times
 
     def _epoch_of(self, stamp_ns: Ints) -> Ints:
@@ -169,8 +172,8 @@ def _read_column(table: pa.Table, name: str) -> NDArray[Any]:
 def _add_bit_names(table: pa.Table, column: str, flags: type[DropReason | Quality], name: str, none: str) -> pa.Table:
     """Return the table with the names of its bits as a text column."""
     bits = _read_column(table, column)
-    told = {int(value): ", ".join(flag_names(int(value), flags)) or none for value in np.unique(bits)}
-    return table.append_column(name, make_text_column([told[int(value)] for value in bits]))
+    texts = {int(value): ", ".join(flag_names(int(value), flags)) or none for value in np.unique(bits)}
+    return table.append_column(name, make_text_column([texts[int(value)] for value in bits]))
 
 
 def _make_header(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
@@ -209,21 +212,23 @@ def _iterate_masks(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageSt
 def _iterate_messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[MessageStream]:
     """Yield the rows of a table as messages of a type of their own: a field a column, null as NaN; rows of equally long texts together."""
     kinds = {field.name: _ROS_TYPES[field.type] for field in table.schema}
-    definition = "std_msgs/Header header\n" + "".join(f"{kind} {of}\n" for of, kind in kinds.items())
+    definition = "std_msgs/Header header\n" + "".join(f"{kind} {column_name}\n" for column_name, kind in kinds.items())
     columns = _make_header(_read_column(table, stamp))
     lengths = np.zeros((len(times), 0), np.int64)
-    for of, kind in kinds.items():
+    for column_name, kind in kinds.items():
         if kind == "string":
-            columns[of] = np.char.encode(to_texts(table.column(of)), "utf-8") if len(times) else np.empty(0, "S1")
-            lengths = np.column_stack([lengths, np.char.str_len(columns[of])])
+            columns[column_name] = (
+                np.char.encode(to_texts(table.column(column_name)), "utf-8") if len(times) else np.empty(0, "S1")
+            )
+            lengths = np.column_stack([lengths, np.char.str_len(columns[column_name])])
         else:
-            columns[of] = _read_column(table, of)
+            columns[column_name] = _read_column(table, column_name)
     for length in np.unique(lengths, axis=0) if len(times) else lengths[:1]:
         rows = (lengths == length).all(axis=-1)
         sizes = iter(length.tolist())
         alike = {
-            of: values[rows].astype(f"S{next(sizes)}") if values.dtype.kind == "S" else values[rows]
-            for of, values in columns.items()
+            column_name: values[rows].astype(f"S{next(sizes)}") if values.dtype.kind == "S" else values[rows]
+            for column_name, values in columns.items()
         }
         constants = {"header.frame_id": _FRAME}
         yield MessageStream(

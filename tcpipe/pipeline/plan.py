@@ -285,7 +285,7 @@ def _describe_pending(task: IngestTask, known: _Known) -> str:
     """Return why a log that was seen before is to be ingested; "" of a new one."""
     sha256 = task.source.sha256
     if before := known.failures.get(_describe_content(task)):
-        acknowledged = is_acknowledged([make_failure(of.content, of.log) for of in before], known.state)
+        acknowledged = is_acknowledged([make_failure(failure.content, failure.log) for failure in before], known.state)
         return f"{_describe_failure(before, task)}{', acknowledged' if acknowledged else ''}; to be tried again"
     if task.force:
         return "to be ingested again if present"
@@ -297,8 +297,8 @@ def _describe_pending(task: IngestTask, known: _Known) -> str:
 def _describe_failure(before: Sequence[Failure], task: IngestTask) -> str:
     if task.force or task.retry_failed:
         return "failed before"
-    latest = max(of.version for of in before)
-    if __version__ not in {of.version for of in before}:
+    latest = max(failure.version for failure in before)
+    if __version__ not in {failure.version for failure in before}:
         return f"failed with {f'tcpipe {latest}' if latest else 'another version'}"
     return "failed under another recipe, for another robot or with other message definitions"
 

@@ -124,7 +124,7 @@ class Preflight:
             f"{self.log}: robot {self.robot or 'unknown'}",
             *(self.expected_yield.lines() if self.expected_yield else ()),
         ]
-        said += [f"topic     {_rate(of)}" for of in self.topics]
+        said += [f"topic     {_rate(topic)}" for topic in self.topics]
         said += [f"fails     {line}" for line in self.problems]
         said += [f"verdict   {format_verdict(self.verdict)}"] if self.expected_yield else []
         said += format_findings(self.findings, more=f"tcpipe preflight {shlex.quote(self.log)} --json")
@@ -133,9 +133,9 @@ class Preflight:
         return clean_lines([*said, "", *self.recipe.splitlines()])
 
 
-def _rate(of: RoleTopic) -> str:
-    rate = "" if of.rate_hz is None else f" at {of.rate_hz:.3g} Hz"
-    return f"{of.role}: {of.topic}{rate}" + ("" if of.wanted_hz is None else f" (needed {of.wanted_hz:g})")
+def _rate(topic: RoleTopic) -> str:
+    rate = "" if topic.rate_hz is None else f" at {topic.rate_hz:.3g} Hz"
+    return f"{topic.role}: {topic.topic}{rate}" + ("" if topic.wanted_hz is None else f" (needed {topic.wanted_hz:g})")
 
 
 def preflight(
@@ -175,10 +175,14 @@ def _summarize(
     topics = tuple(_iterate_topics(report.facts, seen.duration_s or 0.0))
     findings = [*missing, *find_slow(topics, expected_yield, seen.duration_s or 0.0)]
     for more in (seen.findings or (), report.findings):
-        made = {(of.code, of.subject) for of in findings}
-        findings += [of for of in more if (of.code, of.subject) not in made]
+        made = {(finding.code, finding.subject) for finding in findings}
+        findings += [finding for finding in more if (finding.code, finding.subject) not in made]
     losses = find_largest_losses([expected_yield.distance_by_reason_m] if expected_yield else [])
-    ready = expected_yield is not None and expected_yield.segments and all(of.severity == "note" for of in findings)
+    ready = (
+        expected_yield is not None
+        and expected_yield.segments
+        and all(finding.severity == "note" for finding in findings)
+    )
     return Preflight(
         log=seen.path,
         robot=seen.robot,
@@ -223,8 +227,8 @@ def _compute_hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | N
 
 
 def _iterate_topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
-    for role, of in facts.roles.items():
-        for name, topic in of.topics.items():
+    for role, role_facts in facts.roles.items():
+        for name, topic in role_facts.topics.items():
             whole = (topic.rate_hz or 0.0) * span_s
             yield RoleTopic(
                 role, name, topic.rate_hz, WANTED_HZ.get(role), min(topic.rows / whole, 1.0) if whole else 1.0
@@ -246,13 +250,15 @@ def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
 
 def find_slow(topics: Sequence[RoleTopic], expected_yield: ExpectedYield | None, span_s: float) -> Iterator[Finding]:
     """Yield what is too slow, too short or absent for a part of the time to record a day in this way."""
-    for of in topics:
-        subject, names = Subject("role", of.role), {"topic": of.topic}
-        least_hz = read_threshold("rate-too-low", "min_rate_fraction") * (of.wanted_hz or 0.0)
-        if of.rate_hz is not None and of.wanted_hz is not None and of.rate_hz < least_hz:
-            yield make_finding("rate-too-low", subject, names=names, rate_hz=of.rate_hz, wanted_hz=of.wanted_hz)
-        if of.role != "command" and of.present_fraction < read_threshold("topic-incomplete", "min_present_fraction"):
-            yield make_finding("topic-incomplete", subject, names=names, present_fraction=of.present_fraction)
+    for topic in topics:
+        subject, names = Subject("role", topic.role), {"topic": topic.topic}
+        least_hz = read_threshold("rate-too-low", "min_rate_fraction") * (topic.wanted_hz or 0.0)
+        if topic.rate_hz is not None and topic.wanted_hz is not None and topic.rate_hz < least_hz:
+            yield make_finding("rate-too-low", subject, names=names, rate_hz=topic.rate_hz, wanted_hz=topic.wanted_hz)
+        if topic.role != "command" and topic.present_fraction < read_threshold(
+            "topic-incomplete", "min_present_fraction"
+        ):
+            yield make_finding("topic-incomplete", subject, names=names, present_fraction=topic.present_fraction)
     budget = expected_yield.energy_budget if expected_yield else None
     if budget is not None and _is_ruled_by_rate(budget):
         yield make_finding(

@@ -30,7 +30,9 @@ class Acknowledged:
 def find_problems(row: RunFacts) -> tuple[Problem, ...]:
     """Return what is wrong with a run: damage of its log, or that it has no segments."""
     log = row.log.source if row.log else None
-    return tuple(Problem(of, log.sha256, log.paths, row.run_id) for of in select_problems(row.findings) if log)
+    return tuple(
+        Problem(finding, log.sha256, log.paths, row.run_id) for finding in select_problems(row.findings) if log
+    )
 
 
 def make_failure(content: str, log: tuple[str, ...]) -> Problem:
@@ -96,7 +98,11 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
         else:
             wrong.append(
                 _describe_no_match(
-                    name, found, [of for of in known.values() if of.key not in state.acknowledged], state, opened.root
+                    name,
+                    found,
+                    [problem for problem in known.values() if problem.key not in state.acknowledged],
+                    state,
+                    opened.root,
                 )
             )
     if wrong:
@@ -114,8 +120,12 @@ def _name_problems(name: str, known: Iterable[Problem], state: State) -> list[Pr
     paths = {name, str(Path(name).absolute()), str(Path(name).resolve())}
     contents = {sighting.sha256 for path in paths for sighting in state.seen.get(find_lineage((path,)), ())}
     known = list(known)
-    exact = [of for of in known if of.content in contents or paths & {of.name, " + ".join(of.log), *of.log}]
-    return exact or [of for of in known if name in {Path(origin).name for origin in of.log}]
+    exact = [
+        failure
+        for failure in known
+        if failure.content in contents or paths & {failure.name, " + ".join(failure.log), *failure.log}
+    ]
+    return exact or [failure for failure in known if name in {Path(origin).name for origin in failure.log}]
 
 
 def _make_lost_problem(name: str, store: Store, state: State) -> list[Problem]:

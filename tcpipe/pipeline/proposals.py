@@ -92,7 +92,9 @@ def propose_for_log(
     config, known = find_read_config(recipe, log.topics), load_profiles(recipe)
     used = {name: role for role, names in assigned.choices.items() for name in names}
     used |= {name: role.name for role in assigned.roles.values() for name in role.topics}
-    used |= {of.subject.name: of.names["role"] for of in proposals if of.code == "role-proposed"}
+    used |= {
+        proposal.subject.name: proposal.names["role"] for proposal in proposals if proposal.code == "role-proposed"
+    }
     types = {name: log.topics[name].type_name for name in used}
     unread = set[str]()
     if is_complete:
@@ -104,8 +106,8 @@ def propose_for_log(
     lists = {name: list_power_lists(kind, known.power_sources) for name, kind in types.items()}
     columns = {name: make_message_arrays(tables[name], lists[name]) for name in used if name in tables}
     frames: dict[Role, str] = {}
-    for name, of in columns.items():
-        frames.setdefault(cast("Role", used[name]), next(iter(count_frames(of, types[name])), ""))
+    for name, column in columns.items():
+        frames.setdefault(cast("Role", used[name]), next(iter(count_frames(column, types[name])), ""))
     places = place_frames(log, tables, assigned, frames, config)
     head = ["", f"robot: {assigned.robot}, {assigned.robot_why}"]
     for role in assigned.roles.values():
@@ -124,7 +126,7 @@ def propose_for_log(
             lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
         if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
             fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
-            lines += [propose_quality("read.fields", "gnss.quality", of) for of in fields]
+            lines += [propose_quality("read.fields", "gnss.quality", field) for field in fields]
     unplaced = [
         (role, frames[role])
         for role, (_, by) in places.items()
@@ -138,7 +140,7 @@ def _format_ranges(numbers: Mapping[str, float]) -> str:
     """Return the lowest to the highest value of each unit, as ``24.1 V to 25.2 V``."""
     units = [name.removeprefix("low_") for name in numbers if name.startswith("low_")]
     ends = {unit: [(name, numbers[name]) for name in (f"low_{unit}", f"high_{unit}")] for unit in units}
-    return ", ".join(" to ".join(format_number(*end) for end in of) for of in ends.values())
+    return ", ".join(" to ".join(format_number(*end) for end in range_ends) for range_ends in ends.values())
 
 
 def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterator[ProposedLine]:
@@ -160,7 +162,13 @@ def _describe_sample(columns: Columns, topic: Topic, role: str, by: tuple[RoleAs
         choices = find_sources(kind, topic.name, known.power_sources, platform=platform, husky_power="battery")
         rails = [] if isinstance(choices, Finding) else read_rails(columns, choices[0], topic.name)
         read = [] if isinstance(rails, Finding) else rails
-        return count + "".join(f", {format_first(of.voltage_volt)} V, {format_first(of.current_amp)} A" for of in read)
-    needed = [(name, of.message) for name, of in MAPPED[role].items() if of.needed and of.message in columns]
+        return count + "".join(
+            f", {format_first(rail.voltage_volt)} V, {format_first(rail.current_amp)} A" for rail in read
+        )
+    needed = [
+        (name, definition.message)
+        for name, definition in MAPPED[role].items()
+        if definition.needed and definition.message in columns
+    ]
     named = needed[-3:] if kind == MAPPED_TYPES[role] else []  # of an IMU the accelerations, which show gravity
     return count + "".join(f", {name} {format_first(columns[message])}" for name, message in named)

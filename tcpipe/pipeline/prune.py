@@ -112,7 +112,7 @@ def prune(
         *_iterate_replaced(opened, log.state, min_age_s, unread),
     ):
         (removed if why is None else kept).extend(
-            Leftover(what, place.where(of.name), of.size_bytes, why) for of in entries
+            Leftover(what, place.where(entry.name), entry.size_bytes, why) for entry in entries
         )
         for entry in entries if why is None and not dry_run else ():
             place.delete(entry.name)
@@ -136,7 +136,7 @@ def _iterate_old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[
     for run_id, rows in by_run.items():
         ruling = [row for row in rows if row.ingest_key == key and row.tcpipe_version == __version__]
         for row in rows if ruling and run_id not in found.superseded else ():
-            if row.ingest_key != key and row.commit < max(of.commit for of in ruling):
+            if row.ingest_key != key and row.commit < max(row_.commit for row_ in ruling):
                 yield "old recipe", store.runs_place.below(f"{run_id}/{row.recipe_id}"), [(run_id, row.recipe_id)]
 
 
@@ -173,11 +173,11 @@ def _find_strangers(place: Place) -> Iterator[str]:
 def _forget(log: LogWriter, names: Sequence[str], *, dry_run: bool) -> None:
     """Commit that datasets are gone; `UsageError` where none lay at a path."""
     paths = {name: {name.rstrip("/"), str(Path(name).absolute())} for name in names}
-    gone = {name: [of for of in log.state.datasets.values() if of.out in paths[name]] for name in names}
+    gone = {name: [dataset for dataset in log.state.datasets.values() if dataset.out in paths[name]] for name in names}
     if unknown := [name for name in names if not gone[name]]:
         raise UsageError(*(f"{name}: not a dataset of this store; nothing is removed" for name in unknown))
     if not dry_run:
-        log.commit("pruned", Entries(forgotten=tuple(of for each in gone.values() for of in each)))
+        log.commit("pruned", Entries(forgotten=tuple(dataset for each in gone.values() for dataset in each)))
 
 
 def _find_references(state: State) -> tuple[dict[tuple[str, str], str], str | None]:
@@ -186,10 +186,10 @@ def _find_references(state: State) -> tuple[dict[tuple[str, str], str], str | No
         return {}, f"{state.problems[0].log[0]} is missing or damaged: it may name what a dataset refers to"
     found = dict[tuple[str, str], str]()
     for made in sorted(state.datasets.values(), key=is_replaced, reverse=True):
-        told = f"dataset {made.out} refers to it"
+        reason = f"dataset {made.out} refers to it"
         if is_replaced(made):
-            told = f"a dataset, formerly at {made.out}, refers to it; if it no longer exists: 'tcpipe prune --forget {made.out}'"
-        found.update(dict.fromkeys(made.runs, told))
+            reason = f"a dataset, formerly at {made.out}, refers to it; if it no longer exists: 'tcpipe prune --forget {made.out}'"
+        found.update(dict.fromkeys(made.runs, reason))
     return found, None
 
 
@@ -253,8 +253,8 @@ def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str 
             left = [entry for entry in entries if entry.name.startswith(f"{recipe_id}/")]
             yield "no commit names it", place, left, "ingest its log again, or remove it"
         young = {_find_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
-        content = [of for of in entries if split_number(of.name) or _CONTENT.search(of.name)]
-        over = [of for of in content if of.name not in named and _find_folder(of.name) not in young]
+        content = [entry for entry in entries if split_number(entry.name) or _CONTENT.search(entry.name)]
+        over = [entry for entry in content if entry.name not in named and _find_folder(entry.name) not in young]
         yield "no document names it", place, over, why
 
 
@@ -263,11 +263,11 @@ def _iterate_named(place: Place, sizes: Mapping[str, int], rows: Sequence[RunFac
     last, committed = find_highest_numbers(sizes), {name: size for row in rows for name, size in row.files.items()}
     recipes = {row.recipe_id for row in rows}
     for name, size in sizes.items():
-        of = split_number(name)
-        if of is None:
+        number = split_number(name)
+        if number is None:
             continue
-        is_last = of[1] == last[of[0]]
-        if committed.get(name) == size and of[0].endswith("/manifest"):  # the log names its tables too
+        is_last = number[1] == last[number[0]]
+        if committed.get(name) == size and number[0].endswith("/manifest"):  # the log names its tables too
             yield name
         elif name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
             yield from (name, *_iterate_named_by(place, name))

@@ -147,14 +147,14 @@ def _describe_dataset(store: Store, made: Dataset) -> StoredDataset:
 def _iterate_failed(state: State) -> Iterator[FailedLog]:
     """Yield the logs that gave no run, each once: those whose content has given one since are none."""
     made = [row.log.source for row in state.runs.values() if row.log is not None]
-    contents, names = {of.sha256 for of in made}, {" + ".join(of.paths) for of in made}
-    last = {of.content: of for of in sorted(state.failed.values(), key=lambda of: of.version)}
-    for of in sorted(last.values(), key=lambda of: of.log):
-        if of.content not in contents:
-            names.add(name := " + ".join(of.log))
-            acknowledged = is_acknowledged([make_failure(of.content, of.log)], state)
+    contents, names = {log.sha256 for log in made}, {" + ".join(log.paths) for log in made}
+    last = {failure.content: failure for failure in sorted(state.failed.values(), key=lambda failure: failure.version)}
+    for failure in sorted(last.values(), key=lambda failure: failure.log):
+        if failure.content not in contents:
+            names.add(name := " + ".join(failure.log))
+            acknowledged = is_acknowledged([make_failure(failure.content, failure.log)], state)
             yield FailedLog(
-                name, "".join(of.problems[:1]), "acknowledged" if acknowledged else "failed for what it holds"
+                name, "".join(failure.problems[:1]), "acknowledged" if acknowledged else "failed for what it holds"
             )
     for name, why in list_transient_failures(state.calls).items():
         if name not in names:

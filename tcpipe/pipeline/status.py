@@ -168,7 +168,7 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
         history=state.calls,
         verdict=judge_runs(current, find_changes(current)),
         runs=len(current),
-        findings={of.code: len(of.of) for of in by_code if of.severity != "note"},
+        findings={group.code: len(group.of) for group in by_code if group.severity != "note"},
         losses=find_largest_losses(run.distance_by_reason_m for run in current),
         exit_code=3 if trouble else 0,
     )
@@ -189,13 +189,19 @@ def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
     """Yield logs of one state with findings of the same codes on the same subjects; without findings, of the same cause."""
     groups: dict[tuple[LogState, Hashable], list[Step]] = {}
     for step in steps:
-        alike = frozenset((of.code, None if of.subject.kind in ("log", "run") else of.subject) for of in step.findings)
+        alike = frozenset(
+            (finding.code, None if finding.subject.kind in ("log", "run") else finding.subject)
+            for finding in step.findings
+        )
         groups.setdefault((step.state, alike or step.cause), []).append(step)
-    for (state, _), of in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
-        causes = list(dict.fromkeys(step.cause for step in of))
+    for (state, _), rows in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
+        causes = list(dict.fromkeys(step.cause for step in rows))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
         yield Group(
-            state, cause, tuple(step.task.source.name for step in of), sum(step.task.source.size_bytes for step in of)
+            state,
+            cause,
+            tuple(step.task.source.name for step in rows),
+            sum(step.task.source.size_bytes for step in rows),
         )
 
 

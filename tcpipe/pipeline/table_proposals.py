@@ -93,11 +93,15 @@ def propose_tables(path: Path) -> ProposedRecipe:
             roles.setdefault(role, []).append(candidate)
         unused = "" if found else ", not used: no known fields" if table else ", not used: no stamps"
         head.append(f"{name}{unused}; columns {', '.join(names)}")
-    ranked = [of for candidates in roles.values() for of in sorted(candidates, key=lambda of: -of[0].rows)[:1]]
+    ranked = [
+        candidate
+        for candidates in roles.values()
+        for candidate in sorted(candidates, key=lambda candidate: -candidate[0].rows)[:1]
+    ]
     lines, log = list[ProposedLine](), path
     for role, candidates in roles.items():
         first = ranked[0][0]
-        candidates.sort(key=lambda of: (-of[0].overlap_ns(first), -of[0].rows))
+        candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(first), -candidate[0].rows))
         table, mine = candidates[0]
         apart = "" if table.overlap_ns(first) else "no time in common with the others: another clock, or another drive"
         lines += [replace(line, note=f"{line.note}: {apart}", is_certain=False) for line in mine] if apart else mine
@@ -122,7 +126,7 @@ def _group_files(folder: Path, files: Sequence[Path]) -> dict[str, Path]:
         named.setdefault(numbered[file] if of_runs else file.name, []).append(file)
     return {
         name if len(group) > 1 else group[0].relative_to(folder).as_posix(): max(
-            group, key=lambda of: of.stat().st_size
+            group, key=lambda path: path.stat().st_size
         )
         for name, group in named.items()
     }
@@ -143,7 +147,7 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
             span_ns = int(stamp_ns.min()), int(stamp_ns.max())
         else:
             step = float(np.median(np.diff(known)))  # ten rows in a minute at least, in the coarsest unit that fits
-            fitting = (of for of, ns in reversed(STAMP_UNITS.items()) if 0 < step * ns / 1e9 <= 6.0)
+            fitting = (unit for unit, ns in reversed(STAMP_UNITS.items()) if 0 < step * ns / 1e9 <= 6.0)
             stated = "" if unit in STAMP_UNITS else next(fitting, "none")
             factor = STAMP_UNITS.get(stated or unit, 0)
             span_ns = int(known.min() * factor), int(known.max() * factor)
@@ -151,7 +155,7 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
         made = _Table(file, path, names, stamp, stated, is_absolute, span_ns, rows)
         if stated != "none":
             found.append(((is_absolute, rows, not cells.stamp_is_time), made))  # texts are often cut to seconds
-    return max(found, key=lambda of: of[0])[1] if found else None
+    return max(found, key=lambda candidate: candidate[0])[1] if found else None
 
 
 def _is_measured(name: str, names: Sequence[str]) -> bool:
@@ -203,8 +207,8 @@ def _iterate_power(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
 def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str], doubt: str = "") -> list[ProposedLine]:
     """Return the lines of a table's mapping; [] where its values cannot be what its columns are called."""
     values = _read_values(table, role, columns)
-    mapped = {of: text for of, text in columns.items() if of in values}
-    if not mapped or any(of not in mapped for of, known in MAPPED[role].items() if known.needed):
+    mapped = {field: text for field, text in columns.items() if field in values}
+    if not mapped or any(field not in mapped for field, known in MAPPED[role].items() if known.needed):
         return []
     used = [name for name in table.names if name in " ".join(mapped.values())]
     twice = next(filter(None, (describe_duplicate(name, table.names) for name in used)), "")
@@ -214,11 +218,11 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     keys: dict[str, tuple[TomlValue, str]] = {"role": ("power", "")} if name != role else {}
     keys |= {"file": (table.file, doubt), "stamp": (table.stamp, "")}
     keys |= {"stamp_unit": (table.stamp_unit, "by its steps")} if table.stamp_unit else {}
-    samples = {of: "" if of == "quality" else format_first(values[of]) for of in mapped}
-    keys |= {f"columns.{of}": (text, samples[of]) for of, text in mapped.items()}
+    samples = {field: "" if field == "quality" else format_first(values[field]) for field in mapped}
+    keys |= {f"columns.{field}": (text, samples[field]) for field, text in mapped.items()}
     units = _find_units(table, role, mapped)
     turn_unit = units.pop("angular_z", None)
-    keys |= {f"units.{of}": (unit, "") for of, unit in units.items()}
+    keys |= {f"units.{field}": (unit, "") for field, unit in units.items()}
     head = f"tables.{name}"
     lines = [ProposedLine(head, key, value, note, is_certain=not doubt) for key, (value, note) in keys.items()]
     if mapped.get("angular_z", "").endswith(_OVER_TRACK):
@@ -228,9 +232,9 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
         ]
         lines += [ProposedLine(head, "units.angular_z", turn_unit, is_certain=False)] if turn_unit else []
     if role == "gnss" and "quality" not in mapped:
-        lines += [_propose_quality(table, head, of) for of in find_quality(table.names)]
+        lines += [_propose_quality(table, head, quality) for quality in find_quality(table.names)]
     if role == "power" and set(mapped) == {"current"}:
-        lines += [ProposedLine(head, of, volt, NO_VOLTAGE, is_certain=False) for of, volt in NOMINAL.items()]
+        lines += [ProposedLine(head, current, volt, NO_VOLTAGE, is_certain=False) for current, volt in NOMINAL.items()]
     return lines
 
 
@@ -246,10 +250,10 @@ def _propose_quality(table: _Table, head: str, source: str) -> ProposedLine:
 def _find_units(table: _Table, role: str, columns: Mapping[str, str]) -> dict[str, str]:
     """Return the units that the recipe has to state: of expressions whose columns have another one than the field."""
     found: dict[str, str] = {}
-    for of, text in columns.items():
-        unit, expression = MAPPED[role][of].unit, parse_expression(text.rpartition(": ")[2], table.names)
+    for field, text in columns.items():
+        unit, expression = MAPPED[role][field].unit, parse_expression(text.rpartition(": ")[2], table.names)
         if expression.column is None and (other := find_other_unit(expression, unit)):
-            found[of] = other if other in UNITS[unit] else unit
+            found[field] = other if other in UNITS[unit] else unit
     return found
 
 
@@ -257,7 +261,9 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> dict[s
     """Return the values of columns by field, in its unit; without those that hold no number."""
     units, fields = _find_units(table, role, columns), dict[str, FieldSource]()
     for name, text in columns.items():  # one that cannot be read takes no other with it
-        read = read_fields("", role, {name: text}, {of: unit for of, unit in units.items() if of == name}, table.names)
+        read = read_fields(
+            "", role, {name: text}, {field: unit for field, unit in units.items() if field == name}, table.names
+        )
         fields |= read if isinstance(read, dict) else {}
     _, found = read_values(table.path, table.stamp, fields)
     return {name: values for name, values in found.items() if np.isfinite(values).any()}
@@ -270,15 +276,17 @@ def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats])
     """Return what the values leave unclear, and correct ``mapped`` by the factors that they show."""
     if role in ("gnss", "imu"):
         judged, doubt = judge_fields(role, mapped, values)
-        factors = {of: text.removeprefix(mapped[of]) for of, text in judged.items()}
-        held = {of: f"{_quote(mapped[of])}{factor}" if factor else mapped[of] for of, factor in factors.items()}
+        factors = {field: text.removeprefix(mapped[field]) for field, text in judged.items()}
+        held = {
+            field: f"{_quote(mapped[field])}{factor}" if factor else mapped[field] for field, factor in factors.items()
+        }
         mapped.clear()
         mapped.update(held)
         return doubt
     if "energy" in values and np.ptp(values["energy"]) == 0.0:
         return _IMPOSSIBLE
     if role == "power" and not {"power", "energy"} & set(values):
-        volt, amp = (values.get(of, np.full(1, np.nan)) for of in ("voltage", "current"))
+        volt, amp = (values.get(field, np.full(1, np.nan)) for field in ("voltage", "current"))
         return _IMPOSSIBLE if find_rejection(RailReadings("", volt, amp), "", {}) else ""
     speed = values.get("linear_x", np.zeros(1))
     is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > MAX_PLAUSIBLE_MPS

@@ -307,8 +307,8 @@ def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Ch
         )
         return
     manifest, recipe = parse_typed(document, Manifest, where), document["recipe"]
-    of = (ingest_key(recipe), make_recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
-    if of != (manifest.ingest_key, recipe_name):
+    keys = (ingest_key(recipe), make_recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
+    if keys != (manifest.ingest_key, recipe_name):
         yield f"{where}: its recipe is not the one that the directory is named after"
     documents = _list_documents(place)
     yield from _verify_seals(place, sorted(documents))

@@ -34,10 +34,9 @@ from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
+from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, make_raster_style, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, find_wrong_files
-from tcpipe.formats.qgis_styles import make_raster_style
 from tcpipe.learning.models import Model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (

@@ -270,5 +270,8 @@ def predict_segments(
     batches = (frames.rows(np.arange(first, min(first + BATCH, count))) for first in starts)
     found = list(iterate_predictions(model, source, batches, turn_radpm=turn_radpm))
     return SegmentPredictions(
-        *(np.concatenate([getattr(of, name) for of in found]) for name in SegmentPredictions.__slots__)
+        *(
+            np.concatenate([getattr(predictions, name) for predictions in found])
+            for name in SegmentPredictions.__slots__
+        )
     )

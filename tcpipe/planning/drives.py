@@ -201,7 +201,9 @@ def collect_runs(
             raise UsageError(
                 f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
             )
-        collected.append(Run(run.run_id, {name: of.take(found.is_good) for name, of in found.run.metres.items()}))
+        collected.append(
+            Run(run.run_id, {name: metres.take(found.is_good) for name, metres in found.run.metres.items()})
+        )
     return collected
 
 
@@ -216,7 +218,7 @@ def find_shifts(
     together = [run for run in store.runs() if (run.run_id, run.recipe_id) in known]
     registrations, found = register_runs(together, source, recipe)
     names = {run.run_id for run in runs}
-    moved = [of for of in found if of.subject.kind != "run" or of.subject.name in names]
+    moved = [finding for finding in found if finding.subject.kind != "run" or finding.subject.name in names]
     return list_shifts(registrations), moved
 
 
@@ -240,13 +242,13 @@ def compute_drive_cost(
         compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
         compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.card.chord_m,
     )  # fmt: skip
-    good = {name: of.take(found.is_good) for name, of in found.run.metres.items()}
+    good = {name: metres.take(found.is_good) for name, metres in found.run.metres.items()}
     sums = {
         name: IntervalComparison(
-            float(of.measured.sum()), float(of.predicted.sum()),
-            *((None, None) if errors is None else predict(errors[name], of).total.interval),
+            float(metres.measured.sum()), float(metres.predicted.sum()),
+            *((None, None) if errors is None else predict(errors[name], metres).total.interval),
         )
-        for name, of in good.items()
+        for name, metres in good.items()
     }  # fmt: skip
     return DriveCost(
         run_id=run.run_id, log=log, map=source.name, driven_m=float(sum(run.manifest.distance_by_reason_m.values())),
@@ -267,15 +269,15 @@ def format_drive(drive: DriveCost) -> list[str]:
         f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample",
     ]
     above = ", net" if drive.label_energy == "net" else ""
-    for called, of, unit in (("time", drive.duration_s, "s"), (f"energy{above}", drive.energy_joule, "J")):
+    for called, value, unit in (("time", drive.duration_s, "s"), (f"energy{above}", drive.energy_joule, "J")):
         if drive.compared_m:
             interval = (
-                "no interval" if of.low is None or of.high is None
-                else f"{'inside' if of.held else 'OUTSIDE'} the {COVERAGE:.0%} prediction interval {of.low:.0f} to {of.high:.0f}"
+                "no interval" if value.low is None or value.high is None
+                else f"{'inside' if value.held else 'OUTSIDE'} the {COVERAGE:.0%} prediction interval {value.low:.0f} to {value.high:.0f}"
             )  # fmt: skip
             lines.append(
-                f"{drive.run_id}: {called} {of.measured:.0f} {unit} measured, {of.predicted:.0f} {unit} predicted "
-                f"({of.off_percent:+.1f} %; {interval})"
+                f"{drive.run_id}: {called} {value.measured:.0f} {unit} measured, {value.predicted:.0f} {unit} predicted "
+                f"({value.off_percent:+.1f} %; {interval})"
             )
     return lines
 
@@ -312,7 +314,7 @@ class DrivesResult:
         if len(held) > 1:
             of_both = {"time": self.values.duration_s, "energy": self.values.energy_joule}
             hits = [sum(getattr(drive, name).held is True for drive in held) for name in ("duration_s", "energy_joule")]
-            sums = ", ".join(f"{called} {of.off_percent:+.1f} %" for called, of in of_both.items())
+            sums = ", ".join(f"{called} {comparison.off_percent:+.1f} %" for called, comparison in of_both.items())
             lines.append(
                 f"all {len(held)} drives held back: {sums}; intervals cover {hits[0]} of the times and {hits[1]} of the energies"
             )
@@ -356,7 +358,7 @@ def evaluate_drives(
 
 def _sum(parts: Sequence[IntervalComparison]) -> IntervalComparison:
     """Return sums over drives; how errors of drives go together is not known, so there is no interval."""
-    return IntervalComparison(sum(of.measured for of in parts), sum(of.predicted for of in parts), None, None)
+    return IntervalComparison(sum(part.measured for part in parts), sum(part.predicted for part in parts), None, None)
 
 
 def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Finding]:
@@ -371,11 +373,11 @@ def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Findin
         yield make_finding("no-drive-compared", model)
     for name, quantity in (("time", "duration_s"), ("energy", "energy_joule")):
         sums: dict[str, IntervalComparison] = {drive.run_id: getattr(drive, quantity) for drive in compared}
-        for run_id, of in sums.items():
-            error = abs(of.off_percent) / 100.0
+        for run_id, sums_of_run in sums.items():
+            error = abs(sums_of_run.off_percent) / 100.0
             if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
                 yield make_finding(f"{name}-far-off", Subject("run", run_id), error_fraction=error)
-        if held := [of.held for of in sums.values() if of.held is not None]:
+        if held := [run_sums.held for run_sums in sums.values() if run_sums.held is not None]:
             yield from find_miscalibration(measure_coverage(np.array(held), np.arange(len(held))), name, model)
     if 0 < len(compared) < read_threshold("few-drives", "min_drive_count"):
         yield make_finding("few-drives", model, drive_count=len(compared))

@@ -184,16 +184,18 @@ def _sum_costs(  # noqa: PLR0917
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
     found = {
-        name: Adapted(of, nothing, nothing, SumDistribution(0.0, 0.0, 0.0))
-        for name, of in (("duration", duration), ("energy", energy))
+        name: Adapted(total, nothing, nothing, SumDistribution(0.0, 0.0, 0.0))
+        for name, total in (("duration", duration), ("energy", energy))
     }
     if known is not None and errors is None:
         raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
     if errors is not None:
         begin_m, rise_m = ELSEWHERE_M + np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
-        for name, of in found.items():
+        for name, distribution in found.items():
             std = segments.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
-            there = Metres(of.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std)
+            there = Metres(
+                distribution.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std
+            )
             found[name] = (
                 predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
             )
@@ -219,7 +221,7 @@ def _sum_costs(  # noqa: PLR0917
         reason_names=[" ".join(flag_names(int(value), Reason)) for value in said.reasons],
     )
     without_cost = int(table.column("duration_s").null_count)
-    sums = None if errors is None else {name: of.total for name, of in found.items()}
+    sums = None if errors is None else {name: distribution.total for name, distribution in found.items()}
     totals = PathTotals(
         model=model.name,
         map=source.name,

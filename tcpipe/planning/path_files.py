@@ -91,17 +91,21 @@ class PathResult(PathTotals):
         return clean_lines(lines)
 
 
-def format_cost(of: PathTotals) -> str:
+def format_cost(totals: PathTotals) -> str:
     """Return length, time and energy with their intervals, as one line."""
-    duration = _format_quantity(of.duration_s, of.duration_interval_s, "s")
-    energy = _format_quantity(of.energy_joule, of.energy_interval_joule, "J")
-    part = "" if of.complete else f", without {of.path_segments_without_cost} of {of.path_segments} path segments"
+    duration = _format_quantity(totals.duration_s, totals.duration_interval_s, "s")
+    energy = _format_quantity(totals.energy_joule, totals.energy_interval_joule, "J")
+    part = (
+        ""
+        if totals.complete
+        else f", without {totals.path_segments_without_cost} of {totals.path_segments} path segments"
+    )
     turns = (
         ""
-        if of.turn_energy_joule is None
-        else f" ({of.turn_energy_joule:.0f} J of them for {of.turn_rad:.1f} rad of turns)"
+        if totals.turn_energy_joule is None
+        else f" ({totals.turn_energy_joule:.0f} J of them for {totals.turn_rad:.1f} rad of turns)"
     )
-    return f"{of.length_m:.1f} m, {duration}, {energy}{turns}{part}"
+    return f"{totals.length_m:.1f} m, {duration}, {energy}{turns}{part}"
 
 
 def _format_quantity(value: float, interval: tuple[float, float] | None, unit: str) -> str:
@@ -112,19 +116,22 @@ def _format_quantity(value: float, interval: tuple[float, float] | None, unit: s
     return f"{value:.{digits}f} {unit} ({COVERAGE:.0%}: {low:.{digits}f} to {high:.{digits}f})"
 
 
-def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
+def find_doubts(totals: PathTotals, path: Subject) -> Iterator[Finding]:
     """Yield where the model has no support on a path, and how little its intervals rest on."""
-    for reason, count in of.reasons.items():
-        names, total = {"reason": reason.replace("_", " ")}, of.path_segments
+    for reason, count in totals.reasons.items():
+        names, total = {"reason": reason.replace("_", " ")}, totals.path_segments
         yield make_finding("path-not-supported", path, names=names, segment_count=count, total_count=total)
-    if of.duration_interval_s is None:
+    if totals.duration_interval_s is None:
         yield make_finding("no-intervals", path)
-    of_both = {"time": (of.duration_s, of.duration_interval_s), "energy": (of.energy_joule, of.energy_interval_joule)}
+    of_both = {
+        "time": (totals.duration_s, totals.duration_interval_s),
+        "energy": (totals.energy_joule, totals.energy_interval_joule),
+    }
     for quantity, (value, ends) in of_both.items():
         if ends is not None and ends[1] - ends[0] > abs(value):
             yield make_finding("interval-wide", path, names={"quantity": quantity})
-    if of.held_out_runs == 1 and of.duration_interval_s is not None:
-        yield make_finding("one-held-out-run", path, sample_count=of.held_out_samples)
+    if totals.held_out_runs == 1 and totals.duration_interval_s is not None:
+        yield make_finding("one-held-out-run", path, sample_count=totals.held_out_samples)
 
 
 def predict_path(
@@ -317,7 +324,7 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     together = None
     if back is not None or options.budget_joule is not None:
         together = _add_up(model, asked, back, options.budget_joule)
-    origin = PlanOrigin(key, {name: of.totals for name, of in plans.items()}, wanted, together=together)
+    origin = PlanOrigin(key, {name: plan.totals for name, plan in plans.items()}, wanted, together=together)
     if picture is not None:
         from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw
 

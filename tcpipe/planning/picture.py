@@ -189,15 +189,15 @@ def _write_above(axes: Axes, text: str, x: float, y: float) -> None:
 def _draw_title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
     colour = _COLOURS[plan.totals.objective]
     axes.set_title(f"Least {plan.totals.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
-    of, parts = plan.totals, []
+    totals, parts = plan.totals, []
     texts = {
-        "energy_joule": f"{of.energy_joule / 1000.0:.2f} kJ",
-        "duration_s": f"{of.duration_s:.0f} s",
-        "length_m": f"{of.length_m:.0f} m",
+        "energy_joule": f"{totals.energy_joule / 1000.0:.2f} kJ",
+        "duration_s": f"{totals.duration_s:.0f} s",
+        "length_m": f"{totals.length_m:.0f} m",
     }
     for name, text in texts.items():
         best = min(getattr(other.totals, name) for other in plans)
-        more = getattr(of, name) / best - 1.0 if best > 0.0 else 0.0
+        more = getattr(totals, name) / best - 1.0 if best > 0.0 else 0.0
         parts.append(f"{text} (+{more:.1%})" if more >= 0.0005 else text)
     axes.annotate(
         "     ".join(parts), (0.0, 1.0), (0, 9), xycoords="axes fraction", textcoords="offset points", fontsize=10.5

@@ -232,7 +232,7 @@ class Turning:
 
 def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
     """Return what turning costs by a fit, None without such a term; a class without a term costs the mean of the others."""
-    found = {} if fit is None else {of.terrain: of.value for of in fit.terms if of.term == "turning"}
+    found = {} if fit is None else {term.terrain: term.value for term in fit.terms if term.term == "turning"}
     if fit is None or not found:
         return None
     joule_per_rad = np.full(_CLASSES, found.get(_ALL, float(np.mean(list(found.values())))))

@@ -83,8 +83,8 @@ class Sag:
     def products(self, edge_ns: Stamps) -> tuple[Floats, Floats]:
         """Return the sums of voltage and of current, times the current's neighbours, up to each time, shape (E,)."""
         at = np.searchsorted(self.stamp_ns, edge_ns)
-        sums = (np.concatenate(([0.0], np.cumsum(of * self.neighbour_amp))) for of in (self.volt, self.amp))
-        by_volt, by_amp = (of[at] for of in sums)
+        sums = (np.concatenate(([0.0], np.cumsum(values * self.neighbour_amp))) for values in (self.volt, self.amp))
+        by_volt, by_amp = (cumulative[at] for cumulative in sums)
         return by_volt, by_amp
 
 
@@ -99,11 +99,11 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
     if len(stamp_ns) < _FEWEST_SAMPLES:
         return None
     values = [interpolate_rail(each, stamp_ns) for each in known]
-    if all(np.ptp(of[0]) == 0.0 for of in values):  # nobody measured a voltage
+    if all(np.ptp(value[0]) == 0.0 for value in values):  # nobody measured a voltage
         return None
-    volt, amp = np.mean([of[0] for of in values], axis=0), np.sum([of[1] for of in values], axis=0)
+    volt, amp = np.mean([value[0] for value in values], axis=0), np.sum([value[1] for value in values], axis=0)
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
-    volt, amp = (of - _compute_moving_mean(of, rows) for of in (volt, amp))
+    volt, amp = (values - _compute_moving_mean(values, rows) for values in (volt, amp))
     return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
 
 
@@ -127,7 +127,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     if sag is None:
         return None
     edge_ns = np.arange(sag.stamp_ns[0], sag.stamp_ns[-1], round(_BLOCK_S * 1e9), dtype=np.int64)
-    by_volt, weight = (np.diff(of) for of in sag.products(edge_ns))
+    by_volt, weight = (np.diff(product) for product in sag.products(edge_ns))
     used = weight > 0.0
     edge_ns, by_volt, weight = edge_ns[:-1][used], by_volt[used], weight[used]
     count = len(weight)
@@ -152,7 +152,9 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
 
     judged = {first: judge(first) for first in range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1)}
     first = max(judged, key=lambda at: judged[at][0])
-    before, after = (-float(by_volt[of].sum() / weight[of].sum()) for of in (slice(first - 1), slice(first + 1, None)))
+    before, after = (
+        -float(by_volt[rows_].sum() / weight[rows_].sum()) for rows_ in (slice(first - 1), slice(first + 1, None))
+    )
     is_sure = judged[first][0] > _SURE**2 and judged[first][1] > _GRADUAL**2
     least = read_threshold("current-gain-changes", "min_change_fraction")
     if not is_sure or min(before, after) <= 0.0 or abs(before / after - 1.0) < least:

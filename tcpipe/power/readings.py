@@ -97,7 +97,7 @@ def read_power(
             continue
         sources += found.sources
         findings += found.findings
-        gains += [_find_gain_std(of, rail.joints) for of, rail in zip(found.sources, found.rails, strict=True)]
+        gains += [_find_gain_std(source, rail.joints) for source, rail in zip(found.sources, found.rails, strict=True)]
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
     rejected = rejected or _find_incomplete(rails) or _find_too_small(rails)
@@ -107,18 +107,18 @@ def read_power(
         return PowerReadings(findings=tuple(rejected))
     rails, odd = _exclude_implausible(rails)
     log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
-    given: CurrentSign = "auto" if any(of.joints for of in sources) else current_sign
+    given: CurrentSign = "auto" if any(source.joints for source in sources) else current_sign
     sign, of_sign, told_by = _sign(rails, log_times, sources, given)
     if sign == 0:
         return PowerReadings(findings=of_sign)
-    includes = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
+    includes = tuple(dict.fromkeys(source.other_loads for source in sources if source.other_loads))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
     findings += [*of_sign, *odd, *loads, *_find_nominal(sources)]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
-    counts = any(of.energy for of in sources)
-    unknown = any(of.averaging_unknown for of in sources) and not counts
-    averaged = counts or any(of.averaged for of in sources)
-    rest = [of.rest_current_amp for of in sources if of.current and of.rest_current_amp]
+    counts = any(source.energy for source in sources)
+    unknown = any(source.averaging_unknown for source in sources) and not counts
+    averaged = counts or any(source.averaged for source in sources)
+    rest = [source.rest_current_amp for source in sources if source.current and source.rest_current_amp]
     return PowerReadings(
         signed,
         averaged,
@@ -127,18 +127,18 @@ def read_power(
         told_by,
         includes,
         gain_std_fraction=max(gains),
-        offset_std_amp=max(of.zero_std for of in sources),
-        rest_current_amp=(min(of[0] for of in rest), max(of[1] for of in rest))
-        if rest and len(rest) == sum(bool(of.current or of.energy) for of in sources)
+        offset_std_amp=max(source.zero_std for source in sources),
+        rest_current_amp=(min(range_amp[0] for range_amp in rest), max(range_amp[1] for range_amp in rest))
+        if rest and len(rest) == sum(bool(source.current or source.energy) for source in sources)
         else None,
     )
 
 
 def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
     """Yield the finding that a voltage is assumed."""
-    for of in sources:
-        if (volt := of.nominal_voltage_volt) is not None:
-            names, fraction = {"rail": of.rail or of.topic or of.type}, of.nominal_voltage_std_fraction
+    for source in sources:
+        if (volt := source.nominal_voltage_volt) is not None:
+            names, fraction = {"rail": source.rail or source.topic or source.type}, source.nominal_voltage_std_fraction
             yield make_finding("voltage-assumed", _POWER, names=names, voltage_volt=volt, std_fraction=fraction)
 
 
@@ -153,7 +153,10 @@ class _TopicRails:
     def apply_type_signs(self) -> list[RailReadings]:
         """Return the rails with the sign that their type gives a drawn current."""
         each = zip(self.rails, self.sources, strict=True)
-        return [apply_sign(rail, -1 if of.sign == "drawn_negative" and not of.joints else 1) for rail, of in each]
+        return [
+            apply_sign(rail, -1 if source.sign == "drawn_negative" and not source.joints else 1)
+            for rail, source in each
+        ]
 
 
 def _read_first_valid(
@@ -199,7 +202,8 @@ def _convert_thousandths(
     """Return the sources in millivolts or milliamperes, as far as their numbers are power then; none where they are not."""
     for volt, amp in ((1.0, 1e-3), (1e-3, 1.0), (1e-3, 1e-3)):
         scaled = [
-            replace(of, voltage_scale=volt * of.voltage_scale, current_scale=amp * of.current_scale) for of in sources
+            replace(source, voltage_scale=volt * source.voltage_scale, current_scale=amp * source.current_scale)
+            for source in sources
         ]
         found = read_rails(columns, scaled, topic, known)
         if not isinstance(found, Finding) and all(find_rejection(rail, topic, columns) is None for rail in found):
@@ -211,9 +215,12 @@ def _propose_sources(sources: Mapping[str, Sequence[PowerSource]]) -> tuple[Reme
     """Return the tables of a recipe for the sources of topics; of one topic alone for all of its type."""
     rows, alone = [], len(sources) == 1
     for topic, of_topic in sources.items():
-        named = [of if alone and of.type not in FLOAT_TYPES else replace(of, topic=topic) for of in of_topic]
+        named = [
+            source if alone and source.type not in FLOAT_TYPES else replace(source, topic=topic) for source in of_topic
+        ]
         rows += [
-            {of.name: value for of in fields(each) if (value := getattr(each, of.name)) != of.default} for each in named
+            {entry.name: value for entry in fields(each) if (value := getattr(each, entry.name)) != entry.default}
+            for each in named
         ]
     return suggest("scale", {"power_sources": rows})
 
@@ -254,10 +261,10 @@ def _find_incomplete(rails: Rails) -> list[Finding]:
         for rail in found:
             parts.setdefault(rail.name, []).append((topic, rail))
     return [
-        reject_power(of[0][0], f"no-{quantity}", names={"rail": name})
-        for name, of in parts.items()
+        reject_power(named_parts[0][0], f"no-{quantity}", names={"rail": name})
+        for name, named_parts in parts.items()
         for quantity, column in (("voltage", "voltage_volt"), ("current", "current_amp"))
-        if not any(np.isfinite(getattr(part, column)).any() for _, part in of)
+        if not any(np.isfinite(getattr(part, column)).any() for _, part in named_parts)
     ]
 
 
@@ -325,14 +332,14 @@ def _sign(
         return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
     time_s, whole = _sum_currents(rails, log_times)
     sign, net = sign_by_mean(whole, _weight_s(time_s))
-    signs = {"drawn_positive" if of.joints else of.sign for of in sources}
+    signs = {"drawn_positive" if source.joints else source.sign for source in sources}
     if "auto" not in signs:
-        told, other = "drawn_positive", "drawn_negative"
+        likely, other = "drawn_positive", "drawn_negative"
         if signs == {other}:
-            told, other = other, told
+            likely, other = other, likely
         if sign >= 0 or time_s.size < read_threshold(REJECTED, "min_sign_count"):
-            return 1, (), f"{told} (message type)"
-        return 0, (_find_sign(REJECTED, {"reason": "current-flows-back"}, net, other, told),), ""
+            return 1, (), f"{likely} (message type)"
+        return 0, (_find_sign(REJECTED, {"reason": "current-flows-back"}, net, other, likely),), ""
     return _sign_by_charge(sign, net, sources)
 
 
@@ -342,7 +349,7 @@ def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tu
         return -1, (), "drawn_negative (mean, as ROS has it)"
     if sign > 0:
         return 1, (_find_sign(_ASSUMED, {"sign": "drawn_positive"}, net, "drawn_positive"),), "drawn_positive (mean)"
-    if any(of.sign == "auto" and of.type not in (BATTERY_STATE, *FLOAT_TYPES) for of in sources):
+    if any(source.sign == "auto" and source.type not in (BATTERY_STATE, *FLOAT_TYPES) for source in sources):
         return 0, (_find_sign(REJECTED, {"reason": "sign-unknown"}, net, *_SIGNS),), ""
     return -1, (_find_sign(_ASSUMED, {"sign": "drawn_negative"}, net, *_SIGNS),), "drawn_negative (ROS)"
 
@@ -350,7 +357,7 @@ def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tu
 def _find_sign(code: str, names: Mapping[str, str], net: float, *signs: str) -> Finding:
     """Return a finding on the sign of a drawn current: a note where nearly all charge flows one way, so that one sign is suggested."""
     severity: Severity | None = "note" if len(signs) == 1 else None
-    remedies = [of for sign in signs for of in suggest(sign, {"read": {"current_sign": sign}})]
+    remedies = [remedy for sign in signs for remedy in suggest(sign, {"read": {"current_sign": sign}})]
     return make_finding(code, _POWER, severity=severity, names=names, remedies=remedies, net_fraction=abs(net))
 
 

@@ -160,7 +160,10 @@ def _mean_about(at_s: Floats, width_s: float, motion_s: Floats, sums: Floats) ->
     """Return the means of the causes over a width about each time, shape (N, 5)."""
     later, earlier = at_s + width_s / 2, at_s - width_s / 2
     return (
-        np.column_stack([np.interp(later, motion_s, of) - np.interp(earlier, motion_s, of) for of in sums.T]) / width_s
+        np.column_stack(
+            [np.interp(later, motion_s, integral) - np.interp(earlier, motion_s, integral) for integral in sums.T]
+        )
+        / width_s
     )
 
 

@@ -135,9 +135,11 @@ def find_sources(
         and source.husky_power in (None, husky_power)
         and topic.endswith(source.topic or "")
     ]
-    choices = [_select_most_specific([of for of in fitting if of.fallback is last]) for last in (False, True)]
+    choices = [
+        _select_most_specific([source for source in fitting if source.fallback is last]) for last in (False, True)
+    ]
     if choices := [choice for choice in choices if choice]:
-        is_refused = any(of.unsupported_reason for of in choices[0])
+        is_refused = any(source.unsupported_reason for source in choices[0])
         return reject_power(topic, "no-battery-current", names={"type": type_name}) if is_refused else choices
     if type_name in FLOAT_TYPES:
         return _make_float_source(type_name, topic)
@@ -149,10 +151,10 @@ def find_sources(
 
 def list_power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
     """Return the columns inside lists of messages that a type's tables name, as drivers[].current, and the names of joints."""
-    mine = [of for of in known if of.type == type_name]
-    texts = [text for of in mine for text in (of.voltage, of.current, of.power, of.energy)]
-    numbers = {of.column for text in texts for of in parse_fields(text) if "[]." in of.column}
-    return frozenset(numbers | ({NAMES} if any(of.joints for of in mine) else set()))
+    mine = [source for source in known if source.type == type_name]
+    texts = [text for source in mine for text in (source.voltage, source.current, source.power, source.energy)]
+    numbers = {field.column for text in texts for field in parse_fields(text) if "[]." in field.column}
+    return frozenset(numbers | ({NAMES} if any(source.joints for source in mine) else set()))
 
 
 def _select_most_specific(fitting: Sequence[PowerSource]) -> list[PowerSource]:
@@ -233,14 +235,14 @@ def _read_joints(columns: Columns, source: PowerSource, topic: str) -> RailReadi
         there = ", ".join(np.unique(columns[NAMES]).tolist())
         return reject_power(topic, "no-joint", names={"wanted": source.joints, "joints": there})
     for reason, values in (("no-effort", motion.torque_nm), ("no-velocity", motion.speed_radps)):
-        if lacking := [name for name, of in zip(motion.names, values.T, strict=True) if np.isnan(of).all()]:
+        if lacking := [name for name, column in zip(motion.names, values.T, strict=True) if np.isnan(column).all()]:
             return reject_power(topic, reason, names={"joints": ", ".join(lacking)})
     watt = (motion.torque_nm * motion.speed_radps).sum(axis=1)
     if np.isnan(watt).all():
         return reject_power(topic, "joints-apart", names={"joints": ", ".join(motion.names)})
-    told, net = sign_by_mean(watt, np.ones(len(watt)))
-    sign = {"drawn_positive": 1, "drawn_negative": -1, "auto": told}[source.sign]
-    if not sign or told == -sign:
+    sign_name, net = sign_by_mean(watt, np.ones(len(watt)))
+    sign = {"drawn_positive": 1, "drawn_negative": -1, "auto": sign_name}[source.sign]
+    if not sign or sign_name == -sign:
         return reject_power(topic, "torque-against-motion" if sign else "sign-unknown", net_fraction=abs(net))
     found = compute_joint_power(motion, source, sign=sign)
     return RailReadings(source.rail or topic, np.full(len(watt), UNIT_VOLT), found.watt, joints=found)
@@ -252,15 +254,15 @@ def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Seque
         return reject_power(topic, "field-missing", names={"field": ", ".join(lacking).replace("[]", "")})
     currents = parse_fields(source.current)
     others = (source.voltage, source.power, source.energy)
-    for of in [*currents, *(of for text in others for of in parse_fields(text))]:
-        names = {"field": of.column}
-        if of.column not in columns:
+    for field in [*currents, *(term for text in others for term in parse_fields(text))]:
+        names = {"field": field.column}
+        if field.column not in columns:
             return reject_power(topic, "field-missing", names=names)
-        width = columns[of.column].shape[1] if columns[of.column].ndim == 2 else None
-        if not of.every and of.index is None and width is not None:
+        width = columns[field.column].shape[1] if columns[field.column].ndim == 2 else None
+        if not field.every and field.index is None and width is not None:
             return reject_power(topic, "field-is-a-list", names=names)
-        needed = of.index + 1 if of.index is not None else int(of.every)
-        listed = source.currents_listed if of in currents else None
+        needed = field.index + 1 if field.index is not None else int(field.every)
+        listed = source.currents_listed if field in currents else None
         if (needed and (width or 0) < needed) or listed not in (None, width):
             fitting = [by for by in known if width and by.type == source.type and by.currents_listed == width]
             if platforms := sorted({by.platform for by in fitting if by.platform}):
@@ -276,7 +278,9 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
     if not source.voltage and (source.lacks_voltage or source.nominal_voltage_volt is not None):
         voltage = np.full(len(voltage), UNIT_VOLT if source.lacks_voltage else source.nominal_voltage_volt)
     if source.energy:
-        parts = [(of.sign * source.energy_scale, _read_values(columns, of)) for of in parse_fields(source.energy)]
+        parts = [
+            (field.sign * source.energy_scale, _read_values(columns, field)) for field in parse_fields(source.energy)
+        ]
         counter = count_energy(parts, wraps=source.counter_wraps)
         return RailReadings(name, voltage, counter.mean_amp(_choose_stamps(columns), voltage), counter)
     current = source.current_scale * _sum_fields(columns, parse_fields(source.current))
@@ -304,9 +308,9 @@ def _sum_fields(columns: Columns, fields: Sequence[FieldPath]) -> Floats:
         return np.full(len(next(iter(columns.values()))), np.nan)
     parts = [
         np.where(np.abs(values) <= _IMPOSSIBLE, values, np.nan)
-        for values in (_read_values(columns, of) for of in fields)
+        for values in (_read_values(columns, field) for field in fields)
     ]
-    total: Floats = np.sum([of.sign * values for of, values in zip(fields, parts, strict=True)], axis=0)
+    total: Floats = np.sum([field.sign * values for field, values in zip(fields, parts, strict=True)], axis=0)
     return total
 
 
@@ -314,10 +318,10 @@ _IMPOSSIBLE = 1e6
 """No battery has more volts, no drive more amperes (a current in milliamperes is refused by its median)."""
 
 
-def _read_values(columns: Columns, of: FieldPath) -> Floats:
+def _read_values(columns: Columns, field: FieldPath) -> Floats:
     """Return a field's values, shape (N,); of a list that is summed NaN where a row is shorter than others."""
-    values = np.asarray(columns[of.column], np.float64)
-    return values.sum(axis=1) if of.every else values if of.index is None else values[:, of.index]
+    values = np.asarray(columns[field.column], np.float64)
+    return values.sum(axis=1) if field.every else values if field.index is None else values[:, field.index]
 
 
 def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding | None:

@@ -2,7 +2,7 @@
 // The dataset's page. One selection, made by filters that combine, is shown on the map, in the plots, in words, as patches and as a table.
 const unpacked = page.unpack(page.data.samples.packed);
 page.start(async () => {
-  const told = page.data;
+  const facts = page.data;
   const { at, make, fillSelect, pairs, ramp } = page;
 
   const c = await unpacked;
@@ -15,9 +15,9 @@ page.start(async () => {
     apart: ["way to the nearest train metre", "m", 2],
   };
   const label = (name) => kinds[name][0] + (kinds[name][1] ? ` [${kinds[name][1]}]` : "");
-  const classes = new Map(told.classes.map((one) => [one.id, one]));
+  const classes = new Map(facts.classes.map((one) => [one.id, one]));
   const className = (i) => classes.get(c.class[i])?.name ?? "unknown";
-  const splitName = (i) => told.splits[c.split[i]].name;
+  const splitName = (i) => facts.splits[c.split[i]].name;
   const shades = Array.from({ length: 64 }, (_, i) => {
     const place = (i / 63) * (ramp.length - 1), low = Math.min(Math.floor(place), ramp.length - 2), share = place - low;
     const part = (k) => Math.round(parseInt(ramp[low].slice(k, k + 2), 16) * (1 - share) + parseInt(ramp[low + 1].slice(k, k + 2), 16) * share);
@@ -29,22 +29,22 @@ page.start(async () => {
     const legend = [];
     let fill;
     if (name === "split") {
-      fill = Array.from(c.split, (s) => told.splits[s].colour);
-      told.splits.forEach((s) => s.count && legend.push([`${s.name} (${s.count})`, s.colour]));
+      fill = Array.from(c.split, (s) => facts.splits[s].colour);
+      facts.splits.forEach((s) => s.count && legend.push([`${s.name} (${s.count})`, s.colour]));
     } else if (name === "class") {
-      const colour = (id) => classes.get(id)?.colour ?? told.unknown;
+      const colour = (id) => classes.get(id)?.colour ?? facts.unknown;
       fill = Array.from(c.class, colour);
       [...new Set(c.class)].sort((a, b) => a - b).forEach((id) => legend.push([classes.get(id)?.name ?? "unknown", colour(id)]));
     } else if (name === "quality") {
-      fill = Array.from(c.quality, (q) => (q & told.flags ? told.flagged : told.clean));
-      legend.push(["clean", told.clean], ["carries a flag", told.flagged]);
+      fill = Array.from(c.quality, (q) => (q & facts.flags ? facts.flagged : facts.clean));
+      legend.push(["clean", facts.clean], ["carries a flag", facts.flagged]);
     } else if (name === "run") {
-      fill = Array.from(c.run, (r) => told.colours[r % told.colours.length]);
-      told.runs.slice(0, 12).forEach((r, i) => legend.push([r.id, told.colours[i % told.colours.length]]));
+      fill = Array.from(c.run, (r) => facts.colours[r % facts.colours.length]);
+      facts.runs.slice(0, 12).forEach((r, i) => legend.push([r.id, facts.colours[i % facts.colours.length]]));
     } else {
       const [low, high] = page.ends(c[name]);
       fill = Array.from(c[name], (v) => Number.isFinite(v)
-        ? shades[Math.max(0, Math.min(63, Math.floor(63 * (v - low) / ((high - low) || 1))))] : told.unknown);
+        ? shades[Math.max(0, Math.min(63, Math.floor(63 * (v - low) / ((high - low) || 1))))] : facts.unknown);
       legend.push([low, high]);
     }
     const scale = at("scale");
@@ -65,7 +65,7 @@ page.start(async () => {
   fillKinds("across", ["slope", "velocity", "turn", "residual"]);
   fillKinds("up", ["power", "energy", "velocity"]);
   fillKinds("quantity", numeric);
-  page.chooseGround(told.ground);
+  page.chooseGround(facts.ground);
   for (const [id, name] of [["next", "drive next"], ["leaks", "leaks"]]) {
     const drawn = page.model(name);
     at(id).onchange = () => {
@@ -112,11 +112,11 @@ page.start(async () => {
     setFilter("picked", null);
   }
   const choices = {
-    run: [[...told.runs.keys()], (k) => told.runs[k].id, (k) => (i) => c.run[i] === k],
+    run: [[...facts.runs.keys()], (k) => facts.runs[k].id, (k) => (i) => c.run[i] === k],
     class: [[...new Set(c.class)].sort((a, b) => a - b), (k) => classes.get(k)?.name ?? "unknown", (k) => (i) => c.class[i] === k],
-    split: [[...told.splits.keys()].filter((k) => told.splits[k].count), (k) => told.splits[k].name, (k) => (i) => c.split[i] === k],
-    flag: [told.quality.map(([bit]) => bit).filter((bit) => c.quality.some((q) => q & bit)), (k) => told.quality.find(([bit]) => bit === k)[1],
-      (k) => (i) => (k ? c.quality[i] & k : !(c.quality[i] & told.flags))],
+    split: [[...facts.splits.keys()].filter((k) => facts.splits[k].count), (k) => facts.splits[k].name, (k) => (i) => c.split[i] === k],
+    flag: [facts.quality.map(([bit]) => bit).filter((bit) => c.quality.some((q) => q & bit)), (k) => facts.quality.find(([bit]) => bit === k)[1],
+      (k) => (i) => (k ? c.quality[i] & k : !(c.quality[i] & facts.flags))],
   };
   for (const [id, [values, text, passed]] of Object.entries(choices)) {
     fillSelect(at(id), values, text);
@@ -187,11 +187,11 @@ page.start(async () => {
   at("clear").onclick = clear;
 
   // One sample in words.
-  const sheets = told.patches;
+  const sheets = facts.patches;
   const cell = new Map((sheets?.rows ?? []).map((row, i) => [row, i]));
-  const start = (i) => BigInt(told.runs[c.run[i]].first_ns) + BigInt(c.after_s[i]) * 1000000000n + BigInt(c.after_ns[i]);
-  const idOf = (i) => told.samples.ids ? told.samples.ids[i] : `${told.runs[c.run[i]].id}-${start(i)}`;
-  const flagsOf = (i) => told.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words).join("; ") || "clean";
+  const start = (i) => BigInt(facts.runs[c.run[i]].first_ns) + BigInt(c.after_s[i]) * 1000000000n + BigInt(c.after_ns[i]);
+  const idOf = (i) => facts.samples.ids ? facts.samples.ids[i] : `${facts.runs[c.run[i]].id}-${start(i)}`;
+  const flagsOf = (i) => facts.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words).join("; ") || "clean";
   function withStd(i, name) {
     const std = c[`${name}_std`]?.[i];
     return Number.isFinite(std) ? `${c[name][i].toFixed(kinds[name][2] + 1)} ± ${std.toPrecision(2)} ${kinds[name][1]}` : digits(c[name][i], name);
@@ -199,13 +199,13 @@ page.start(async () => {
   // Sheets with a sample's patch, and its number in them: inside the page, or beside it.
   function pictureOf(i) {
     if (cell.has(i)) return [sheets, cell.get(i)];
-    if (!sheets || !told.folder) return null;
-    const layers = sheets.layers.map(({ name }, k) => ({ name, uri: `${told.folder}/${k}-${Math.floor(i / told.per_sheet)}.webp` }));
-    return [{ ...sheets, layers }, i % told.per_sheet];
+    if (!sheets || !facts.folder) return null;
+    const layers = sheets.layers.map(({ name }, k) => ({ name, uri: `${facts.folder}/${k}-${Math.floor(i / facts.per_sheet)}.webp` }));
+    return [{ ...sheets, layers }, i % facts.per_sheet];
   }
-  const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${told.count} patches; 'tcpipe report --patches' puts all beside it.` : "";
+  const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${facts.count} patches; 'tcpipe report --patches' puts all beside it.` : "";
   function inWords(i) {
-    const run = told.runs[c.run[i]];
+    const run = facts.runs[c.run[i]];
     const rows = ["power", "velocity", "duration", "energy"].map((name) => [kinds[name][0], withStd(i, name)]);
     rows.push(["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")]);
     if (c.residual) rows.push(["beyond physics", digits(c.residual[i], "residual")]);
@@ -227,17 +227,17 @@ page.start(async () => {
     const left = make("div"), right = make("div");
     if (selected.length > 1) {
       const mean = (name) => page.mean(selected.map((k) => c[name][k]).filter(Number.isFinite));
-      const by = told.splits.map((s, k) => [s.name, selected.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
+      const by = facts.splits.map((s, k) => [s.name, selected.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
       left.append(make("b", `${selected.length} selected`), pairs([
         ...["power", "velocity", "energy", "slope"].map((name) => [`mean ${kinds[name][0]}`, digits(mean(name), name)]),
         ["splits", by.map(([name, count]) => `${name} ${count}`).join(", ")],
-        ["flagged", `${selected.filter((j) => c.quality[j] & told.flags).length}`]]), make("p", `Number ${selected.indexOf(current) + 1} of them:`));
+        ["flagged", `${selected.filter((j) => c.quality[j] & facts.flags).length}`]]), make("p", `Number ${selected.indexOf(current) + 1} of them:`));
     }
     left.append(pairs(inWords(current)));
     const picture = pictureOf(current);
     if (picture) {
       right.append(...page.patches(...picture));
-      const lost = () => right.replaceChildren(make("p", `${told.folder} is not beside this page.`, { className: "note" }));
+      const lost = () => right.replaceChildren(make("p", `${facts.folder} is not beside this page.`, { className: "note" }));
       if (picture[0] !== sheets) Object.assign(new Image(), { src: picture[0].layers[0].uri, onerror: lost });
     } else {
       right.append(make("p", noPicture, { className: "note" }));
@@ -303,7 +303,7 @@ page.start(async () => {
   const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
   const directory = location.protocol === "file:" ? decodeURIComponent(new URL(".", location).pathname).replace(/(.)\/$/, "$1") : "DIR";
   function drawExport() {
-    const part = told.count > n ? ` The selection covers the ${n} samples that the page shows, drawn at random from ${told.count}.` : "";
+    const part = facts.count > n ? ` The selection covers the ${n} samples that the page shows, drawn at random from ${facts.count}.` : "";
     const words = filters.size ? `${selected.length} of ${n} samples are selected.` : `Nothing is selected: examples of every split, class and slope.`;
     at("selection-count").textContent = words + part;
     at("selected").hidden = !selected.length;

@@ -176,7 +176,9 @@ def _make_data(
         "samples": shown.json,
         "patches": patches,
         "ground": [name.removeprefix("layer ") for name in names if name.startswith("layer ")],
-        "classes": [{"id": of.id, "name": of.name, "colour": find_class_colour(of.id)} for of in card.classes],
+        "classes": [
+            {"id": entry.id, "name": entry.name, "colour": find_class_colour(entry.id)} for entry in card.classes
+        ],
         "splits": [{"name": name, "colour": SPLIT_COLOURS[name], "count": card.splits[name]} for name in SPLIT_COLOURS],
         "runs": [
             {"id": run.run_id, "first_ns": str(first), "href": hrefs.get(run.run_id)}
@@ -297,7 +299,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
             for grid in card.maps
         ),
         *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs),
-        *(("excluded", str(of)) for of in card.exclusions),
+        *(("excluded", str(exclusion)) for exclusion in card.exclusions),
         ("licence", card.licence or "none given"),
         *(("licence of open data", line) for line in card.attributions),
         ("creator", card.creator or "none given"),
@@ -336,7 +338,7 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
         columns[name] = ("half", np.degrees(to_floats(table, column)))
     if card.physics:
         columns["residual"] = ("half", to_floats(table, "power_watt") - to_floats(table, "physics_power_watt"))
-    run = _find_indices(table, "run_id", [of.run_id for of in card.runs])
+    run = _find_indices(table, "run_id", [source.run_id for source in card.runs])
     after = table.column("start_ns").to_numpy() - starts_ns[run]
     near = (apart_m < np.sqrt(2.0) * card.patch_m) & (nearest < count)
     columns |= {

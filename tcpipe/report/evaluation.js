@@ -2,16 +2,16 @@
 // An evaluation's page: samples measured against predicted and over slope, one of them in words, and the worst with their patches.
 const unpacked = page.unpack(page.data.samples);
 page.start(async () => {
-  const told = page.data;
+  const facts = page.data;
   const { at, make, fillSelect, pairs } = page;
   const c = await unpacked;
-  const kinds = Object.fromEntries(told.quantities.map((one) => [one.key, one]));
-  const classes = new Map(told.classes.map((one) => [one.id, one]));
+  const kinds = Object.fromEntries(facts.quantities.map((one) => [one.key, one]));
+  const classes = new Map(facts.classes.map((one) => [one.id, one]));
   const source = page.model("samples").data_source;
   const plot = { against: page.model("against"), off: page.model("off") };
   const off = (i, key) => c[`${key} predicted`][i] - c[key][i];
-  const splitOf = (i) => told.splits[c.split[i]], classOf = (i) => classes.get(c.class[i]);
-  fillSelect(at("split"), told.splits.map((one) => one.name));
+  const splitOf = (i) => facts.splits[c.split[i]], classOf = (i) => classes.get(c.class[i]);
+  fillSelect(at("split"), facts.splits.map((one) => one.name));
   fillSelect(at("quantity"), Object.keys(kinds), (key) => kinds[key].called);
 
   let shown = [];  // rows of the page, the worst first
@@ -39,9 +39,9 @@ page.start(async () => {
   }
 
   // One sample in words.
-  const cell = new Map((told.patches?.rows ?? []).map((row, i) => [row, i]));
+  const cell = new Map((facts.patches?.rows ?? []).map((row, i) => [row, i]));
   function inWords(i) {
-    const rows = told.quantities.map(({ key, called, unit, digits }) => {
+    const rows = facts.quantities.map(({ key, called, unit, digits }) => {
       const [label, said, std] = [c[key][i], c[`${key} predicted`][i], c[`${key} std`][i]];
       const sure = Number.isFinite(std) ? ` ± ${std.toPrecision(2)}` : "";
       const ends = ["low", "high"].map((end) => (said + c[`${key} ${end}`][i]).toFixed(digits));
@@ -65,13 +65,13 @@ page.start(async () => {
     const left = make("div"), right = make("div");
     if (places.length > 1) {
       const errors = places.map((place) => off(shown[place], key)), { mean } = page;
-      const kind = told.classes.map((one) => [one.name, places.filter((place) => c.class[shown[place]] === one.id).length]).filter(([, count]) => count);
+      const kind = facts.classes.map((one) => [one.name, places.filter((place) => c.class[shown[place]] === one.id).length]).filter(([, count]) => count);
       left.append(make("b", `${places.length} chosen`), pairs([
         ["mean error", `${page.fixed(mean(errors), digits)} ${unit}`], ["RMSE", `${Math.sqrt(mean(errors.map((e) => e * e))).toFixed(digits)} ${unit}`],
         ["ground", kind.map((pair) => pair.join(" ")).join(", ")]]), make("p", "The worst of them:"));
     }
     left.append(pairs(inWords(i)));
-    right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page only contains the patches of the samples with the largest errors of E.", { className: "note" })]));
+    right.append(...(cell.has(i) ? page.patches(facts.patches, cell.get(i)) : [make("p", "The page only contains the patches of the samples with the largest errors of E.", { className: "note" })]));
     box.append(left, right);
   }
   const choose = page.chooseSamples(source, { against: ["measured", "predicted"], off: ["slope", "error"] }, () => shown.length, (places) => show([...places].sort((a, b) => a - b)));
@@ -79,8 +79,8 @@ page.start(async () => {
   draw();
   show([]);
 
-  if (told.patches) {
-    page.gallery(told.patches, (i) => ({
+  if (facts.patches) {
+    page.gallery(facts.patches, (i) => ({
       kind: classOf(i).name, split: splitOf(i).name,
       words: `${classOf(i).name} ${page.fixed(c.slope[i], 1)}°, ${page.fixed(c.E[i], 0)} J, predicted ${page.fixed(c["E predicted"][i], 0)} J, ${splitOf(i).name}`,
     }), (i) => {

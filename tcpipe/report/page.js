@@ -144,18 +144,18 @@ const page = (() => {
   // Patches as buttons (gallery.html): `of(row)` gives a row's class, split and words, `choose(row)` is what a click does.
   function gallery(sheets, of, choose) {
     let most = 60;
-    const told = sheets.rows.map(of);
-    fillSelect(at("gallery-class"), [...new Set(told.map((one) => one.kind))].sort());
-    fillSelect(at("gallery-split"), [...new Set(told.map((one) => one.split))].sort());
+    const rows = sheets.rows.map(of);
+    fillSelect(at("gallery-class"), [...new Set(rows.map((one) => one.kind))].sort());
+    fillSelect(at("gallery-split"), [...new Set(rows.map((one) => one.split))].sort());
     fillSelect(at("gallery-layer"), sheets.layers.map((layer) => layer.name));
     at("gallery-layer").value = (sheets.layers.find((layer) => layer.name === "ortho") ?? sheets.layers[0]).name;
     const draw = () => {
       const [kind, split] = [at("gallery-class").value, at("gallery-split").value];
       const layer = sheets.layers.find((one) => one.name === at("gallery-layer").value);
-      const cells = [...told.keys()].filter((i) => (!kind || told[i].kind === kind) && (!split || told[i].split === split));
+      const cells = [...rows.keys()].filter((i) => (!kind || rows[i].kind === kind) && (!split || rows[i].split === split));
       at("gallery").replaceChildren(...cells.slice(0, most).map((i) => {
         const button = make("button", "", { type: "button" });
-        button.append(patch(sheets, layer, i, 92), told[i].words);
+        button.append(patch(sheets, layer, i, 92), rows[i].words);
         button.onclick = () => { choose(sheets.rows[i]); at("chosen").scrollIntoView({ block: "nearest" }); };
         return button;
       }));

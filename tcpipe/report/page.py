@@ -124,7 +124,7 @@ def show_verdict(
         by_code.setdefault((finding.severity, finding.code), []).append(finding)
     shown = []
     for (severity, code), of_code in by_code.items():
-        observed = [(describe_finding(of), of.span_s) for of in of_code]
+        observed = [(describe_finding(finding), finding.span_s) for finding in of_code]
         shown.append(ShownFinding(severity, code, describe_title(of_code[0]), observed, list_remedies(of_code)))
     for group, total, noun in groups:
         title, text = describe_title(group.findings[0]), describe_group(group, total, noun)

@@ -192,7 +192,9 @@ def draw_ratios(
         tooltips=[("", "@name"), ("ratio", "@value{0.00} (@low{0.00} to @high{0.00})")],
     )
     value, low, high = (list(column) for column in zip(*ends, strict=True)) if ends else ([], [], [])
-    colours = [FAINT if at else KEPT if of[0] < 1.0 else DROPPED for of, at in zip(ends, is_open, strict=True)]
+    colours = [
+        FAINT if at else KEPT if interval[0] < 1.0 else DROPPED for interval, at in zip(ends, is_open, strict=True)
+    ]
     plot.figure.line([1.0, 1.0], [0, max(len(known), 1)], color=FAINT, line_dash="dashed", line_width=2)
     source = {"name": [text for text, *_ in known], "value": value, "low": low, "high": high, "colour": colours}
     lines = plot.figure.segment("low", "name", "high", "name", color="colour", line_width=3, source=source)

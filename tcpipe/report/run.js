@@ -4,9 +4,9 @@ const packed = [page.data.spans, page.data.segments, ...Object.values(page.data.
 const unpacked = Promise.all(packed.map(page.unpack));
 page.start(async () => {
   const { at, make, fillSelect, pairs, model, ramp } = page;
-  const told = page.data;
+  const facts = page.data;
   const [spans, s, ...columns] = await unpacked;
-  const series = Object.fromEntries(Object.entries(told.series).map(([name, { gap_s }], i) => [name, { ...columns[i], gap_s }]));
+  const series = Object.fromEntries(Object.entries(facts.series).map(([name, { gap_s }], i) => [name, { ...columns[i], gap_s }]));
   const [track, n] = [series.track, s.start.length];
   const panels = [];
   const range = model("gates").x_range;
@@ -63,8 +63,8 @@ page.start(async () => {
     };
     for (let i = 0; i < spans.start.length; i++) {
       if (spans.end[i] < range.start || spans.start[i] > range.end) continue;
-      const mine = told.reasons.filter(([bit]) => spans.bits[i] & bit);
-      if (!mine.length) add("kept", told.kept, spans.start[i], spans.end[i]);
+      const mine = facts.reasons.filter(([bit]) => spans.bits[i] & bit);
+      if (!mine.length) add("kept", facts.kept, spans.start[i], spans.end[i]);
       mine.forEach(([, name, , colour]) => add(name, colour, spans.start[i], spans.end[i]));
       if (!mine.length) continue;
       const k = shade.x1.length - 1;
@@ -77,7 +77,7 @@ page.start(async () => {
   function redraw(views = panels) {
     const pixels = Math.max(200, model("gates").inner_width || 800);
     const heights = new Map(), shown = new Set(views.map((view) => view.model.name));
-    told.lines.forEach((line, k) => {
+    facts.lines.forEach((line, k) => {
       if (!shown.has(line.plot)) return;
       const data = seen(series[line.series], series[line.series][line.column], pixels);
       model(`line ${k}`).data_source.data = data;
@@ -98,7 +98,7 @@ page.start(async () => {
   range.properties.start.change.connect(soon);
   range.properties.end.change.connect(soon);
 
-  const [first, last] = [told.first_s, told.last_s];
+  const [first, last] = [facts.first_s, facts.last_s];
   const zoom = (start, end) => {
     const span = Math.min(end - start, last - first);
     const from = Math.min(Math.max(start, first), last - span);
@@ -116,13 +116,13 @@ page.start(async () => {
   at("on").onclick = () => about(1, 0.5);
 
   // Segments on the map and in their own plot.
-  const flagged = Array.from(s.quality, (bits) => (bits & told.flags ? told.doubted : told.kept));
+  const flagged = Array.from(s.quality, (bits) => (bits & facts.flags ? facts.doubted : facts.kept));
   const number = (value, [, , unit, digits]) => (finite(value) ? `${page.fixed(value, digits)} ${unit}` : "none");
   function ramped(values, kind) {
     const [low, high] = page.ends(values);
     at("scale").replaceChildren(...page.scale(number(low, kind), number(high, kind)));
     return Array.from(values, (value) => finite(value)
-      ? ramp[Math.max(0, Math.min(ramp.length - 1, Math.floor((ramp.length * (value - low)) / ((high - low) || 1))))] : told.unused);
+      ? ramp[Math.max(0, Math.min(ramp.length - 1, Math.floor((ramp.length * (value - low)) / ((high - low) || 1))))] : facts.unused);
   }
   // The track from one time to another as lines, which gaps end.
   function pathOf(from, to) {
@@ -131,7 +131,7 @@ page.start(async () => {
     for (let k = from; k < to; k++) {
       const gap = k > from && track.t[k] - track.t[k - 1] > track.gap_s;
       if (gap || k === from) { x = []; y = []; paths.push([x, y]); }
-      else if (k < to - 1 && Math.hypot(track.x[k] - x[x.length - 1], track.y[k] - y[y.length - 1]) < told.step_m) continue;
+      else if (k < to - 1 && Math.hypot(track.x[k] - x[x.length - 1], track.y[k] - y[y.length - 1]) < facts.step_m) continue;
       x.push(track.x[k]); y.push(track.y[k]);
     }
     return paths;
@@ -141,7 +141,7 @@ page.start(async () => {
   spans.start.forEach((start, i) => {
     for (const path of pathOf(after(track.t, start), Math.min(after(track.t, spans.end[i]) + 1, track.t.length))) {
       bySpan[0].push(path);
-      bySpan[1].push(told.reasons.find(([bit]) => spans.bits[i] & bit)?.[3] ?? told.unused);
+      bySpan[1].push(facts.reasons.find(([bit]) => spans.bits[i] & bit)?.[3] ?? facts.unused);
     }
   });
   function byColumn(key) {
@@ -160,11 +160,11 @@ page.start(async () => {
     model("track").data_source.data = whole ? byColumn(key) : lines(...bySpan);
     let colour = flagged;
     if (key === "severity") {
-      const seen = told.severities.filter((_, k) => s.severity.includes(k));
-      at("scale").replaceChildren(...page.legend([...seen, ["no finding of its own", told.kept], ["not in a segment", told.unused]]));
-      colour = Array.from(s.severity, (k) => told.severities[k]?.[1] ?? told.kept);
+      const seen = facts.severities.filter((_, k) => s.severity.includes(k));
+      at("scale").replaceChildren(...page.legend([...seen, ["no finding of its own", facts.kept], ["not in a segment", facts.unused]]));
+      colour = Array.from(s.severity, (k) => facts.severities[k]?.[1] ?? facts.kept);
     } else if (key === "quality") {
-      const entries = [["segment", told.kept], ["with a flag", told.doubted], ["kept, not in a segment", told.unused], ...told.reasons
+      const entries = [["segment", facts.kept], ["with a flag", facts.doubted], ["kept, not in a segment", facts.unused], ...facts.reasons
         .filter(([bit]) => spans.bits.some((bits) => bits & bit)).map(([, name, , colour]) => [name, colour])];
       at("scale").replaceChildren(...page.legend(entries));
     } else if (!whole) colour = ramped(s[names[key][1]], names[key]);
@@ -178,11 +178,11 @@ page.start(async () => {
     model("labels").data_source.data = { t: s.start.map((t, i) => (t + s.end[i]) / 2), y, low: off(-1), high: off(1), colour: flagged };
     model("label plot").left[0].axis_label = `${at("label").value} [${unit}]${std ? ", ± σ" : ""}`;
   }
-  const local = told.findings.filter(([start, end]) => end - start < 0.9 * (told.last_s - told.first_s));  // others hold everywhere
+  const local = facts.findings.filter(([start, end]) => end - start < 0.9 * (facts.last_s - facts.first_s));  // others hold everywhere
   const found = local.flatMap(([start, end, colour]) => pathOf(after(track.t, start - 1), after(track.t, end + 1)).map((path) => [path, colour]));
   model("findings").data_source.data = lines(found.map(([path]) => path), found.map(([, colour]) => colour));
-  page.chooseGround(told.ground);
-  at("ground").closest("label").hidden = !told.ground.length;
+  page.chooseGround(facts.ground);
+  at("ground").closest("label").hidden = !facts.ground.length;
   const colours = [...there, ...Object.keys(ofTrack).filter((key) => !there.includes(key) && track[ofTrack[key]]?.some(finite))];
   fillSelect(at("colour"), ["quality", "severity", ...colours], (key) => ({ quality: "use and quality", severity: "severity" })[key] ?? names[key][0]);
   fillSelect(at("label"), there, (key) => names[key][0]);
@@ -192,14 +192,14 @@ page.start(async () => {
 
   // One cursor, and what is chosen in words.
   const clock = (t) => {
-    const epoch = told.epochs.findLast(([start]) => t >= start - 0.5) ?? told.epochs[0];
+    const epoch = facts.epochs.findLast(([start]) => t >= start - 0.5) ?? facts.epochs[0];
     const ns = BigInt(epoch[1]) + BigInt(Math.round((t - epoch[0]) * 1e6)) * 1000n;
     return page.clock(Number(ns / 1000000n));
   };
   const segmentAt = (t) => { for (let i = 0; i < n; i++) if (s.start[i] <= t && t <= s.end[i]) return i; return -1; };
   const bitsAt = (t) => { for (let i = 0; i < spans.start.length; i++) if (spans.start[i] <= t && t <= spans.end[i]) return spans.bits[i]; return null; };
-  const reasonsAt = (t) => told.reasons.filter(([bit]) => (bitsAt(t) ?? 0) & bit);
-  const values = (t) => told.lines.flatMap((line) => {
+  const reasonsAt = (t) => facts.reasons.filter(([bit]) => (bitsAt(t) ?? 0) & bit);
+  const values = (t) => facts.lines.flatMap((line) => {
     const one = series[line.series], i = nearest(one.t, t), value = one[line.column][i];
     return finite(value) && Math.abs(one.t[i] - t) <= one.gap_s ? [[`${line.plot} ${line.name}`.trim(), `${value.toPrecision(4)} ${line.unit}`]] : [];
   });
@@ -220,14 +220,14 @@ page.start(async () => {
     const [left, right] = [make("div"), make("div")];
     if (i >= 0) {
       at("row").value = i + 1;
-      const flags = told.quality.filter(([bit]) => s.quality[i] & bit).map(([, words]) => words);
+      const flags = facts.quality.filter(([bit]) => s.quality[i] & bit).map(([, words]) => words);
       left.append(make("b", `Segment ${i + 1} of ${n}`), pairs([
         ...Object.values(names).filter(([, name]) => s[name] !== undefined).map((kind) => {
           const std = s[`${kind[1]}_std`]?.[i];
           return [kind[0], finite(std) && finite(s[kind[1]][i]) ? `${page.fixed(s[kind[1]][i], kind[3])} ± ${std.toPrecision(2)} ${kind[2]}` : number(s[kind[1]][i], kind)];
         }),
         ["quality", flags.length ? flags.join("; ") : "clean"],
-        ["in a dataset", page.explain(`${told.run}-${told.starts[i]}`)]]));
+        ["in a dataset", page.explain(`${facts.run}-${facts.starts[i]}`)]]));
     } else {
       left.append(make("b", bitsAt(t) === null ? "No track here" : why.length ? "Not used" : "Kept, but not in a segment"),
         pairs(why.length ? why.map(([, name, words]) => [name, words]) : [["why", bitsAt(t) === null
@@ -240,7 +240,7 @@ page.start(async () => {
   const current = (by) => { const t = chosen ?? first, i = segmentAt(t); return i >= 0 ? i : after(s.start, t) - (by > 0 ? 1 : 0); };
   page.stepThrough(() => n, current, pick);
   document.querySelectorAll(".show").forEach((button) => {
-    const { from, to } = button.dataset, found = told.findings.find(([, , , ...span]) => span[0] === Number(from) && span[1] === Number(to));
+    const { from, to } = button.dataset, found = facts.findings.find(([, , , ...span]) => span[0] === Number(from) && span[1] === Number(to));
     if (!found) return;
     const [start, end] = found, room = Math.max(2, 0.2 * (end - start));
     button.hidden = false;
@@ -289,7 +289,7 @@ page.start(async () => {
   });
 
   const wide = at(model("map").id).clientWidth;
-  if (wide < 600) model("map").height = Math.round(Math.min(600, Math.max(240, 90 + (wide - 100) * told.tall_by_wide)));
+  if (wide < 600) model("map").height = Math.round(Math.min(600, Math.max(240, 90 + (wide - 100) * facts.tall_by_wide)));
   paint();
   if (n) pick(0);
   else choose(first);

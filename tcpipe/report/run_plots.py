@@ -383,13 +383,13 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts, findings: S
     least_s = 0.004 * timeline.end_s  # so that a moment can be seen
     events = [
         (
-            of.finding.code,
-            of.start_s,
-            max(of.end_s, of.start_s + least_s),
-            SEVERITY_COLOURS[of.finding.severity],
-            describe_finding(of.finding),
+            finding.finding.code,
+            finding.start_s,
+            max(finding.end_s, finding.start_s + least_s),
+            SEVERITY_COLOURS[finding.finding.severity],
+            describe_finding(finding.finding),
         )
-        for of in findings
+        for finding in findings
     ]
     problems = dict.fromkeys(row for row, *_ in events)
     events += _iterate_events(timeline, facts)

@@ -157,7 +157,8 @@ def _draw_run(
         "spans": spans.to_json(),
         "segments": _make_segments_data(segments, timeline, run_map, findings=info.report.findings, spans=findings),
         "findings": [
-            [of.start_s, of.end_s, SEVERITY_COLOURS[of.finding.severity], *(of.finding.span_s or ())] for of in findings
+            [span.start_s, span.end_s, SEVERITY_COLOURS[span.finding.severity], *(span.finding.span_s or ())]
+            for span in findings
         ],
         "severities": [[name, SEVERITY_COLOURS[name]] for name in SEVERITIES],
         "starts": [str(stamp) for stamp in to_integers(segments, "start_ns").tolist()],
@@ -258,9 +259,11 @@ def _find_severities(
     """Return the worst severity that concerns each segment by a span or a flag: its place in `SEVERITIES`, beyond them where none does."""
     start_s, end_s = (np.asarray(columns[name][1], np.float64) for name in ("start", "end"))
     quality = np.asarray(columns["quality"][1], np.int64)
-    concerned = [(of.finding.severity, (start_s <= of.end_s) & (end_s >= of.start_s)) for of in spans]
+    concerned = [(span.finding.severity, (start_s <= span.end_s) & (end_s >= span.start_s)) for span in spans]
     flags = {code: int(Quality[entry.flag.upper()]) for code, entry in read_catalogue().items() if entry.flag}
-    concerned += [(of.severity, (quality & flags[of.code]) != 0) for of in findings if of.code in flags]
+    concerned += [
+        (finding.severity, (quality & flags[finding.code]) != 0) for finding in findings if finding.code in flags
+    ]
     worst = np.full(len(quality), len(SEVERITIES))
     for severity, rows in concerned:
         worst[rows] = np.minimum(worst[rows], rank_severity(severity))

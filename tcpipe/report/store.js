@@ -1,21 +1,21 @@
 "use strict";
 // The store's page: a table of all runs that sorts and filters, and plots over time; what is chosen in one is chosen in the other.
 page.start(() => {
-  const { data: told, at, make, fillSelect } = page;
-  const runs = told.rows.map((row, number) => Object.assign({ number }, ...told.fields.map((name, i) => ({ [name]: row[i] }))));
+  const { data: facts, at, make, fillSelect } = page;
+  const runs = facts.rows.map((row, number) => Object.assign({ number }, ...facts.fields.map((name, i) => ({ [name]: row[i] }))));
   const state_of = (run) => run.superseded_by ? `superseded by ${run.superseded_by}` : run.state;
   const date = (ms) => ms === null ? "" : new Date(ms).toISOString().slice(0, 16).replace("T", " ");
   const digits = (name, places) => (run) => run[name] === null ? "" : run[name].toFixed(places);
   const columns = [
     ["run", (run) => run.run], ["start_ms", (run) => date(run.start_ms), 1], ["robot", (run) => run.robot], ["state", state_of],
-    ["datasets", (run) => run.datasets.map((n) => told.datasets[n]).join(", ")], ["tags", (run) => run.tags],
+    ["datasets", (run) => run.datasets.map((n) => facts.datasets[n]).join(", ")], ["tags", (run) => run.tags],
     ["segments", digits("segments", 0), 1], ["driven", digits("driven", 0), 1], ["used", digits("used", 1), 1], ["floor", digits("floor", 2), 1],
     ["verdict", (run) => run.verdict], ["findings", digits("findings", 0), 1],
   ];
 
   // What is shown: the rows of the filters, or those that were chosen in a plot.
   let [by, falls, most, chosen] = ["", false, 25, null];
-  const key = (run) => by === "datasets" ? run.datasets.map((n) => told.datasets[n]).join(", ") : run[by];
+  const key = (run) => by === "datasets" ? run.datasets.map((n) => facts.datasets[n]).join(", ") : run[by];
   const order = (one, other) => {
     const [a, b] = [key(one), key(other)], lacks = (value) => value === null || value === "";
     if (lacks(a) || lacks(b)) return lacks(a) - lacks(b);
@@ -62,7 +62,7 @@ page.start(() => {
   // The plots.
   const source = page.model("used")?.data_source;
   const points = runs.filter((run) => run.start_ms !== null);
-  const colours = new Map(told.robots);
+  const colours = new Map(facts.robots);
   const numbers = (name) => Float64Array.from(points, (run) => run[name] ?? NaN);
   const term = () => {
     const n = at("term")?.selectedIndex ?? -1;
@@ -71,7 +71,7 @@ page.start(() => {
   let quiet = false;
   if (source) {
     if (at("term")) {
-      fillSelect(at("term"), told.terms);
+      fillSelect(at("term"), facts.terms);
       const axis = page.model("drift term").left[0];
       at("term").onchange = () => { source.data = { ...source.data, term: term() }; axis.axis_label = at("term").value; };
       axis.axis_label = at("term").value;
@@ -97,10 +97,10 @@ page.start(() => {
     }
     draw();
   };
-  fillSelect(at("robot"), told.robots.map(([robot]) => robot));
+  fillSelect(at("robot"), facts.robots.map(([robot]) => robot));
   fillSelect(at("state"), [...new Set(runs.map((run) => run.state))], (state) => `${state} (${runs.filter((run) => run.state === state).length})`);
-  fillSelect(at("dataset"), ["none", ...told.datasets.keys()], (n) => told.datasets[n] ?? n);
-  fillSelect(at("code"), [...told.codes.keys()], (n) => told.codes[n]);
+  fillSelect(at("dataset"), ["none", ...facts.datasets.keys()], (n) => facts.datasets[n] ?? n);
+  fillSelect(at("code"), [...facts.codes.keys()], (n) => facts.codes[n]);
   for (const id of ["robot", "state", "dataset", "code"]) at(id).onchange = filtered;
   at("find").oninput = filtered;
   at("clear").onclick = () => {

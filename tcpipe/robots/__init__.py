@@ -230,14 +230,16 @@ class Profiles:
         """Return the message types that carry power, best first; with ``propulsion`` those that tell it apart for some robot."""
         return list(
             dict.fromkeys(
-                of.type for of in self.power_sources if (of.propulsion and not of.unsupported_reason) or not propulsion
+                source.type
+                for source in self.power_sources
+                if (source.propulsion and not source.unsupported_reason) or not propulsion
             )
         )
 
     def refusals(self) -> dict[str, str]:
         """Return the message types that carry currents but tell no power, and why."""
-        telling = {of.type for of in self.power_sources if not of.unsupported_reason}
-        return {of.type: of.unsupported_reason for of in self.power_sources if of.type not in telling}
+        telling = {source.type for source in self.power_sources if not source.unsupported_reason}
+        return {source.type: source.unsupported_reason for source in self.power_sources if source.type not in telling}
 
     def before(self, others: Profiles) -> Profiles:
         """Return these and others: a robot's name and a message type that are here are not taken from there."""
@@ -250,8 +252,10 @@ def parse_fields(text: str) -> list[FieldPath]:
     """Return the fields that a source's text joins by + and -."""
     found = []
     for part in re.finditer(r"([+-]?)([^+-]+)", text):
-        if of := _FIELD.fullmatch(part[2]):
-            column = of["path"] + (f"[]{of['inner']}" if of["inner"] else "")
-            index = int(of["index"]) if of["index"] else None
-            found.append(FieldPath(column, index, bool(of["of_list"]) and index is None, -1 if part[1] == "-" else 1))
+        if match := _FIELD.fullmatch(part[2]):
+            column = match["path"] + (f"[]{match['inner']}" if match["inner"] else "")
+            index = int(match["index"]) if match["index"] else None
+            found.append(
+                FieldPath(column, index, bool(match["of_list"]) and index is None, -1 if part[1] == "-" else 1)
+            )
     return found

@@ -165,25 +165,28 @@ def read_paper_parameters() -> Numbers:
 
 def make_paper_site() -> PaperSite:
     """Return a site as large, as high and as steep as the paper's (section IV-A), its robot, and drives with its class shares."""
-    told = read_paper_parameters()
-    ground = {_GROUNDS[name]: GroundModel(**_read_numbers(table)) for name, table in told["ground"].items()}
-    wheels = Wheels(**_read_table(Wheels, told["wheels"]))
-    robot = SimulatedRobot(**_read_table(SimulatedRobot, told["robot"]), ground=ground, wheels=wheels)
-    sensors = Sensors(gnss=Gnss(**_read_table(Gnss, told["gnss"])), power=Power(**_read_table(Power, told["power"])))
-    return PaperSite(make_paper_world(), robot, sensors, tuple(_iterate_tours(told["drives"])))
+    parameters = read_paper_parameters()
+    ground = {_GROUNDS[name]: GroundModel(**_read_numbers(table)) for name, table in parameters["ground"].items()}
+    wheels = Wheels(**_read_table(Wheels, parameters["wheels"]))
+    robot = SimulatedRobot(**_read_table(SimulatedRobot, parameters["robot"]), ground=ground, wheels=wheels)
+    sensors = Sensors(
+        gnss=Gnss(**_read_table(Gnss, parameters["gnss"])), power=Power(**_read_table(Power, parameters["power"]))
+    )
+    return PaperSite(make_paper_world(), robot, sensors, tuple(_iterate_tours(parameters["drives"])))
 
 
 def make_paper_surface() -> Surface:
     """Return what the ground is like from metre to metre."""
-    told = read_paper_parameters()
-    states = told["states"]
+    parameters = read_paper_parameters()
+    states = parameters["states"]
 
     def make_field(seed: int, name: str, count: int, **options: Any) -> tuple[Wave, ...]:
         return draw_waves(seed, count=count, total=1.0, wavelength_m=tuple(states[f"{name}_m"]), **options)
 
     return Surface(
         looks={
-            _GROUNDS[name]: SurfaceEffect(**_read_table(SurfaceEffect, table)) for name, table in told["look"].items()
+            _GROUNDS[name]: SurfaceEffect(**_read_table(SurfaceEffect, table))
+            for name, table in parameters["look"].items()
         },
         wetness=make_field(31, "wetness", 16),
         cover=make_field(32, "cover", 16),
@@ -244,8 +247,8 @@ def make_paper_world() -> World:
 
     Its shape is made up: a long slope with knolls, two paved and three unpaved roads, mud in the hollows, trees and hedges.
     """
-    told = read_paper_parameters()
-    about, surface = told["site"], told["surface"]
+    parameters = read_paper_parameters()
+    about, surface = parameters["site"], parameters["surface"]
     rng = np.random.default_rng(about["seed"])
     site = Site(west_m=697300.0, south_m=5208300.0, width_m=about["width_m"], height_m=about["height_m"])
     slope = (Hill(420.0, 210.0, 60.0, 170.0, 130.0), Hill(120.0, 60.0, -16.0, 120.0, 80.0))

@@ -194,8 +194,10 @@ class Sensors:
     def mounted(self, faults: Faults) -> Sensors:
         """Return the sensors with their true extrinsics: at base_link unless the fault that moves them is on."""
         in_place = {"gnss": faults.gnss_lever_arm, "doppler": faults.gnss_lever_arm, "imu": faults.imu_mounting}
-        carried = {name: of for name, kept in in_place.items() if not kept and (of := getattr(self, name)) is not None}
-        return replace(self, **{name: replace(of, mounting=AT_BASE_LINK) for name, of in carried.items()})
+        carried = {
+            name: sensor for name, kept in in_place.items() if not kept and (sensor := getattr(self, name)) is not None
+        }
+        return replace(self, **{name: replace(sensor, mounting=AT_BASE_LINK) for name, sensor in carried.items()})
 
     def stated(self, faults: Faults, noise: Noise) -> Sensors:
         """Return mounted sensors as the log of a drive states them: the antenna off by up to its ``stated_off_m``."""
@@ -214,8 +216,8 @@ def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: No
         "gnss": partial(read_gnss, site=site), "imu": read_imu, "wheels": read_wheels, "visual": read_visual,
         "power": read_power, "command": read_command, "doppler": read_doppler,
     }  # fmt: skip
-    carried = {name: of for name in readers if (of := getattr(sensors, name)) is not None}
-    readings = {name: readers[name](truth, of, faults, noise) for name, of in carried.items()}
+    carried = {name: sensor for name in readers if (sensor := getattr(sensors, name)) is not None}
+    readings = {name: readers[name](truth, sensor, faults, noise) for name, sensor in carried.items()}
     readings = {name: _offset_stamps(name, reading, sensors, faults) for name, reading in readings.items()}
     if faults.clock_step:
         middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2

@@ -105,7 +105,9 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
     """Yield the findings of reading; one without extrinsics suggests none where fusing has estimated them."""
-    estimated = {role for finding in fused for of in finding.remedies for role in of.recipe.get("read.extrinsics", ())}
+    estimated = {
+        role for finding in fused for remedy in finding.remedies for role in remedy.recipe.get("read.extrinsics", ())
+    }
     for finding in read:
         is_estimated = finding.code == "sensor-not-placed" and finding.subject.name in estimated
         yield replace(finding, remedies=()) if is_estimated else finding
@@ -228,7 +230,10 @@ def find_clock_jumps(inputs: FusionInputs) -> Iterator[tuple[int, Finding]]:
         if m.gnss is None or odometry is None:
             continue
         for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > _JUMP_NS]:
-            step_s, at_s = float(np.diff(ends_ns)[0]) * 1e-9, float(ends_ns[1] - min(of[0] for of in stamps)) * 1e-9
+            step_s, at_s = (
+                float(np.diff(ends_ns)[0]) * 1e-9,
+                float(ends_ns[1] - min(stamps_ns[0] for stamps_ns in stamps)) * 1e-9,
+            )
             driven = np.interp(ends_ns, odometry.stamp_ns, odometry.velocity_mps[:, 0])
             moved_m = [np.diff(np.interp(ends_ns, m.gnss.stamp_ns, axis)) for axis in m.gnss.position_enu_m[:, :2].T]
             slowest_mps = float(np.abs(driven).min())

@@ -76,9 +76,9 @@ def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) 
         findings.append(make_finding("local-frame", gnss))
     elif inputs.datum_deg_m is not None:
         findings += [
-            _find_initial_yaw(of, first_ns, gnss)
-            for of in facts.stretches
-            if of.heading_from not in _CERTAIN_YAW_SOURCES
+            _find_initial_yaw(section, first_ns, gnss)
+            for section in facts.stretches
+            if section.heading_from not in _CERTAIN_YAW_SOURCES
         ]
     findings += _find_reopenings(facts, first_ns)
     findings += _find_changes(facts, first_ns)
@@ -265,7 +265,7 @@ def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Str
     # That of wheels always varies: they slip.
     camera = parameters.get("camera scale")
     varies = {} if camera is None else {VISUAL: max(camera.variation, default=0.0)}
-    varies |= {each.role: each.size for of in facts.stretches for each in of.changes if each.kind == "varies"}
+    varies |= {each.role: each.size for section in facts.stretches for each in section.changes if each.kind == "varies"}
     for role, variation in varies.items():
         if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
             yield make_finding("odometry-scale-varies", Subject("role", role), variation_fraction=variation)

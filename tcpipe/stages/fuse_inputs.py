@@ -213,7 +213,9 @@ def exclude_sensors(inputs: FusionInputs, exclusions: Iterable[SensorExclusion],
 
 def find_longest_epoch(inputs: FusionInputs) -> int:
     """Return the clock epoch with most measurements."""
-    counts = {epoch: sum(of.stamp_ns.size for of in m.sensors().values()) for epoch, m in inputs.measurements.items()}
+    counts = {
+        epoch: sum(sensor.stamp_ns.size for sensor in m.sensors().values()) for epoch, m in inputs.measurements.items()
+    }
     return max(counts, key=lambda epoch: counts[epoch])
 
 
@@ -304,5 +306,7 @@ def name_pose(value: _Named, streams: Streams) -> _Named:
     elif isinstance(value, tuple | list):
         named = type(value)(name_pose(item, streams) for item in value)
     elif is_dataclass(value) and not isinstance(value, type):
-        named = replace(value, **{of.name: name_pose(getattr(value, of.name), streams) for of in fields(value)})
+        named = replace(
+            value, **{entry.name: name_pose(getattr(value, entry.name), streams) for entry in fields(value)}
+        )
     return cast("_Named", named)

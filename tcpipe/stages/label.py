@@ -206,8 +206,8 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
         start_std_m=start_std_m,
         end_std_m=end_std_m,
         smoothed=smoothed,
-        told_s=DISPLACEMENT_LAGS_S,
-        told_std_m=told_m,
+        lags_s=DISPLACEMENT_LAGS_S,
+        lag_std_m=told_m,
     )
 
 
@@ -232,7 +232,7 @@ def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
     """Return the resolution of the power of all rails together [W]; 0 where none shows."""
     steps = [
         float(np.median(each.voltage_volt)) * estimate_resolution(each.current)
-        for each in next((of for of in rails.values() if of), [])
+        for each in next((rail_facts for rail_facts in rails.values() if rail_facts), [])
         if len(each.voltage_volt)
     ]
     return float(np.linalg.norm(steps)) if steps else 0.0

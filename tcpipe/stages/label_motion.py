@@ -117,11 +117,11 @@ def _compute_vibration(
     if imu is None:
         return unknown
     force = np.column_stack([to_floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
-    told = np.isfinite(force).all(axis=1)
+    is_known = np.isfinite(force).all(axis=1)
     low, high = _GRAVITY_BAND_MPS2
-    if not told.any() or not low <= float(np.median(np.linalg.norm(force[told], axis=1))) <= high:
+    if not is_known.any() or not low <= float(np.median(np.linalg.norm(force[is_known], axis=1))) <= high:
         return unknown
-    return compute_vibration_mps2(to_integers(imu, "stamp_ns")[told], force[told], start_ns, end_ns)
+    return compute_vibration_mps2(to_integers(imu, "stamp_ns")[is_known], force[is_known], start_ns, end_ns)
 
 
 Flags = dict[Quality, NDArray[np.bool_]]

@@ -65,10 +65,12 @@ def audit_power_sensor(
         still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz, but=DropReason.STUCK)
         for rail in rails:
             rest_amp.setdefault(rail.name, []).append(measure_rest_currents(rail, still_ns))
-    joined = [of for parts in rest_amp.values() if (of := np.concatenate(parts)).size]
+    joined = [current_amp for parts in rest_amp.values() if (current_amp := np.concatenate(parts)).size]
     if not joined:
         return facts
-    std_amp = max(estimate_offset_std(of, power.rest_current_amp, facts.offset_std_amp) for of in joined)
+    std_amp = max(
+        estimate_offset_std(current_amp, power.rest_current_amp, facts.offset_std_amp) for current_amp in joined
+    )
     low, high = zip(*map(summarize_rest, joined), strict=True)
     return replace(facts, offset_std_amp=std_amp, rest_amp=(min(low), max(high)))
 
@@ -84,7 +86,7 @@ def _add_gain_change(facts: PowerSensorFacts, rails_by_epoch: Mapping[int, list[
     changes = [found for rails in rails_by_epoch.values() if (found := find_gain_change(measure_sag(rails)))]
     if not changes:
         return facts
-    change = max(changes, key=lambda of: abs(of.ratio - 1.0))
+    change = max(changes, key=lambda candidate: abs(candidate.ratio - 1.0))
     std = float(np.hypot(facts.gain_std_fraction, (change.ratio - 1.0) / 2.0**0.5))
     return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
 

@@ -86,13 +86,13 @@ def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[M
     """
     stamp_ns, run_id = to_integers(track.table, "stamp_ns"), track.info.run_id
     dropped, kept, empty = np.zeros(len(stamp_ns), np.bool_), np.zeros(len(stamp_ns), np.bool_), 0
-    mine = [of for of in windows if len(stamp_ns) and of.is_for(run_id)]
+    mine = [window for window in windows if len(stamp_ns) and window.is_for(run_id)]
     for window in mine:
         start_ns, end_ns = window.find_bounds_ns(int(stamp_ns[0]))
         inside = (stamp_ns >= start_ns) & (stamp_ns < end_ns)
         empty += not inside.any()
         (dropped if window.action == "drop" else kept)[inside] = True
-    if any(of.action == "keep" for of in mine):
+    if any(window.action == "keep" for window in mine):
         dropped |= ~kept
     subject = Subject("run", run_id)
     return dropped, (make_finding("time-window-empty", subject, windows_count=empty),) if empty else ()
@@ -264,8 +264,8 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
         chord_m=chord_m,
         slowest_mps=config.turning_velocity_mps,
         smoothed=track.info.estimator == "smoother",
-        told_s=DISPLACEMENT_LAGS_S,
-        told_std_m=_subtract_variance(told_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
+        lags_s=DISPLACEMENT_LAGS_S,
+        lag_std_m=_subtract_variance(told_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
     )
 
 

@@ -48,16 +48,18 @@ def find_proposals(
     """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of. The log is read once."""
     free = [topic for topic in log.topics.values() if _is_free(topic, config)]
     settled, types = {*assignment.roles, *config.topics}, {topic.type_name for topic in free}
-    known_types = {*known.types(), *(of for types in ROLE_TYPES.values() for of in types)}
+    known_types = {*known.types(), *(type_name for types in ROLE_TYPES.values() for type_name in types)}
     of_role = {
         (role, topic): fields
         for role in _PROPOSED
         if role not in settled and not types & set(ROLE_TYPES[role])
         for topic in free
-        if (fields := match_field_names(role, [of for of in list_number_fields(topic) if "[]" not in of]))
+        if (fields := match_field_names(role, [field for field in list_number_fields(topic) if "[]" not in field]))
     }
     of_power = [topic for topic in free if "power" not in settled and _may_be_power(topic, known_types)]
-    lists = {topic.name: [of for of in [*list_number_fields(topic), "name[]"] if "[]" in of] for topic in of_power}
+    lists = {
+        topic.name: [field for field in [*list_number_fields(topic), "name[]"] if "[]" in field] for topic in of_power
+    }
     tables = log.tables(list(dict.fromkeys([*(topic.name for _, topic in of_role), *lists])))
     columns = {name: make_message_arrays(table, lists.get(name, ())) for name, table in tables.items()}
     readable = [topic for topic in of_power if topic.name in columns]
@@ -87,9 +89,9 @@ def _propose_roles(
     for (role, topic), found in matched.items():
         own = columns.get(topic.name, {})
         if set(found.values()) <= set(own):
-            mapped, doubt = judge_fields(role, found, {name: own[of] for name, of in found.items()})
+            mapped, doubt = judge_fields(role, found, {name: own[column] for name, column in found.items()})
             remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: mapped}})
-            names = {field: format_first(own[of]) for field, of in found.items() if field != "quality"}
+            names = {field: format_first(own[column]) for field, column in found.items() if field != "quality"}
             names |= {"role": role, "type": topic.type_name, **({"doubt": doubt} if doubt else {})}
             yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
 
@@ -99,8 +101,8 @@ def judge_fields(role: str, found: Mapping[str, str], columns: Columns) -> tuple
 
     ``found`` are the names that are matched, ``columns`` their values by field.
     """
-    values = {name: np.asarray(of, np.float64) for name, of in columns.items()}
-    values = {name: of[np.isfinite(of) & (of != 0.0)] for name, of in values.items()}
+    values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
+    values = {name: value[np.isfinite(value) & (value != 0.0)] for name, value in values.items()}
     if role == "gnss":
         return _judge_fixes(dict(found), values)
     if role == "imu":
@@ -154,11 +156,11 @@ def _propose_power(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> I
     bare = [topic for topic in topics if topic.type_name in FLOAT_TYPES]
     own = [topic for topic in topics if topic.type_name not in (*FLOAT_TYPES, JOINT_STATE)]
     found = [*_find_bare(bare, columns)] or [*_find_own(own, columns)] or [*_find_joints(topics, columns)]
-    found.sort(key=lambda of: bool(of.doubt))
+    found.sort(key=lambda proposal: bool(proposal.doubt))
     for best in found[:1]:
-        rivals = [name for of in found[1:] if not of.doubt for name in of.topics]
+        rivals = [name for proposal in found[1:] if not proposal.doubt for name in proposal.topics]
         doubt = best.doubt or (f"{', '.join(rivals)} could be meant as well" if rivals else "")
-        listed = [name for of in found for name in of.topics]
+        listed = [name for proposal in found for name in proposal.topics]
         names = {"topics": ", ".join(listed), **({"doubt": doubt} if doubt else {})}
         used = list(dict.fromkeys(str(keys["topic"]) for keys in best.sources if "topic" in keys))
         used = used or (
@@ -221,7 +223,7 @@ def _find_bare(bare: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterato
         sources = [keys for keys in judged["power"] if split_sides(str(keys["topic"]))[0] == alike]
     elif not sources and not judged["voltage"]:
         sources, doubt = [{**keys, **NOMINAL} for keys in judged["current"]], NO_VOLTAGE
-    if topics := [str(keys["topic"]) for of in judged.values() for keys in of]:
+    if topics := [str(keys["topic"]) for judged_keys in judged.values() for keys in judged_keys]:
         yield _Candidate(tuple(topics), tuple(sources), numbers, doubt)
 
 
@@ -233,7 +235,7 @@ def _pair_rails(voltages: Sequence[Keys], currents: Sequence[Keys]) -> list[Keys
     """Return each rail's voltage and current: called alike, or all currents at the only voltage; of drives alone where some are."""
     by_rail = {keys["rail"]: keys for keys in voltages}
     used: list[Keys] = []
-    for keys in [of for of in currents if is_of_drives(str(of["topic"]))] or currents:
+    for keys in [current for current in currents if is_of_drives(str(current["topic"]))] or currents:
         voltage = by_rail.get(keys["rail"]) or (voltages[0] if len(voltages) == 1 else None)
         if voltage is None:
             return []
@@ -274,7 +276,7 @@ def _find_joints(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> Ite
         own = columns[topic.name] if topic.type_name == JOINT_STATE else {}
         names = [str(name) for name in np.unique(own.get("name[]", np.zeros(0, "U1"))).tolist()]
         wheels = "|".join(re.escape(name) for name in names if _DRIVING.fullmatch(name.lower()))
-        if wheels and all(np.any(np.nan_to_num(own.get(of, np.zeros(1)))) for of in ("velocity", "effort")):
+        if wheels and all(np.any(np.nan_to_num(own.get(quantity, np.zeros(1)))) for quantity in ("velocity", "effort")):
             keys: Keys = {"type": topic.type_name, "joints": wheels, "sign": "auto"}
             yield _Candidate(
                 (topic.name,), (keys,), doubt="uncomment if efforts are torques [N m]: mechanical power alone"

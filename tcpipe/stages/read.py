@@ -32,8 +32,11 @@ def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
     roles: dict[Role, list[str]] = {}
     for name, table in recipe.tables.items():
         role = cast("Role", table.role or name)
-        of, power = table.columns, table.make_power_source(name)
-        if role in get_args(Role) and (topic := find_topic(name, role, of, power.type if power else None)[0]) in topics:
+        columns, power = table.columns, table.make_power_source(name)
+        if (
+            role in get_args(Role)
+            and (topic := find_topic(name, role, columns, power.type if power else None)[0]) in topics
+        ):
             roles.setdefault(role, []).append(topic)
     return replace(recipe.read, topics={**roles, **recipe.read.topics}) if roles else recipe.read
 
@@ -198,7 +201,7 @@ def make_read_report(
         findings += _find_unused(source, timelines.get(source.key))
         if source.key in timelines:
             findings += _find_clock(source, timelines[source.key], is_simulated=clocks.simulated is not None)
-    start_ns = min((int(of.readings.log_time_ns[0]) for of in sources if len(of.readings.row)), default=0)
+    start_ns = min((int(source.readings.log_time_ns[0]) for source in sources if len(source.readings.row)), default=0)
     for step in steps:
         at_s, names = (step.log_time_ns - start_ns) / 1e9, {"topics": ", ".join(step.topics) or "all topics"}
         span_s, step_s = (at_s, at_s), step.step_s

@@ -112,14 +112,14 @@ def add_averaging(
     if period_s < read_threshold(_ASSUMED, "min_period_s"):
         return power, ()
     motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
-    told = None if motion is None else _test_by_motion(power_ns, watt, select_rows(motion, "clock_epoch", 0))
-    averaged = power.averaged if told is None else told
+    verdict = None if motion is None else _test_by_motion(power_ns, watt, select_rows(motion, "clock_epoch", 0))
+    averaged = power.averaged if verdict is None else verdict
     power = replace(power, averaged=averaged)
-    if told is None and period_s < read_threshold(_ASSUMED, "min_unobserved_period_s"):
+    if verdict is None and period_s < read_threshold(_ASSUMED, "min_unobserved_period_s"):
         return power, ()
-    severity: Severity | None = "warning" if told is None else None
-    names = {"value": "mean" if averaged else "sample", "evidence": "nothing" if told is None else "motion"}
-    remedies = [of for value in ("yes", "no") for of in suggest(value, {"read": {"power_averaged": value}})]
+    severity: Severity | None = "warning" if verdict is None else None
+    names = {"value": "mean" if averaged else "sample", "evidence": "nothing" if verdict is None else "motion"}
+    remedies = [remedy for value in ("yes", "no") for remedy in suggest(value, {"read": {"power_averaged": value}})]
     power_role = Subject("role", "power")
     found = make_finding(_ASSUMED, power_role, severity=severity, names=names, remedies=remedies, period_s=period_s)
     return power, (found,)
@@ -194,7 +194,7 @@ def remove_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
     if not repeats:
         return streams, []
     columns = {name: power[name] for name in power.column_names}
-    columns |= {of: np.where(kept[quantity], values[quantity], np.nan) for quantity, of in _QUANTITIES.items()}
+    columns |= {column: np.where(kept[quantity], values[quantity], np.nan) for quantity, column in _QUANTITIES.items()}
     table = STREAMS["power"].table(**columns).filter(pa.array(kept["current"] | kept["voltage"]))
     return {**streams, "power": table}, repeats
 
@@ -218,8 +218,11 @@ def find_repeats(repeats: Sequence[Repeats]) -> Iterator[Finding]:
     """Yield the finding that messages repeat readings, by the slowest of them; labelling finds whether that is too slow."""
     if not repeats:
         return
-    slowest = min(repeats, key=lambda of: of.reading_hz)
-    names = {of: ", ".join(dict.fromkeys(getattr(each, of) for each in repeats)) for of in ("quantity", "rail")}
+    slowest = min(repeats, key=lambda repeat: repeat.reading_hz)
+    names = {
+        attribute: ", ".join(dict.fromkeys(getattr(each, attribute) for each in repeats))
+        for attribute in ("quantity", "rail")
+    }
     message_hz, reading_hz = slowest.message_hz, slowest.reading_hz
     yield make_finding("power-readings-repeated", _POWER, names=names, message_hz=message_hz, reading_hz=reading_hz)
 

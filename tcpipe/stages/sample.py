@@ -211,12 +211,14 @@ def check_same_layers(sources: Sequence[MapReader], config: SampleConfig) -> Non
             continue
         for name, layer in layers.items():
             its = theirs[name]
-            got, wanted = (f"{of.signature}{f', {of.stored}' if of.bands else ''}" for of in (its, layer))
+            got, wanted = (
+                f"{layer_.signature}{f', {layer_.stored}' if layer_.bands else ''}" for layer_ in (its, layer)
+            )
             if got != wanted:
                 problems.append(f"map {other.name}: {name} is {got}, but {wanted} in map {first.name}")
             elif layer.classes is not None and its.classes is not None and its.classes != layer.classes:
                 different = "; ".join(its.classes.differences(layer.classes))
-                of = "its classes" if name == "terrain" else f"its classes of {name}"
-                problems.append(f"map {other.name}: {of} differ from those of map {first.name}: {different}")
+                subject = "its classes" if name == "terrain" else f"its classes of {name}"
+                problems.append(f"map {other.name}: {subject} differ from those of map {first.name}: {different}")
     if problems:
         raise MapError(*problems)

@@ -122,11 +122,11 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
 def _check_bounds(options: Any, function: str) -> None:
     """Raise `UsageError` for all numbers out of their range, values that are no choice, and points that are none."""
     problems = []
-    for of in fields(options):
-        kind, value = of.metadata.get("option", Option()).kind, getattr(options, of.name)
+    for entry in fields(options):
+        kind, value = entry.metadata.get("option", Option()).kind, getattr(options, entry.name)
         if value is None or not (expected := _describe_mismatch(kind, value)):
             continue
-        problems.append(f"{function}: {of.name} is {value!r}; expected {expected}")
+        problems.append(f"{function}: {entry.name} is {value!r}; expected {expected}")
     if problems:
         raise UsageError(*problems)
 

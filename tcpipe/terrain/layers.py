@@ -108,7 +108,7 @@ class Layer:
         """Return the mean of each band of stored patches, or the share of each class, shape (N, bands or classes); without data: 0."""
         if self.classes is not None:
             ids = np.arange(1, self.classes.count + 1)
-            return np.stack([np.mean(pixels == of, axis=(1, 2)) for of in ids], axis=1)
+            return np.stack([np.mean(pixels == class_id, axis=(1, 2)) for class_id in ids], axis=1)
         values = pixels.reshape(len(pixels), max(len(self.bands), 1), -1).astype(np.float64)
         has_data = self.has_stored_data(values)
         return np.asarray(np.where(has_data, values, 0.0).sum(axis=2) / np.maximum(has_data.sum(axis=2), 1))

@@ -57,12 +57,12 @@ def make_arrow_schema(message: Record) -> pa.Schema:
     """
     fields = [pa.field(name, pa.int64()) for name in (LOG_TIME, PUBLISH_TIME)]
     taken = {LOG_TIME, PUBLISH_TIME}
-    for name, of in iterate_flat_fields(message):
+    for name, wire_type in iterate_flat_fields(message):
         column = name
         while column in taken:
             column += "_"
         taken.add(column)
-        fields.append(pa.field(column, find_arrow_type(of)))
+        fields.append(pa.field(column, find_arrow_type(wire_type)))
     return pa.schema(fields)
 
 
@@ -171,14 +171,14 @@ class TopicTable:
         self._gathered, self._gathered_bytes = [], 0
         ends = np.cumsum(lengths)
         starts = ends - lengths
-        for of in self._split_dialects(data, starts, lengths):
-            first = data[starts[of][0] : ends[of][0]][:4].tobytes()
+        for part in self._split_dialects(data, starts, lengths):
+            first = data[starts[part][0] : ends[part][0]][:4].tobytes()
             try:
                 dialect = find_dialect(first, self._encoding)
             except LayoutError as error:
-                self._leave_out(str(error), len(rows[of]))
+                self._leave_out(str(error), len(rows[part]))
             else:
-                self._decode_lengths(rows[of], data, starts[of], ends[of], dialect)
+                self._decode_lengths(rows[part], data, starts[part], ends[part], dialect)
 
     def _decode_lengths(
         self, rows: _Int64, data: NDArray[np.uint8], starts: _Int64, ends: _Int64, dialect: Dialect
@@ -189,14 +189,16 @@ class TopicTable:
             self._decode_dialect(rows, data, starts, ends, dialect)
             return
         groups = dict(group_by_key(lengths))
-        for length in [length for length, of in groups.items() if length and len(of) >= MIN_GROUP]:
-            of = groups.pop(length)
-            begins = length * np.arange(len(of))
-            alike = _gather_payloads(data.data, starts[of], length)
-            self._decode_dialect(rows[of], alike, begins, begins + length, dialect)
+        for length in [
+            length for length, rows_of_length in groups.items() if length and len(rows_of_length) >= MIN_GROUP
+        ]:
+            group = groups.pop(length)
+            begins = length * np.arange(len(group))
+            alike = _gather_payloads(data.data, starts[group], length)
+            self._decode_dialect(rows[group], alike, begins, begins + length, dialect)
         if groups:
-            of = np.sort(np.concatenate(list(groups.values())))
-            self._decode_dialect(rows[of], data, starts[of], ends[of], dialect)
+            group = np.sort(np.concatenate(list(groups.values())))
+            self._decode_dialect(rows[group], data, starts[group], ends[group], dialect)
 
     def _split_dialects(self, data: NDArray[np.uint8], starts: _Int64, lengths: _Int64) -> Iterator[slice | _Int64]:
         """Yield which messages have the same head of CDR; those that are too short for one have none."""
@@ -256,7 +258,8 @@ class TopicTable:
                 kept.append(row)
         names = [name for name, _ in iterate_flat_fields(self._type.wire)]
         columns = [
-            pa.array([value[name] for value in values], of) for name, of in zip(names, self._fields.types, strict=True)
+            pa.array([value[name] for value in values], arrow_type)
+            for name, arrow_type in zip(names, self._fields.types, strict=True)
         ]
         self._add_part(np.array(kept, np.int64), columns)
 
@@ -281,17 +284,17 @@ def _make_contiguous(table: pa.Table) -> pa.Table:
     return table.combine_chunks() if table.nbytes < MAX_CONTIGUOUS_BYTES else table
 
 
-def find_arrow_type(of: WireType) -> pa.DataType:
+def find_arrow_type(wire_type: WireType) -> pa.DataType:
     """Return the Arrow type: arrays become lists (fixed-size ones where the definition fixes it), messages structs."""
-    match of:
+    match wire_type:
         case Scalar():
-            return pa.bool_() if of.code == "?" else pa.from_numpy_dtype(np.dtype(of.code))
+            return pa.bool_() if wire_type.code == "?" else pa.from_numpy_dtype(np.dtype(wire_type.code))
         case Text():
             return pa.string()
         case Record():
-            return pa.struct([pa.field(name, find_arrow_type(field)) for name, field in of.fields])
+            return pa.struct([pa.field(name, find_arrow_type(field)) for name, field in wire_type.fields])
         case Array():
-            return pa.list_(find_arrow_type(of.element), of.length or -1)
+            return pa.list_(find_arrow_type(wire_type.element), wire_type.length or -1)
 
 
 def make_texts(count: int, offsets: pa.Buffer, raw: pa.Buffer) -> tuple[pa.StringArray, int]:
@@ -325,26 +328,26 @@ class WalkedColumns:
         self.replaced_texts = 0
         self._data = data
 
-    def columns(self, root: Fields, of: Record) -> Iterator[pa.Array]:
+    def columns(self, root: Fields, record: Record) -> Iterator[pa.Array]:
         """Yield the columns in the order of the definition; nested messages unfold, arrays stay whole."""
-        for values, (_, field) in zip(root.fields, of.fields, strict=True):
+        for values, (_, field) in zip(root.fields, record.fields, strict=True):
             if isinstance(values, Fields) and isinstance(field, Record):
                 yield from self.columns(values, field)
             else:
                 yield self._array(values, field)
 
-    def _array(self, values: Values, of: WireType) -> pa.Array:
-        match values, of:
+    def _array(self, values: Values, wire_type: WireType) -> pa.Array:
+        match values, wire_type:
             case Fields(), Record():
                 children = [
-                    self._array(child, field) for child, (_, field) in zip(values.fields, of.fields, strict=True)
+                    self._array(child, field) for child, (_, field) in zip(values.fields, wire_type.fields, strict=True)
                 ]
-                return pa.Array.from_buffers(find_arrow_type(of), values.count, [None], children=children)
+                return pa.Array.from_buffers(find_arrow_type(wire_type), values.count, [None], children=children)
             case Lists(), Array():
-                return make_lists(self._array(values.elements, of.element), values.counts, of.length)
+                return make_lists(self._array(values.elements, wire_type.element), values.counts, wire_type.length)
             case Runs(dtype=np.dtype() as dtype), Array():
                 elements = number_column(np.frombuffer(self._compact(values)[1], dtype))
-                return make_lists(elements, values.lengths // dtype.itemsize, of.length)
+                return make_lists(elements, values.lengths // dtype.itemsize, wire_type.length)
             case Runs(), Text():
                 found, replaced = make_texts(len(values.lengths), *self._compact(values))
                 self.replaced_texts += replaced
@@ -357,7 +360,7 @@ class WalkedColumns:
                     shape, f"V{dtype.itemsize}", self._data if shape[0] else b"", 0, (1,)
                 )
                 return number_column(windows[offsets].view(dtype))
-        raise TypeError(f"{type(values).__name__} are no values of {of}")
+        raise TypeError(f"{type(values).__name__} are no values of {wire_type}")
 
     def _compact(self, runs: Runs) -> tuple[pa.Buffer, pa.Buffer]:
         """Copy runs together; return Arrow's offsets and the bytes.

@@ -36,8 +36,10 @@ _OWN_PACKAGES = {"ulog": "px4", "dataflash": "ardupilot"}
 def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> TableLog:
     """Read a ``ulog`` or ``dataflash`` log; ``stack`` is closed with it. `LogError`: it cannot be read."""
     records = read_records(path, kind)
-    known = {name: of for name, of in records.messages.items() if _find_base(name) in CONVERTED}
-    messages = {name: (of.time_us, select_fields(of.read_columns(records.data))) for name, of in known.items()}
+    known = {name: message for name, message in records.messages.items() if _find_base(name) in CONVERTED}
+    messages = {
+        name: (message.time_us, select_fields(message.read_columns(records.data))) for name, message in known.items()
+    }
     log = Autopilot(kind, messages, records.parameters)
     with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
         converted, findings = make_role_messages(log)
@@ -46,10 +48,10 @@ def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> Tab
         make_topic(
             f"/{name}",
             f"{_OWN_PACKAGES[kind]}/msg/{_find_base(name)}",
-            (of.time_us + offset_us) * 1000,
-            partial(of.read_columns, records.data),
+            (message.time_us + offset_us) * 1000,
+            partial(message.read_columns, records.data),
         )
-        for name, of in records.messages.items()
+        for name, message in records.messages.items()
     ]
     for role in converted:
         stamp_ns = (role.time_us + offset_us) * 1000
@@ -70,11 +72,11 @@ def _find_base(name: str) -> str:
     return re.sub(r"_\d+$", "", name)
 
 
-def _make_stamped(of: RoleMessages, stamp_ns: Int64, lever_arms: LeverArms) -> Fields:
+def _make_stamped(messages: RoleMessages, stamp_ns: Int64, lever_arms: LeverArms) -> Fields:
     """Return a message's fields with stamp and frame; what its values are given in is base_link where nothing places an IMU."""
-    frame = "base_link" if of.frame == "imu" and of.frame not in lever_arms else of.frame
-    column = "child_frame_id" if of.type_name == ODOMETRY else "header.frame_id"
-    return {**make_stamp_fields(stamp_ns), **of.columns, column: pa.repeat(frame, len(stamp_ns))}
+    frame = "base_link" if messages.frame == "imu" and messages.frame not in lever_arms else messages.frame
+    column = "child_frame_id" if messages.type_name == ODOMETRY else "header.frame_id"
+    return {**make_stamp_fields(stamp_ns), **messages.columns, column: pa.repeat(frame, len(stamp_ns))}
 
 
 _NO_TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}

@@ -107,7 +107,9 @@ class AutopilotRecords:
 
     def add(self, name: str, instance: int, layout: Layout, offsets: Int64, scales: Mapping[str, float]) -> None:
         """Add the messages of an instance; without a time they cannot be used."""
-        clock = next((of for of in _CLOCKS if of in (layout.names or ()) and layout[of].str in ("<u8", "<u4")), None)
+        clock = next(
+            (name for name in _CLOCKS if name in (layout.names or ()) and layout[name].str in ("<u8", "<u4")), None
+        )
         if clock is None:
             self.add_damage("messages-not-decoded", f"/{name}", 0, reason=f"{name} has no time")
             return
@@ -118,18 +120,22 @@ class AutopilotRecords:
 
     def sort_by_time(self) -> None:
         """Bring messages in order of time; those with a stamp far from those around it, or from the log's end, are left out and counted."""
-        ends = [float(np.median(of.time_us[-_WINDOW:])) for of in self.messages.values() if len(of.time_us) >= _WINDOW]
+        ends = [
+            float(np.median(message.time_us[-_WINDOW:]))
+            for message in self.messages.values()
+            if len(message.time_us) >= _WINDOW
+        ]
         latest_us = min(max(ends, default=LATEST_US) + _LATE_US, LATEST_US)
-        for name, of in list(self.messages.items()):
-            known = (of.time_us >= 0) & (of.time_us <= latest_us) & ~_find_stray(of.time_us)
+        for name, message in list(self.messages.items()):
+            known = (message.time_us >= 0) & (message.time_us <= latest_us) & ~_find_stray(message.time_us)
             if lost := int(np.count_nonzero(~known)):
                 self.add_damage("time-invalid", f"/{name}", lost)
-            of.offsets, of.time_us = of.offsets[known], of.time_us[known]
-            if late := int(np.count_nonzero(np.diff(of.time_us) < 0)):
+            message.offsets, message.time_us = message.offsets[known], message.time_us[known]
+            if late := int(np.count_nonzero(np.diff(message.time_us) < 0)):
                 self.add_damage("messages-unordered", f"/{name}", 0, places=late)
-                order = np.argsort(of.time_us, kind="stable")
-                of.offsets, of.time_us = of.offsets[order], of.time_us[order]
-            if not len(of.time_us):
+                order = np.argsort(message.time_us, kind="stable")
+                message.offsets, message.time_us = message.offsets[order], message.time_us[order]
+            if not len(message.time_us):
                 del self.messages[name]
 
 
@@ -175,8 +181,8 @@ _DATA = ord("D")
 
 def _parse_field(text: str) -> tuple[str, int, str] | None:
     """Return the type of a field, how many of it there are (0: no list) and its name, from ``float[3] rate``; None where it is no field."""
-    of, _, name = text.partition(" ")
-    kind, opening, count = of.removesuffix("]").partition("[")
+    type_name, _, name = text.partition(" ")
+    kind, opening, count = type_name.removesuffix("]").partition("[")
     number = int(count) if count.isdecimal() and len(count) <= _MOST_DIGITS else 0
     is_field = kind.isidentifier() and name.isidentifier() and bool(number) == bool(opening)
     return (kind, number, name) if is_field else None
@@ -215,12 +221,12 @@ class _UlogReader:
         while at + 5 <= end_of_data:
             size, kind, number = _ULOG_HEAD.unpack_from(self._data, at)
             end = at + 3 + size
-            of = self._by_id.get(number) if kind == _DATA else None
-            fits = of.fits(size) if of else kind in _ULOG_KINDS and self._is_head(end)
+            topic = self._by_id.get(number) if kind == _DATA else None
+            fits = topic.fits(size) if topic else kind in _ULOG_KINDS and self._is_head(end)
             if not fits or end > end_of_data:
                 end = self._records.skip_to(at, self._find_next(at + 1))
-            elif of:
-                of.offsets.append(at + 5)
+            elif topic:
+                topic.offsets.append(at + 5)
             else:
                 self._read_message(kind, at + 3, size)
             at = end
@@ -229,9 +235,9 @@ class _UlogReader:
         for number, count in self._unknown.items():
             reason = f"nothing says what messages of number {number} are"
             self._records.add_damage("messages-not-decoded", lost=count, reason=reason)
-        for of in self._topics.values():
-            if of.offsets:
-                self._records.add(of.name, of.instance, of.layout, np.array(of.offsets), {})
+        for topic in self._topics.values():
+            if topic.offsets:
+                self._records.add(topic.name, topic.instance, topic.layout, np.array(topic.offsets), {})
 
     def _is_head(self, at: int) -> bool:
         return at >= len(self._data) or (at + 3 <= len(self._data) and self._data[at + 2] in _ULOG_KINDS)
@@ -254,7 +260,7 @@ class _UlogReader:
                 self._unknown[int.from_bytes(text[:2], "little")] += 1
             case "F":
                 name, _, fields = text.decode("ascii", "replace").removesuffix(";").partition(":")
-                parsed = [of for of in map(_parse_field, fields.split(";")) if of]
+                parsed = [field for field in map(_parse_field, fields.split(";")) if field]
                 if len(parsed) > fields.count(";"):
                     self._formats.setdefault(name, parsed)
                 else:
@@ -262,8 +268,8 @@ class _UlogReader:
             case "A" if size > 3:
                 self._subscribe(text[0], int.from_bytes(text[1:3], "little"), text[3:].decode("ascii", "replace"))
             case "P" if size > 5 and len(text) == 5 + text[0]:
-                of, _, name = text[1:-4].decode("ascii", "replace").partition(" ")
-                code = "<f" if of == "float" else "<i"
+                type_name, _, name = text[1:-4].decode("ascii", "replace").partition(" ")
+                code = "<f" if type_name == "float" else "<i"
                 self._records.parameters[name] = float(struct.unpack(code, text[-4:])[0])
             case "B" if text[8:9] > b"\1" or any(text[9:16]):
                 raise LogError(f"{self._records.path}: it uses features of ULog that tcpipe does not know")
@@ -308,14 +314,14 @@ class _UlogReader:
         """Yield the fields of a format, those of formats in it as ``outer.inner`` or, of several, ``outer_0.inner``."""
         if depth > _DEEPEST:
             raise ValueError("formats inside formats")
-        for of, count, field_name in self._formats[name]:
-            code = _ULOG_TYPES.get(of)
+        for type_name, count, field_name in self._formats[name]:
+            code = _ULOG_TYPES.get(type_name)
             if code is not None:
                 yield prefix + field_name, f"S{count or 1}" if code == "S" else (code, (count,)) if count else code
                 continue
             for index in range(count or 1):
                 inner = f"{prefix}{field_name}_{index}." if count else f"{prefix}{field_name}."
-                yield from self._iterate_fields(of, inner, depth + 1)
+                yield from self._iterate_fields(type_name, inner, depth + 1)
 
 
 # ---------------------------------------------------------------- ArduPilot
@@ -351,13 +357,13 @@ def _read_dataflash(records: AutopilotRecords) -> None:
     if at < end_of_data:
         records.skip_to(at, end_of_data)
     for kind, (name, layout, scales) in formats.items():
-        of = np.array(offsets[kind], np.int64)
-        if len(of) and not layout.names:
+        starts = np.array(offsets[kind], np.int64)
+        if len(starts) and not layout.names:
             reason = f"the format of {name} contradicts itself"
-            records.add_damage("messages-not-decoded", f"/{name}", len(of), reason=reason)
-        elif len(of) and name not in _WITHOUT_TIME:
-            _add_instances(records, name, layout, of, scales)
-        columns = Messages(name, layout, of, of, scales).read_columns(data) if name in ("PARM", "DSF") else {}
+            records.add_damage("messages-not-decoded", f"/{name}", len(starts), reason=reason)
+        elif len(starts) and name not in _WITHOUT_TIME:
+            _add_instances(records, name, layout, starts, scales)
+        columns = Messages(name, layout, starts, starts, scales).read_columns(data) if name in ("PARM", "DSF") else {}
         if name == "PARM" and [columns[key].dtype.str for key in ("Name", "Value") if key in columns] == [
             "|S16",
             "<f4",
@@ -403,7 +409,7 @@ def _add_instances(
     records: AutopilotRecords, name: str, layout: Layout, offsets: Int64, scales: Mapping[str, float]
 ) -> None:
     """Add messages, those of each instance of a sensor apart."""
-    instance = next((of for of in _INSTANCES if of in (layout.names or ()) and layout[of].str == "|u1"), None)
+    instance = next((name for name in _INSTANCES if name in (layout.names or ()) and layout[name].str == "|u1"), None)
     if instance is None:
         records.add(name, 0, layout, offsets, scales)
         return

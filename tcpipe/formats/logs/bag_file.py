@@ -183,10 +183,10 @@ class BagPart(ChunkedPart[_Chunk]):
                 continue
             held += [entries for _, entries in found]
             places += [(number, connection, len(entries) // _INDEX_ENTRY_BYTES) for connection, entries in found]
-        of, connections, counts = np.array(places, np.int64).reshape(-1, 3).T
+        chunk_number, connections, counts = np.array(places, np.int64).reshape(-1, 3).T
         words = np.frombuffer(b"".join(held), "<u4").reshape(-1, 3).astype(np.int64)
         stamps_ns = words[:, 0] * NS + words[:, 1]
-        return (np.repeat(of, counts), np.repeat(connections, counts), words[:, 2], stamps_ns), unsound
+        return (np.repeat(chunk_number, counts), np.repeat(connections, counts), words[:, 2], stamps_ns), unsound
 
     def _index_of(self, chunk: _Chunk) -> list[tuple[int, bytes]]:
         """Return each connection's entries in the index behind a chunk; `DamageError` where it has none, or a broken one."""

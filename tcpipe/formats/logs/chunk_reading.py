@@ -46,8 +46,8 @@ class Entries:
 
     def at(self, chosen: slice | Int64Array | NDArray[np.bool_]) -> Entries:
         """Return some of them."""
-        of = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
-        return Entries(*(values[chosen] for values in of))
+        columns = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
+        return Entries(*(values[chosen] for values in columns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +89,8 @@ class Messages:
 
     def at(self, chosen: Int64Array | NDArray[np.bool_]) -> Messages:
         """Return some of them."""
-        of = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
-        return Messages(self.data, *(values[chosen] for values in of))
+        columns = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
+        return Messages(self.data, *(values[chosen] for values in columns))
 
     def blocks(self, ordinal: Int64Array) -> list[MessageBlock]:
         """Return them as one block a channel; ``ordinal`` is their order within the file, shape (N,)."""

@@ -89,7 +89,7 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
         _refuse_what_is_not_there(path)
         if not path.is_file() and not path.is_dir():
             raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
-        fetched = {file: FetchedFile(of, file) for file, of in stored.items()}
+        fetched = {file: FetchedFile(place, file) for file, place in stored.items()}
         if path.is_dir():
             opened = _open_directory(path, stack, fetched)
         else:
@@ -385,15 +385,17 @@ class Log(OpenLog):
                 topic_table.add(block)
                 held += topic_table.held_bytes
                 if held > most:
-                    fullest = {name: of for name, of in collected.items() if of.held_bytes * len(collected) >= held}
-                    tables = {name: of.take(share=0.5) for name, of in fullest.items()}
+                    fullest = {
+                        name: table for name, table in collected.items() if table.held_bytes * len(collected) >= held
+                    }
+                    tables = {name: table.take(share=0.5) for name, table in fullest.items()}
                     for name, table in tables.items():
                         given[name] += table.num_rows
                     yield tables
-                    held = sum(of.held_bytes for of in collected.values())
-        tables = {name: of.take() for name, of in collected.items()}
-        for name, of in collected.items():
-            self._note_losses(name, of, given[name] + tables[name].num_rows)
+                    held = sum(table.held_bytes for table in collected.values())
+        tables = {name: table.take() for name, table in collected.items()}
+        for name, collected_table in collected.items():
+            self._note_losses(name, collected_table, given[name] + tables[name].num_rows)
         yield tables
 
     def _collectors(self, topics: Iterable[str]) -> dict[str, TopicTable]:
@@ -416,7 +418,7 @@ class Log(OpenLog):
                 raise LogError(
                     f"{self.path}: its topics unfold to more than {MAX_COLUMNS} columns; read fewer of them at once"
                 )
-        return {name: TopicTable(of, self.topics[name].encoding) for name, of in types.items()}
+        return {name: TopicTable(message_type, self.topics[name].encoding) for name, message_type in types.items()}
 
     def _blocks(self, index: int, collected: Mapping[str, TopicTable]) -> Iterator[tuple[TopicTable, MessageBlock]]:
         """Yield one file's blocks, each with its topic's table; channels that differ from their topic's type are set aside."""

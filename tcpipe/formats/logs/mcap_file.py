@@ -235,9 +235,9 @@ class McapPart(ChunkedPart[Chunk]):
             places += [(number, channel, before + at, end) for channel, at in records]
             regions.append(region)
             before = end
-        of, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
+        chunk_number, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
         right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
-        return (of[record], channels[record], offsets, stamps), [*unsound, *of[~right].tolist()]
+        return (chunk_number[record], channels[record], offsets, stamps), [*unsound, *chunk_number[~right].tolist()]
 
     def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview | bytes, list[tuple[int, int]]]:
         """Return bytes that hold a chunk's message indexes, and of each channel's where it begins in them.
@@ -477,8 +477,8 @@ class McapPart(ChunkedPart[Chunk]):
 
     def _tally_messages(self, data: memoryview, messages: Int64Array) -> None:
         channels = gather_integers(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
-        for channel, of in group_by_key(channels):
-            stamps = gather_integers(data, messages[of] + RECORD_HEAD + 6, "i8")
+        for channel, rows in group_by_key(channels):
+            stamps = gather_integers(data, messages[rows] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
     def lost(self, chunk: Chunk, error: DamageError) -> Damage:

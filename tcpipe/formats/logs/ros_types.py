@@ -263,15 +263,22 @@ def _parse_msg(type_name: str, definition: str) -> _Definitions:
         parsed = parse_msg(definition, type_name)
     except MsgTextError:  # rosbags may know better, and says what is wrong
         return get_types_from_msg(definition.replace("\r\n", "\n"), type_name)
-    return {name: ([], [(field, _describe_field_type(of)) for field, of in fields]) for name, fields in parsed.items()}
+    return {
+        name: ([], [(field, _describe_field_type(field_type)) for field, field_type in fields])
+        for name, fields in parsed.items()
+    }
 
 
-def _describe_field_type(of: FieldType) -> Any:
+def _describe_field_type(field_type: FieldType) -> Any:
     """Return a field's type as rosbags describes it."""
-    one: Any = (Nodetype.BASE, (of.name, of.text_limit)) if of.name in BASE_TYPES else (Nodetype.NAME, of.name)
-    if of.length is None:
+    one: Any = (
+        (Nodetype.BASE, (field_type.name, field_type.text_limit))
+        if field_type.name in BASE_TYPES
+        else (Nodetype.NAME, field_type.name)
+    )
+    if field_type.length is None:
         return one
-    return (Nodetype.ARRAY if of.fixed else Nodetype.SEQUENCE, (one, of.length))
+    return (Nodetype.ARRAY if field_type.fixed else Nodetype.SEQUENCE, (one, field_type.length))
 
 
 def _parse_idl(definition: str) -> _Definitions:
@@ -322,8 +329,8 @@ def _read_definitions_of_directory(directory: Path) -> _Definitions:
     return found
 
 
-def _iterate_flat_values(message: object, of: Record, prefix: str) -> Iterable[tuple[str, Any]]:
-    for name, wire_type in of.fields:
+def _iterate_flat_values(message: object, record: Record, prefix: str) -> Iterable[tuple[str, Any]]:
+    for name, wire_type in record.fields:
         value = getattr(message, normalize_fieldname(name))
         if isinstance(wire_type, Record):
             yield from _iterate_flat_values(value, wire_type, f"{prefix}{name}.")
@@ -331,12 +338,14 @@ def _iterate_flat_values(message: object, of: Record, prefix: str) -> Iterable[t
             yield prefix + name, _to_plain(value, wire_type)
 
 
-def _to_plain(value: Any, of: WireType) -> Any:
-    match of:
+def _to_plain(value: Any, wire_type: WireType) -> Any:
+    match wire_type:
         case Record():
-            return {name: _to_plain(getattr(value, normalize_fieldname(name)), field) for name, field in of.fields}
-        case Array() if not isinstance(of.element, Scalar):
-            return [_to_plain(item, of.element) for item in value]
+            return {
+                name: _to_plain(getattr(value, normalize_fieldname(name)), field) for name, field in wire_type.fields
+            }
+        case Array() if not isinstance(wire_type.element, Scalar):
+            return [_to_plain(item, wire_type.element) for item in value]
         case _:
             return value
 

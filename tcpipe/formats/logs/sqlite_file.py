@@ -284,5 +284,5 @@ def _read_blocks(rows: list[_Row]) -> Iterator[MessageBlock]:
     offsets = np.cumsum(lengths) - lengths
     buffer = memoryview(b"".join(payloads))
     ordinal, channel, log, publish = np.array([numbers, channels, log_ns, publish_ns], np.int64)
-    for topic, of in group_by_key(channel):
-        yield MessageBlock(topic, buffer, offsets[of], lengths[of], log[of], publish[of], ordinal[of])
+    for topic, at in group_by_key(channel):
+        yield MessageBlock(topic, buffer, offsets[at], lengths[at], log[at], publish[at], ordinal[at])

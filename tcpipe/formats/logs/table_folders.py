@@ -37,7 +37,9 @@ class TableRun:
     @property
     def files(self) -> tuple[Path, ...]:
         """The tables that are there, by name."""
-        return tuple(sorted({path for of in self.mappings.values() if (path := self.folder / of.file).is_file()}))
+        return tuple(
+            sorted({path for mapping in self.mappings.values() if (path := self.folder / mapping.file).is_file()})
+        )
 
 
 def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
@@ -73,8 +75,8 @@ def find_table_run(path: Path | str, mappings: Mappings) -> TableRun | None:
             continue
         pattern = "([^/]+)".join(map(re.escape, mapping.file.split("*")))
         if named := re.fullmatch(pattern, "/".join(path.parts[-len(parts) :])):
-            names = {name: of.file.replace("*", named[1]) for name, of in mappings.items()}
-            of_run = {name: replace(of, file=names[name]) for name, of in mappings.items()}
+            names = {name: mapping.file.replace("*", named[1]) for name, mapping in mappings.items()}
+            of_run = {name: replace(mapping, file=names[name]) for name, mapping in mappings.items()}
             return TableRun(path.parents[len(parts) - 1], of_run)
     return None
 

@@ -242,11 +242,13 @@ def read_values(
     path: Path, stamp: str, fields: Mapping[str, FieldSource]
 ) -> tuple[Cells, dict[str, NDArray[np.float64]]]:
     """Return the cells that fields are made of, and the fields' values, shape (rows,)."""
-    used = {name: [column for column, _ in of.expression.operands()] for name, of in fields.items()}
+    used = {name: [column for column, _ in field.expression.operands()] for name, field in fields.items()}
     numbers = [column for name, columns in used.items() if name != "quality" for column in columns]
     cells = read_cells(path, stamp=stamp, columns=numbers, words=used.get("quality", ()))
     rows = len(cells.stamp)
-    return cells, {name: of.evaluate(lambda column, _: cells.columns[column], rows) for name, of in fields.items()}
+    return cells, {
+        name: field.evaluate(lambda column, _: cells.columns[column], rows) for name, field in fields.items()
+    }
 
 
 def _collect_columns(path: Path, columns: list[str], numbers: list[str] | None) -> pl.DataFrame:

@@ -221,7 +221,7 @@ def _iterate_blocks(dataset: Any, window: Window, url: str) -> Iterator[tuple[in
             yield int(found[0]), int(found[1])
 
 
-def _move(affine: Any, window: Window) -> rasterio.Affine:
+def _move(affine: rasterio.Affine, window: Window) -> rasterio.Affine:
     """Return an affine for the pixels of a window."""
     col, row = window.col_off, window.row_off
     return rasterio.Affine(

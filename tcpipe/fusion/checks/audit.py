@@ -132,17 +132,17 @@ def _compare_odometry(
     at_s = compute_seconds(stamp_ns, zero)
     step_s = np.diff(at_s)[:, None]
     velocity = source.velocity_mps[:, : track.shape[1]]
-    told = compute_interval_means(compute_seconds(source.stamp_ns, zero), velocity, at_s[:-1], at_s[1:]) * step_s
-    told[~is_covered(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], least_ns=_MAX_GAP_NS)] = np.nan
+    sensor_m = compute_interval_means(compute_seconds(source.stamp_ns, zero), velocity, at_s[:-1], at_s[1:]) * step_s
+    sensor_m[~is_covered(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], least_ns=_MAX_GAP_NS)] = np.nan
     if role == WHEELS:  # that turn while the robot stands: it is stuck, and they are right
-        told[(np.abs(track[:, :1]) < _STANDS_MPS * step_s) & (np.abs(told) > _STANDS_MPS * step_s)] = np.nan
-    told, track = (np.stack([values[first:last].sum(0) for first, last in windows]) for values in (told, track))
-    far = np.isfinite(told[:, 0]) & (np.abs(track[:, 0]) > _MOVES_M)
+        sensor_m[(np.abs(track[:, :1]) < _STANDS_MPS * step_s) & (np.abs(sensor_m) > _STANDS_MPS * step_s)] = np.nan
+    sensor_m, track = (np.stack([values[first:last].sum(0) for first, last in windows]) for values in (sensor_m, track))
+    far = np.isfinite(sensor_m[:, 0]) & (np.abs(track[:, 0]) > _MOVES_M)
     if scale_seen and far.sum() >= _FEWEST:
-        told = told / np.clip(np.median(told[far, 0] / track[far, 0]), *_SCALES)
+        sensor_m = sensor_m / np.clip(np.median(sensor_m[far, 0] / track[far, 0]), *_SCALES)
     noise_m = float(np.sqrt(np.median(source.variance_m2ps2[:, 0]) * period_ns * 1e-9 * _WINDOW_S))
     lasting_m = np.hypot(SCALE_STD[role] * np.linalg.norm(track, axis=1), _LASTING_MPS * _WINDOW_S)
-    return np.linalg.norm(told - track, axis=1), np.hypot(lasting_m, noise_m)
+    return np.linalg.norm(sensor_m - track, axis=1), np.hypot(lasting_m, noise_m)
 
 
 def _compare_fixes(found: Trajectory, rotation: Floats, gnss: Positions, windows: Ints) -> tuple[Floats, Floats]:

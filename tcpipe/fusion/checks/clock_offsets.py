@@ -89,15 +89,15 @@ def find_clock_offsets(m: Measurements, power: PowerSignal | None, *, clock_epoc
     Extrinsics need not be right, since a yaw rate is compared with all three axes of a gyroscope.
     """
     middle_ns, span_s = find_middle_ns(m)
-    told: dict[tuple[str, str, str], list[tuple[float, Floats]]] = {}
+    evidence: dict[tuple[str, str, str], list[tuple[float, Floats]]] = {}
     for at_ns in iterate_windows_ns(m, _WINDOW_NS):
         inside = select_measurements(m, int(at_ns[0]) - _MARGIN_NS, int(at_ns[-1]) + _MARGIN_NS)
         for late, against, by, target, regressors in _iterate_signals(inside, power, at_ns):
             products = compute_lag_products(target, regressors)
             if products is not None:
                 at_s = (0.5 * float(at_ns[-1] - at_ns[0]) + float(at_ns[0] - middle_ns)) * 1e-9
-                told.setdefault((late, against, by), []).append((at_s, products))
-    pairs = [pair for names, windows in told.items() for pair in _list_pairs(*names, windows)]
+                evidence.setdefault((late, against, by), []).append((at_s, products))
+    pairs = [pair for names, windows in evidence.items() for pair in _list_pairs(*names, windows)]
     return solve_offsets(pairs, clock_epoch, span_s)
 
 
@@ -242,8 +242,8 @@ def solve_offsets(pairs: Sequence[ClockPair], clock_epoch: int = 0, span_s: floa
     reference = max(solved, key=lambda role: len(agreeing[role]))  # the first of equals
     offsets = {reference: ClockOffset(0.0, 0.0, noted=False)} | solved[reference]
     blamed = {role: role == DOPPLER or _is_blamed(role, agreeing[reference], offsets, known) for role in offsets}
-    told = {role: replace(offset, blamed=blamed[role]) for role, offset in solved[reference].items()}
-    return ClockFacts(clock_epoch, reference, tuple(pairs), told)
+    decided = {role: replace(offset, blamed=blamed[role]) for role, offset in solved[reference].items()}
+    return ClockFacts(clock_epoch, reference, tuple(pairs), decided)
 
 
 def _find_limit_s(role: str) -> float:
@@ -289,7 +289,9 @@ def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
 
 def _find_agreeing(offsets: Mapping[str, ClockOffset]) -> set[str]:
     """Return the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
-    near = {role for role, of in offsets.items() if abs(of.offset_s) <= _find_limit_s(role) and not of.drift_ppm}
+    near = {
+        role for role, offset in offsets.items() if abs(offset.offset_s) <= _find_limit_s(role) and not offset.drift_ppm
+    }
     return near - {DOPPLER}
 
 
@@ -304,7 +306,7 @@ def _is_blamed(
         return False
     among = [p for p in pairs if {p.late, p.against} <= {role, *agreeing}]
     for p in among:
-        late_s, against_s = (float(_compute_lateness(offsets[of], p.from_middle_s)) for of in (p.late, p.against))
+        late_s, against_s = (float(_compute_lateness(offsets[role], p.from_middle_s)) for role in (p.late, p.against))
         if abs(p.offset_s - late_s + against_s) > max(_SURE * _get_std_s(p), _NOTED_S):
             return False
     kinds = ([p for p in among if (p.by == YAW_RATE) == turning] for turning in (True, False))

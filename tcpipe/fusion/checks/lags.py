@@ -155,13 +155,13 @@ def compute_lag_products(target: Floats, regressors: Floats) -> Floats | None:
     known = np.isfinite(target[grouped])
     # Only rows in which the target is known; a group that has fewer than the fullest goes on with unknown ones, which count 0.
     fullest = int(known.sum(1).max())
-    told = np.take_along_axis(grouped, np.argsort(~known, axis=1, kind="stable")[:, :fullest], axis=1)
-    columns = np.ones((*told.shape, regressors.shape[1] + 2))
+    samples = np.take_along_axis(grouped, np.argsort(~known, axis=1, kind="stable")[:, :fullest], axis=1)
+    columns = np.ones((*samples.shape, regressors.shape[1] + 2))
     found = np.empty((2 * steps + 1, groups, columns.shape[2], columns.shape[2]))
     for i, lag in enumerate(range(-steps, steps + 1)):
         # Stamps that are late by the lag: what happened `lag` rows earlier.
         columns[...] = 1.0
-        columns[:, :, :-2], columns[:, :, -1] = regressors[told - lag], target[told]
+        columns[:, :, :-2], columns[:, :, -1] = regressors[samples - lag], target[samples]
         columns[~np.isfinite(columns).all(2)] = 0.0
         found[i] = np.matmul(columns.transpose(0, 2, 1), columns)
     return found

@@ -580,14 +580,14 @@ def compute_command_ratio(wheels: BodyVelocities, command: CommandedSpeed) -> fl
     """
     if command.stamp_ns.size == 0:
         return None
-    told = hold_last(command.stamp_ns, command.forward_velocity_mps, wheels.stamp_ns)
-    changed = np.flatnonzero(np.abs(np.diff(told, prepend=told[0])) > _STEP_MPS)
-    began = np.concatenate(([0], changed))[np.searchsorted(changed, np.arange(told.size), "right")]
+    commanded_mps = hold_last(command.stamp_ns, command.forward_velocity_mps, wheels.stamp_ns)
+    changed = np.flatnonzero(np.abs(np.diff(commanded_mps, prepend=commanded_mps[0])) > _STEP_MPS)
+    began = np.concatenate(([0], changed))[np.searchsorted(changed, np.arange(commanded_mps.size), "right")]
     is_held = wheels.stamp_ns - wheels.stamp_ns[began] > _HELD_NS
-    rows = is_held & (np.abs(told) > _DRIVES_MPS) & np.isfinite(told)
+    rows = is_held & (np.abs(commanded_mps) > _DRIVES_MPS) & np.isfinite(commanded_mps)
     if rows.sum() * compute_median_period_ns(wheels.stamp_ns) < _SHORTEST_NS:
         return None
-    ratio = wheels.velocity_mps[rows, 0] / told[rows]
+    ratio = wheels.velocity_mps[rows, 0] / commanded_mps[rows]
     return float(np.median(ratio)) if np.quantile(ratio, 0.25) > _FASTER else None
 
 

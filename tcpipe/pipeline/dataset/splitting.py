@@ -49,7 +49,7 @@ class ExcludedIds:
 
 def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Sequence[str]) -> tuple[ExcludedIds, ...]:
     """Return the lists of samples to exclude; `UsageError` unless each has a reason, `DatasetError` if one cannot be read."""
-    paths = [Path(of) for of in ([files] if isinstance(files, str | Path) else files)]
+    paths = [Path(path) for path in ([files] if isinstance(files, str | Path) else files)]
     texts = [text.strip() for text in ([reasons] if isinstance(reasons, str) else reasons)]
     if len(texts) != len(paths) or not all(texts):
         raise UsageError(
@@ -78,27 +78,40 @@ def find_excluded(
     lists: Sequence[ExcludedIds], segment_ids: pa.ChunkedArray, kept: NDArray[np.int64]
 ) -> ExcludedSamples:
     """Return which samples the lists exclude; ``kept`` are the rows of ``segment_ids`` that are samples, (N,)."""
-    mask, told, tables, findings = np.zeros(len(kept), np.bool_), list[Exclusion](), [EXCLUDED_IDS.empty_table()], []
+    mask, exclusions, tables, findings = (
+        np.zeros(len(kept), np.bool_),
+        list[Exclusion](),
+        [EXCLUDED_IDS.empty_table()],
+        [],
+    )
     known = segment_ids.combine_chunks() if lists else None
     sample = np.full(len(segment_ids), -1)
     sample[kept] = np.arange(len(kept))
-    for of in lists:
-        row = pc.index_in(pa.array(of.ids), value_set=known).fill_null(-1).to_numpy()
+    for exclusion_list in lists:
+        row = pc.index_in(pa.array(exclusion_list.ids), value_set=known).fill_null(-1).to_numpy()
         rows = sample[row[row >= 0]]
         rows = rows[rows >= 0]
-        told.append(Exclusion(of.name, of.checksum, of.reason, len(of.ids), int((~mask[rows]).sum())))
+        exclusions.append(
+            Exclusion(
+                exclusion_list.name,
+                exclusion_list.checksum,
+                exclusion_list.reason,
+                len(exclusion_list.ids),
+                int((~mask[rows]).sum()),
+            )
+        )
         mask[rows] = True
         outcome = np.select([row < 0, sample[row] < 0], ["no segment", "no sample"], IS_EXCLUDED)
-        texts = [[of.name] * len(row), [of.reason] * len(row), outcome.tolist()]
-        tables.append(pa.table([of.ids, *texts], schema=EXCLUDED_IDS))
+        texts = [[exclusion_list.name] * len(row), [exclusion_list.reason] * len(row), outcome.tolist()]
+        tables.append(pa.table([exclusion_list.ids, *texts], schema=EXCLUDED_IDS))
         if missing := int((row < 0).sum()):
-            names, subject = {"example": of.ids[int(np.argmin(row))]}, Subject("file", of.name)
+            names, subject = {"example": exclusion_list.ids[int(np.argmin(row))]}, Subject("file", exclusion_list.name)
             findings.append(
                 make_finding(
                     "exclusion-unmatched", subject, names=names, unmatched_count=missing, listed_count=len(row)
                 )
             )
-    return ExcludedSamples(mask, tuple(told), pa.concat_tables(tables), tuple(findings))
+    return ExcludedSamples(mask, tuple(exclusions), pa.concat_tables(tables), tuple(findings))
 
 
 def draw_splits(

@@ -20,8 +20,8 @@ def std(velocity_std, duration, start, end, *, smoothed, told=(np.nan, np.nan)):
         start_std_m=one(start),
         end_std_m=one(end),
         smoothed=smoothed,
-        told_s=(1.0, 2.0),
-        told_std_m=np.array([told]),
+        lags_s=(1.0, 2.0),
+        lag_std_m=np.array([told]),
     )[0]
 
 
@@ -61,11 +61,11 @@ def test_a_fix_that_shrinks_the_error_moves_a_forward_filter():
 
 
 def test_between_told_durations_it_is_a_power_of_time():
-    told_s = (0.5, 1.0, 2.0)
+    lags_s = (0.5, 1.0, 2.0)
     duration = np.array([0.2, 0.5, 0.8, 1.7, 2.0, 2.1, 1.5])
-    told = 0.004 * np.sqrt(np.array(told_s)) * np.ones((7, 1))  # a random walk of the displacement
+    told = 0.004 * np.sqrt(np.array(lags_s)) * np.ones((7, 1))  # a random walk of the displacement
     told[6, 2] = np.nan  # the track ends before
-    got = interpolate_durations_m(duration, told_s=told_s, told_std_m=told)
+    got = interpolate_durations_m(duration, lags_s=lags_s, lag_std_m=told)
     assert got[1:5] == pytest.approx(0.004 * np.sqrt(duration[1:5]))
     assert got[0] == pytest.approx(0.004 * np.sqrt(0.5) * 0.2 / 0.5)  # a constant velocity error
     assert np.isnan(got[5:]).all()
@@ -88,8 +88,8 @@ def test_the_chord_ahead_sees_a_jump_before_it_comes():
         chord_m=1.0,
         slowest_mps=0.1,
         smoothed=False,
-        told_s=(0.5, 2.0),
-        told_std_m=np.where(np.arange(count)[:, None] == 120, [0.2, 0.8], np.nan),
+        lags_s=(0.5, 2.0),
+        lag_std_m=np.where(np.arange(count)[:, None] == 120, [0.2, 0.8], np.nan),
     )
     assert np.flatnonzero(got > 0.1).tolist() == [*range(80, 100), 120]
     assert got[120] == pytest.approx(0.4)  # a power of time between what is told of half and of two seconds
@@ -109,5 +109,5 @@ def test_nothing_unknown_is_nothing_wrong():
 
 def test_each_duration_lies_between_its_own_neighbours():
     told = np.array([[0.001, 0.002, 0.032]] * 3)
-    got = interpolate_durations_m(np.sqrt([0.5, 2.0, 1.0]), told_s=(0.5, 1.0, 2.0), told_std_m=told)
+    got = interpolate_durations_m(np.sqrt([0.5, 2.0, 1.0]), lags_s=(0.5, 1.0, 2.0), lag_std_m=told)
     assert got == pytest.approx([np.sqrt(0.001 * 0.002), np.sqrt(0.002 * 0.032), 0.002])
