@@ -131,7 +131,7 @@ def _parse_document(path: Path) -> Mapping[str, Json]:
         values = text.count("[") + text.count("{")
         if values > MAX_VALUES:
             raise RegionError(f"{path}: {values} positions, rings and objects, at most {MAX_VALUES}{_SIMPLER}")
-        document = json.loads(text)
+        document = json.loads(text, parse_constant=_reject_constant)
     except OSError as error:
         raise RegionError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:
@@ -144,6 +144,10 @@ def _parse_document(path: Path) -> Mapping[str, Json]:
             f"{path}: declares the CRS {crs}; GeoJSON is WGS84 lon/lat (RFC 7946): export it again as EPSG:4326"
         )
     return document
+
+
+def _reject_constant(name: str) -> Json:
+    raise ValueError(f"{name} is not a number in JSON")
 
 
 def _iterate_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Json]]:

@@ -121,7 +121,10 @@ def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str,
 def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     """Yield what was read of the files that a card lists, and a line for everything that is not as it says."""
     place, where, kind = found.place, found.place.where(found.name), _KINDS[found.name]
-    yield find_broken_seal(found.data, where) or ("files", 1)
+    if broken := find_broken_seal(found.data, where):
+        yield broken  # its checksums say nothing of the other files
+        return
+    yield "files", 1
     if kind == "dataset":
         yield find_broken_seal(place.read(REPORT), place.where(REPORT)) or ("files", 1)
         card = parse_card(found.data, where, proved=False)
