@@ -1,8 +1,13 @@
-"""Several files of one drive read as one log: ROS 1 splits, power logged apart."""
+"""Several files of one drive read as one log: ROS 1 splits, power logged apart; and what a later part of a split lacks.
+
+`rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (with the time of each before the number, unless that is left out), and
+latched messages only into the part in which they came: a part that is read alone takes its static transforms from an earlier one beside it.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,20 +22,32 @@ from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import Mappings, find_table_run
 from tcpipe.formats.object_storage import format_path, is_url, lay_out_objects
 from tcpipe.logs.topics import Topic
-from tcpipe.tables.findings import Finding
+from tcpipe.tables.findings import Finding, Subject, make_finding
+
+_PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
+_DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
+_STATIC = "tf_static"
+_GAP_NS = 5_000_000_000
+"""Parts of one recording follow one another within so much."""
 
 
 class JoinedLog(OpenLog):
-    """Logs behind one face: topics merged, tables in log-time order."""
+    """Logs behind one face: topics merged, tables in log-time order; with the static transforms of an ``earlier`` part."""
 
-    def __init__(self, logs: Sequence[Log | TableLog], topics: Mapping[str, Topic], stack: ExitStack) -> None:
+    def __init__(
+        self, logs: Sequence[Log | TableLog], earlier: Log | None, topics: Mapping[str, Topic], stack: ExitStack
+    ) -> None:
         super().__init__(stack)
-        self._logs, self.topics = logs, topics
+        self._logs, self._earlier, self.topics = logs, earlier, topics
 
     @property
     def findings(self) -> list[Finding]:
         """Damage and notes of every file."""
-        return [finding for log in self._logs for finding in log.findings]
+        found = [finding for log in self._logs for finding in log.findings]
+        if self._earlier:
+            subject, names = Subject("file", self._logs[0].path.name), {"earlier": self._earlier.path.name}
+            found.append(make_finding("static-transforms-borrowed", subject, names=names))
+        return found
 
     @property
     def size_bytes(self) -> int:
@@ -41,7 +58,9 @@ class JoinedLog(OpenLog):
     def outline(self) -> str:
         """A hash of the indexes of all files; "" where one has none."""
         outlines = [log.outline for log in self._logs]
-        return hashlib.sha256("".join(outlines).encode()).hexdigest() if all(outlines) else ""
+        if not all(outlines):
+            return ""
+        return outlines[0] if len(outlines) == 1 else hashlib.sha256("".join(outlines).encode()).hexdigest()
 
     @property
     def is_known_by_outline(self) -> bool:
@@ -49,13 +68,13 @@ class JoinedLog(OpenLog):
         return any(log.is_known_by_outline for log in self._logs)
 
     def sha256(self) -> str:
-        """Return the hash of the files' hashes, in order. `LogError` when two files are the same recording."""
+        """Return the file's hash; of several, that of their hashes, in order. `LogError` when two files are the same recording."""
         digests: dict[str, Log | TableLog] = {}
         for log in self._logs:
             twin = digests.setdefault(log.sha256(), log)
             if twin is not log:
                 raise LogError(f"{log.path}: the same recording as {twin.path}; give each part once")
-        return hashlib.sha256("".join(digests).encode()).hexdigest()
+        return hashlib.sha256("".join(digests).encode()).hexdigest() if len(digests) > 1 else next(iter(digests))
 
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return each topic's table over all files, in log-time order."""
@@ -63,7 +82,9 @@ class JoinedLog(OpenLog):
         for log in self._logs:
             for name, table in log.tables([topic for topic in topics if topic in log.topics]).items():
                 parts.setdefault(name, []).append(table)
-        return {name: _join_tables(name, tables) for name, tables in parts.items()}
+        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
+        of_earlier = self._earlier.tables(lent) if self._earlier and lent else {}
+        return {name: _join_tables(name, tables) for name, tables in parts.items()} | of_earlier
 
     def batches(self, topics: Sequence[str]) -> Iterator[dict[str, pa.Table]]:
         """Yield each topic's tables piece by piece, file after file."""
@@ -73,6 +94,9 @@ class JoinedLog(OpenLog):
                 for name, table in tables.items():
                     _require_same_fields(name, schemas.setdefault(name, table.schema), table.schema)
                 yield tables
+        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
+        if self._earlier and lent:
+            yield from self._earlier.batches(lent)
 
 
 def _join_tables(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
@@ -113,8 +137,13 @@ def open_logs(
         for path in firsts.values():
             logs.append(open_single_log(path, message_definitions=message_definitions, tables=tables))
             stack.push(logs[-1])
-        topics, opened = _merge_topics(logs), stack.pop_all()
-    return JoinedLog(logs, topics, opened) if len(logs) > 1 else logs[0]
+        alone = logs[0] if len(logs) == 1 else None
+        earlier = _find_earlier_part(alone) if isinstance(alone, Log) and not _find_static_topics(alone) else None
+        if earlier:
+            stack.enter_context(earlier)
+        topics = (_find_static_topics(earlier) if earlier else {}) | _merge_topics(logs)
+        opened = stack.pop_all()
+    return JoinedLog(logs, earlier, topics, opened) if earlier or len(logs) > 1 else logs[0]
 
 
 def open_single_log(
@@ -138,6 +167,43 @@ def open_single_log(
     return open_log(path, message_definitions=message_definitions)
 
 
+def _find_earlier_part(log: Log) -> Log | None:
+    """Return the nearest earlier part that has static transforms, open; None where the chain of parts breaks before."""
+    part: Log | None = log
+    while part is not None:
+        before = _find_part_before(part)
+        if part is not log:
+            part.close()
+        if before is not None and _find_static_topics(before):
+            return before
+        part = before
+    return None
+
+
+def _find_part_before(log: Log) -> Log | None:
+    """Return the part of the same recording that ends where this one begins, open."""
+    mine = _PART.fullmatch(log.path.name)
+    starts = [topic.start_ns for topic in log.topics.values() if topic.start_ns is not None]
+    if mine is None or not starts or log.path.is_dir():
+        return None
+    for path in sorted(log.path.parent.iterdir()):
+        other = _PART.fullmatch(path.name)
+        if (
+            other
+            and int(other["number"]) == int(mine["number"]) - 1
+            and _DATE.sub("", other["name"]) == _DATE.sub("", mine["name"])
+        ):
+            try:
+                found = open_log(path)
+            except (LogError, OSError):
+                continue
+            ends = [topic.end_ns for topic in found.topics.values() if topic.end_ns is not None]
+            if ends and abs(min(starts) - max(ends)) <= _GAP_NS:
+                return found
+            found.close()
+    return None
+
+
 def _merge_topics(logs: Sequence[Log | TableLog]) -> dict[str, Topic]:
     merged: dict[str, Topic] = {}
     for log in logs:
@@ -150,3 +216,7 @@ def _merge_topics(logs: Sequence[Log | TableLog]) -> dict[str, Topic]:
                 )
             merged[name] = topic if before is None else before.joined(topic)
     return merged
+
+
+def _find_static_topics(log: Log) -> dict[str, Topic]:
+    return {name: topic for name, topic in log.topics.items() if name.endswith(_STATIC)}

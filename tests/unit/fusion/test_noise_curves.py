@@ -39,7 +39,7 @@ def test_a_fix_changes_by_white_noise_and_by_what_its_process_forgets(measured):
 
 @pytest.mark.parametrize("time_s", [1.0, 40.0])
 def test_a_distance_errs_by_the_integral_of_velocity_noise_and_scale(measured, time_s):
-    scale, none = GaussMarkov(0.02**2, 15.0, told=1.0), GaussMarkov(0.0, 10.0)
+    scale, none = GaussMarkov(0.02**2, 15.0, data_share=1.0), GaussMarkov(0.0, 10.0)
     prior = make_prior_model(measured)
     odometries = prior.odometries | {"wheel_odometry": OdometryNoise(1e-4, scale, velocity_data_share=0.0)}
     found = describe_noise(measured, replace(prior, odometries=odometries, shared_scale=none))["wheel_odometry"]
