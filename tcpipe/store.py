@@ -49,6 +49,7 @@ from tcpipe.formats.run_documents import (
     StreamInfo,
     Tags,
     find_highest_numbers,
+    is_unmarked_store,
     mark_store,
     name_document,
     name_folder,
@@ -394,11 +395,15 @@ def is_named_after(run_id: str, sha256: str) -> bool:
 
 
 def is_store(path: Path | str) -> bool:
-    """Return whether a place is a store; `UsageError` if it is one of an earlier data model."""
+    """Return whether a place is a store; `UsageError` if it is one of an earlier data model, or incomplete."""
     if is_url(path) and not is_bucket(path):
         return False
     place = open_place(path)
     if place.read(MARK) is None:  # not its size: only what is asked for with a body is refused with a reason
+        if is_unmarked_store(place):
+            raise UsageError(
+                f"{place.where()}: an incomplete copy of a store (no {MARK}), or one of data model 1, which is not read; copy it again"
+            )
         return False
     with suppress(StoreError):
         _refuse_earlier(place, read_layout(place))

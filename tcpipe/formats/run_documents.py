@@ -238,6 +238,17 @@ SPOOL = "spool"
 """Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store, and claims; they go in the end."""
 
 
+def is_unmarked_store(place: Place) -> bool:
+    """Return whether runs or maps are here, but not the mark of a store."""
+    if place.size(MARK) is not None:
+        return False
+    return any(name.endswith(".zarr") for name in place.folders("maps")) or any(
+        name.startswith("run") and name.endswith(".json")
+        for run_id in place.folders("runs")[:10]
+        for name in place.files(f"runs/{run_id}")
+    )
+
+
 def read_layout(place: Place) -> str | None:
     """Return the data model of a store, None where there is none; `StoreError` where its mark is not as it was written."""
     where, data = place.where(MARK), place.read(MARK)

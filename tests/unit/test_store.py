@@ -153,6 +153,9 @@ def test_what_a_copier_left_by_halves_is_named_and_not_used(tmp_path):
     manifest(run).unlink()
     (line,) = inspect(store.root, recipe=Recipe()).damaged_runs.values()
     assert line.endswith("manifest-1.json: is missing; ingest the log again")
+    (store.root / "store.json").unlink()
+    with pytest.raises(UsageError, match="an incomplete copy of a store"):
+        open_store(store.root)
 
 
 def test_a_store_is_moved_by_copying_its_files(root, tmp_path):
