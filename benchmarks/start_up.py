@@ -32,7 +32,7 @@ from tcpipe.formats.logs.writing import MessageStream, write_mcap
 KERNEL = """
 import numpy as np, pyarrow
 from tcpipe.geometry import polyline
-polyline._split(np.linspace(-1.0, 1.0, 7), 0.5)
+polyline._compute_distance_m(np.zeros((2, 3)), np.ones((2, 3)), 0.05, 0.5, (0.0, 0.0))
 """
 TWICE = """
 import shutil, sys, time
