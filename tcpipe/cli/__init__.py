@@ -53,7 +53,7 @@ _COMMANDS = {
     "route-graph": ("model_commands", "Write costs into a Nav2 route graph"),
     "report": ("dataset_commands", "Write the HTML page of a run, dataset or store"),
     "overlay": ("log_commands", "Write a run as MCAP, to view with its log"),
-    "export": ("dataset_commands", "Export topics as Parquet, or a dataset for QGIS"),
+    "export": ("dataset_commands", "Export topics as Parquet"),
     "explain": ("dataset_commands", "Trace a sample to its log and compute it again"),
     "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
     "migrate": ("dataset_commands", "Convert a store, map or dataset to this data model"),

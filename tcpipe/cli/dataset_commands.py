@@ -124,8 +124,8 @@ def export(
 ) -> int:
     """Write topics of LOG to OUT as Parquet, one file per topic, one row per message, columns by dotted field name.
 
-    The metadata of the files has the units of the columns and the definition of the message. tcpipe does not write topics again that
-    OUT already contains from the same log.
+    The metadata of the files has the definition of the message. tcpipe does not write topics again that OUT already contains from the
+    same log.
     """
     import resource
 

@@ -93,7 +93,7 @@ def export(
     topics: Sequence[str] = (),
     message_definitions: Path | None = None,
 ) -> Exported:
-    """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, units and definition in the metadata.
+    """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, the definition in the metadata.
 
     The log, or that at a URL, is read once and written piece by piece: memory does not grow with it. What ``out`` holds already of the
     same log is left alone. Without ``topics`` all are written; one text may name several, divided by commas. ``message_definitions`` is a

@@ -1,4 +1,4 @@
-"""Everything read: gaps, stamps and clock steps that were put in come out; memory does not grow with the log."""
+"""Everything read: gaps, stamps and clock steps that were put in come out."""
 
 import numpy as np
 import pyarrow as pa
