@@ -242,11 +242,10 @@ def _run_causes(a: Mapping[str, RunSource], b: Mapping[str, RunSource]) -> Itera
 
 def _exclusion_causes(a: Mapping[str, Exclusion], b: Mapping[str, Exclusion]) -> Iterator[str]:
     for name in sorted({*a, *b}):
-        was, now = a.get(name), b.get(name)
-        if was is None or now is None:
-            which, exclusion = ("removed", was) if now is None else ("added", now)
-            yield f"exclusion: {which} {name} ({exclusion.samples if exclusion else 0} samples): {exclusion.reason if exclusion else ''}"
-        elif was != now:
+        if name not in a or name not in b:
+            which, exclusion = ("added", b[name]) if name not in a else ("removed", a[name])
+            yield f"exclusion: {which} {name} ({exclusion.samples} samples): {exclusion.reason}"
+        elif (was := a[name]) != (now := b[name]):
             yield f"exclusion: {name} is another list: {was.samples} → {now.samples} samples, {was.reason} → {now.reason}"
 
 
@@ -291,8 +290,5 @@ def _iterate_lines(found: Difference) -> Iterator[str]:
             yield f"{name} of {count}: changed by {change['median']:.3g} in the median, by {change['largest']:.3g} at most"
     for name, label in found.labels.items():
         if not np.allclose((label["mean_a"], label["std_a"]), (label["mean_b"], label["std_b"])):
-            means, deviations = (
-                f"{label['mean_a']:.4g} → {label['mean_b']:.4g}",
-                f"{label['std_a']:.4g} → {label['std_b']:.4g}",
-            )
-            yield f"{name} of all samples: mean {means}, deviation {deviations}"
+            means = f"{label['mean_a']:.4g} → {label['mean_b']:.4g}"
+            yield f"{name} of all samples: mean {means}, deviation {label['std_a']:.4g} → {label['std_b']:.4g}"

@@ -78,39 +78,24 @@ def find_excluded(
     lists: Sequence[ExcludedIds], segment_ids: pa.ChunkedArray, kept: NDArray[np.int64]
 ) -> ExcludedSamples:
     """Return which samples the lists exclude; ``kept`` are the rows of ``segment_ids`` that are samples, (N,)."""
-    mask, exclusions, tables, findings = (
-        np.zeros(len(kept), np.bool_),
-        list[Exclusion](),
-        [EXCLUDED_IDS.empty_table()],
-        [],
-    )
+    mask, findings = np.zeros(len(kept), np.bool_), list[Finding]()
+    exclusions, tables = list[Exclusion](), [EXCLUDED_IDS.empty_table()]
     known = segment_ids.combine_chunks() if lists else None
-    sample = np.full(len(segment_ids), -1)
-    sample[kept] = np.arange(len(kept))
-    for exclusion_list in lists:
-        row = pc.index_in(pa.array(exclusion_list.ids), value_set=known).fill_null(-1).to_numpy()
-        rows = sample[row[row >= 0]]
-        rows = rows[rows >= 0]
-        exclusions.append(
-            Exclusion(
-                exclusion_list.name,
-                exclusion_list.checksum,
-                exclusion_list.reason,
-                len(exclusion_list.ids),
-                int((~mask[rows]).sum()),
-            )
-        )
-        mask[rows] = True
-        outcome = np.select([row < 0, sample[row] < 0], ["no segment", "no sample"], IS_EXCLUDED)
-        texts = [[exclusion_list.name] * len(row), [exclusion_list.reason] * len(row), outcome.tolist()]
-        tables.append(pa.table([exclusion_list.ids, *texts], schema=EXCLUDED_IDS))
-        if missing := int((row < 0).sum()):
-            names, subject = {"example": exclusion_list.ids[int(np.argmin(row))]}, Subject("file", exclusion_list.name)
-            findings.append(
-                make_finding(
-                    "exclusion-unmatched", subject, names=names, unmatched_count=missing, listed_count=len(row)
-                )
-            )
+    samples = np.full(len(segment_ids), -1)
+    samples[kept] = np.arange(len(kept))
+    for listed in lists:
+        rows, count = pc.index_in(pa.array(listed.ids), value_set=known).fill_null(-1).to_numpy(), len(listed.ids)
+        outcomes = np.select([rows < 0, samples[rows] < 0], ["no segment", "no sample"], IS_EXCLUDED)
+        excluded = samples[rows[outcomes == IS_EXCLUDED]]
+        new = int((~mask[excluded]).sum())
+        exclusions.append(Exclusion(listed.name, listed.checksum, listed.reason, count, new))
+        mask[excluded] = True
+        texts = [[listed.name] * count, [listed.reason] * count, outcomes.tolist()]
+        tables.append(pa.table([listed.ids, *texts], schema=EXCLUDED_IDS))
+        if missing := int((rows < 0).sum()):
+            names, subject = {"example": listed.ids[int(np.argmin(rows))]}, Subject("file", listed.name)
+            numbers = {"unmatched_count": missing, "listed_count": count}
+            findings.append(make_finding("exclusion-unmatched", subject, names=names, **numbers))
     return ExcludedSamples(mask, tuple(exclusions), pa.concat_tables(tables), tuple(findings))
 
 
