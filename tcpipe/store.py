@@ -149,8 +149,9 @@ class Store:
             prefix = f"{name}/{name_folder(checksums)}"
             if free := self.map_number(name) == after:
                 maps.put_files(prefix, directory)
-        document = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", subdirectory(prefix, checksums)
-        data, new = to_json(seal_document(MapDocument(*document))).encode(), name_document(name, after + 1)
+        zarr, picture, files = f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", subdirectory(prefix, checksums)
+        document = MapDocument(DATA_MODEL_VERSION, zarr, picture, files)
+        data, new = to_json(seal_document(document)).encode(), name_document(name, after + 1)
         same = free and after > 0 and maps.read(name_document(name, after)) == data
         put = same or (free and maps.put_new(new, data))
         if not put and not (after and maps.read(new) == data):  # the answer to one's own may be lost
@@ -372,7 +373,7 @@ class Store:
     ) -> Manifest:
         """Write one ingestion, its checksums added to the manifest; return that, or the one of others that is ``settled``."""
         place = self.runs_place.below(f"{manifest.run_id}/{manifest.recipe_id}")
-        kept_facts = {
+        metadata = {
             "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": to_plain(manifest.info.datum), "robot": manifest.robot,
         }  # fmt: skip
         tables = {
@@ -383,7 +384,7 @@ class Store:
         whole = self.read_rows(manifest.run_id).get(manifest.recipe_id)
         if whole is not None and settled(known := read_as_at(place, whole.manifest, Manifest)):
             return known
-        checksums = put_tables(place, {name: add_metadata(table, kept_facts) for name, table in tables.items()})
+        checksums = put_tables(place, {name: add_metadata(table, metadata) for name, table in tables.items()})
         after = find_highest_numbers(place.files()).get("manifest", 0)
         return put_next(place, "manifest", replace(manifest, checksums=checksums), after=after, settled=settled)
 

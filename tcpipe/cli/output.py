@@ -66,7 +66,7 @@ _LONGEST_NAME = 40
 
 
 class Progress:
-    """Lines on stderr; on a terminal ``console`` a bar of all logs, with what the last one that did something does, until the end."""
+    """Lines on stderr; on a terminal ``console`` a bar of all logs and the step of the log that reported last, until the end."""
 
     def __init__(self, what: str, *, quiet: bool, console: Console | None) -> None:
         self._what = what

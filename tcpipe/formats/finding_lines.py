@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from string import Formatter
 from typing import Generic, TypeVar
 
@@ -112,30 +113,26 @@ def _find_purpose(finding: Finding, remedy: Remedy) -> str:
 def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
     """Return what helps against findings of one code: what it does, and the commands and lines of a recipe that do it; else the advice."""
     remedies: list[Remedy] = []
-    for remedy in (remedy_ for finding in findings for remedy_ in finding.remedies):
+    for remedy in chain.from_iterable(finding.remedies for finding in findings):
         if remedy not in remedies:
             remedies.append(remedy)
     if remedies and len(remedies) <= MOST_LINES:
-        return [
-            (
-                _find_purpose(findings[0], remedy_),
-                [
-                    *([remedy_.command] if remedy_.command else []),
-                    *([_build_recipe_fragment(remedy_).toml()] if remedy_.recipe else []),
-                ],
-            )
-            for remedy_ in remedies
-        ]
+        return [(_find_purpose(findings[0], remedy), _list_changes(remedy)) for remedy in remedies]
     entry = read_catalogue().get(findings[0].code)
     return [(entry.advice, [])] if entry and entry.advice else []
+
+
+def _list_changes(remedy: Remedy) -> list[str]:
+    recipe = [_build_recipe_fragment(remedy).toml()] if remedy.recipe else []
+    return [*([remedy.command] if remedy.command else []), *recipe]
 
 
 def format_finding(finding: Finding) -> str:
     """Return a finding as one line: what was observed, its remedies or the catalogue's advice, and its code."""
     entry = read_catalogue().get(finding.code)
     advice = entry.advice if entry else ""
-    remedy = ". ".join(describe_remedy(finding, remedy_) for remedy_ in finding.remedies) or advice
-    return f"{describe_finding(finding)}{f'. {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
+    remedies = ". ".join(describe_remedy(finding, remedy) for remedy in finding.remedies) or advice
+    return f"{describe_finding(finding)}{f'. {remedies}' if remedies else ''}".rstrip(".") + f" [{finding.code}]"
 
 
 def format_remedy_blocks(findings: Iterable[Finding]) -> list[str]:
@@ -241,8 +238,8 @@ def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") 
         key, line = next(iter(group.of)), format_finding(findings[0])
         return line if key == findings[0].subject.name else f"{key}: {line}"
     shared = findings[0].remedies if all(finding.remedies == findings[0].remedies for finding in findings) else ()
-    remedy = ". ".join(describe_remedy(findings[0], remedy_) for remedy_ in shared)
-    return format_count(group.code, len(group.of), total, what, _describe_range(findings), remedy=remedy)
+    remedies = ". ".join(describe_remedy(findings[0], remedy) for remedy in shared)
+    return format_count(group.code, len(group.of), total, what, _describe_range(findings), remedy=remedies)
 
 
 def describe_group(group: FindingGroup[K], total: int | None, what: str) -> str:

@@ -455,7 +455,10 @@ _OTHER_CREDENTIALS = (
 
 
 def read_aws_profile(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the settings of the profile ``AWS_PROFILE``, else ``default``, that the environment does not give, by obstore's names."""
+    """Return the settings of the profile ``AWS_PROFILE``, else ``default``, that the environment does not give, by obstore's names.
+
+    `ValueError`: there is no profile of that name, or it has no keys (single sign-on, a role, a program that gives them).
+    """
     wanted = environment.get("AWS_PROFILE")
     name, home = wanted or "default", Path(environment.get("HOME", "~")).expanduser() / ".aws"
     credentials = Path(environment.get("AWS_SHARED_CREDENTIALS_FILE", home / "credentials")).expanduser()
@@ -467,18 +470,18 @@ def read_aws_profile(environment: Mapping[str, str] = os.environ) -> dict[str, s
     if wanted and sections == (None, None):
         raise ValueError(f"{credentials} and {config} have no profile {name}, which AWS_PROFILE names")
     found = {**(sections[0] or {}), **(sections[1] or {})}
-    said = {
+    locations = {
         key: found[entry]
         for entry, (key, given) in _PROFILE_LOCATIONS.items()
         if entry in found and not environment.keys() & given
     }
     if environment.keys() & _OTHER_CREDENTIALS:
-        return said
+        return locations
     keys = {key: found[entry] for entry, key in _PROFILE_KEYS.items() if entry in found}
     if wanted and not {"access_key_id", "secret_access_key"} <= keys.keys():
         export = f'eval "$(aws configure export-credentials --profile {name} --format env)"'
         raise ValueError(f"the profile {name} holds no keys; run: {export}")
-    return said | keys
+    return locations | keys
 
 
 def _read_section(path: Path, name: str) -> Mapping[str, str] | None:

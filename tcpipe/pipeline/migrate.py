@@ -228,8 +228,8 @@ def _copy_folder(
 
 def _is_converted(name: str) -> bool:
     """Return whether a file is a document of a run."""
-    number = split_number(name.rpartition("/")[2]) if name.startswith("runs/") else None
-    return number is not None and number[0] in ("run", "manifest", "tags")
+    document = split_number(name.rpartition("/")[2]) if name.startswith("runs/") else None
+    return document is not None and document[0] in ("run", "manifest", "tags")
 
 
 def _read_checksums(document: Document, above: str) -> dict[str, Checksum]:
@@ -333,7 +333,7 @@ def _write_log(store: Store, source: Place, record_names: Sequence[str]) -> list
     for start in range(0, len(names), _TOGETHER):
         run_ids = names[start : start + _TOGETHER]
         read = source.map(store.read_rows, run_ids)
-        rows = [row for rows_by_log in read for row in rows_by_log.values() if not is_committed(row, log.state)]
+        rows = [row for rows_by_recipe in read for row in rows_by_recipe.values() if not is_committed(row, log.state)]
         known = (replace(row, log=row.log and replace(row.log, outline=outlines.get(row.run_id, ""))) for row in rows)
         log.commit("ingested", Entries(runs=tuple(known)))
     log.commit("seen", lambda state: _convert_records(records, state))

@@ -140,11 +140,9 @@ class _Clock:
             mine, known = epoch == number, self._epoch == number
             known = known if known.any() else np.ones_like(known)
             begin = self._stamp_ns[known][0]  # differences are exact in float64, times since 1970 are not
-            at, known_ns = (
-                (stamp_ns[mine] - begin).astype(np.float64),
-                (self._stamp_ns[known] - begin).astype(np.float64),
-            )
-            times[mine] += np.rint(np.interp(at, known_ns, self._behind_ns[known])).astype(np.int64)
+            at_ns = (stamp_ns[mine] - begin).astype(np.float64)
+            known_ns = (self._stamp_ns[known] - begin).astype(np.float64)
+            times[mine] += np.rint(np.interp(at_ns, known_ns, self._behind_ns[known])).astype(np.int64)
         return times
 
     def _epoch_of(self, stamp_ns: Ints) -> Ints:

@@ -106,8 +106,8 @@ def propose_for_log(
     lists = {name: list_power_lists(kind, known.power_sources) for name, kind in types.items()}
     columns = {name: make_message_arrays(tables[name], lists[name]) for name in used if name in tables}
     frames: dict[Role, str] = {}
-    for name, column in columns.items():
-        frames.setdefault(cast("Role", used[name]), next(iter(count_frames(column, types[name])), ""))
+    for name, arrays in columns.items():
+        frames.setdefault(cast("Role", used[name]), next(iter(count_frames(arrays, types[name])), ""))
     places = place_frames(log, tables, assigned, frames, config)
     head = ["", f"robot: {assigned.robot}, {assigned.robot_why}"]
     for role in assigned.roles.values():

@@ -78,7 +78,8 @@ def prune(
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or something cannot be removed; what went before is gone.
 
     Of a run that was ingested with the ``recipe`` that rules, what earlier calls made with others is old. Of what ``keep`` names, runs
-    and recipes, nothing goes. Datasets that lay at the paths ``forget`` are gone: what they refer to may go.
+    and recipes, nothing goes. Datasets that lay at the paths ``forget`` are gone: what they refer to may go. What killed calls left goes
+    when it is ``min_age_s`` old; what waits for a dataset, when nothing was put there for so long. With ``dry_run`` nothing is removed.
     """
     ruling = resolve_recipe(recipe)
     opened = open_store(store)
@@ -135,8 +136,11 @@ def _iterate_old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[
         by_run.setdefault(row.run_id, []).append(row)
     for run_id, rows in by_run.items():
         ruling = [row for row in rows if row.ingest_key == key and row.tcpipe_version == __version__]
-        for row in rows if ruling and run_id not in found.superseded else ():
-            if row.ingest_key != key and row.commit < max(row_.commit for row_ in ruling):
+        if not ruling or run_id in found.superseded:
+            continue
+        latest = max(row.commit for row in ruling)
+        for row in rows:
+            if row.ingest_key != key and row.commit < latest:
                 yield "old recipe", store.runs_place.below(f"{run_id}/{row.recipe_id}"), [(run_id, row.recipe_id)]
 
 
@@ -263,11 +267,12 @@ def _iterate_named(place: Place, sizes: Mapping[str, int], rows: Sequence[RunFac
     last, committed = find_highest_numbers(sizes), {name: size for row in rows for name, size in row.files.items()}
     recipes = {row.recipe_id for row in rows}
     for name, size in sizes.items():
-        number = split_number(name)
-        if number is None:
+        document = split_number(name)
+        if document is None:
             continue
-        is_last = number[1] == last[number[0]]
-        if committed.get(name) == size and number[0].endswith("/manifest"):  # the log names its tables too
+        stem, number = document
+        is_last = number == last[stem]
+        if committed.get(name) == size and stem.endswith("/manifest"):  # the log names its tables too
             yield name
         elif name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
             yield from (name, *_iterate_named_by(place, name))

@@ -194,14 +194,14 @@ def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
             for finding in step.findings
         )
         groups.setdefault((step.state, alike or step.cause), []).append(step)
-    for (state, _), rows in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
-        causes = list(dict.fromkeys(step.cause for step in rows))
+    for (state, _), group in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
+        causes = list(dict.fromkeys(step.cause for step in group))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
         yield Group(
             state,
             cause,
-            tuple(step.task.source.name for step in rows),
-            sum(step.task.source.size_bytes for step in rows),
+            tuple(step.task.source.name for step in group),
+            sum(step.task.source.size_bytes for step in group),
         )
 
 

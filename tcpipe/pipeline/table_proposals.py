@@ -234,7 +234,7 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     if role == "gnss" and "quality" not in mapped:
         lines += [_propose_quality(table, head, quality) for quality in find_quality(table.names)]
     if role == "power" and set(mapped) == {"current"}:
-        lines += [ProposedLine(head, current, volt, NO_VOLTAGE, is_certain=False) for current, volt in NOMINAL.items()]
+        lines += [ProposedLine(head, key, volt, NO_VOLTAGE, is_certain=False) for key, volt in NOMINAL.items()]
     return lines
 
 

@@ -184,10 +184,8 @@ class BandedLayer:
 
 def _place_bands(source: RasterLayer, grid: MapGrid, name: str) -> BandedLayer:
     """Return the bands of a raster on a grid of their own; log how large that becomes."""
-    count, dtype = (
-        source.raster.band_count,
-        "float16" if all(tile.is_half for tile in source.raster.tiles) else "float32",
-    )
+    count = source.raster.band_count
+    dtype = "float16" if all(tile.is_half for tile in source.raster.tiles) else "float32"
     size_mb = count * grid.rows * grid.cols * np.dtype(dtype).itemsize / 1e6
     message = "map %s: layer %s: %d bands, %d x %d px of %g m, %s: up to %.1f MB"
     logger.info(message, name, source.layer.name, count, grid.cols, grid.rows, grid.pixel_size_m, dtype, size_mb)
