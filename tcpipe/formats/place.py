@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 U = TypeVar("U")
 
-MOST_BYTES = 256 << 20
+_MOST_BYTES = 256 << 20
 """A file that is read as a whole is at most so large [byte]."""
 _READS_AT_ONCE = 4
 """Files that are read side by side: a disk gives no more, and two cores hash 1 to 3 GB a second."""
@@ -89,12 +89,12 @@ class Place:
         self._do("", lambda path: os.scandir(path).close(), lambda s, key: next(iter(s.list(key or None)), None))
 
     def read(self, name: str) -> bytes | None:
-        """Return a whole file; None where there is none. On disk at most `MOST_BYTES`."""
+        """Return a whole file; None where there is none. On disk it is a `StoreError` if it is larger than any document or page."""
 
         def read(path: Path) -> bytes:
-            if path.stat().st_size > MOST_BYTES:
+            if path.stat().st_size > _MOST_BYTES:
                 raise StoreError(
-                    f"{path}: is larger than {MOST_BYTES >> 20} MB, which no document or page is; remove it"
+                    f"{path}: is larger than {_MOST_BYTES >> 20} MB, which no document or page is; remove it"
                 )
             return path.read_bytes()
 

@@ -101,12 +101,12 @@ def verify(path: Path | str) -> Verified:
 def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str, ...]]:
     """Return what a path is, its findings, which are made as they are asked for, and notes."""
     if inside := find_store_above(path):
-        return "run", verify_run(*inside), ()
+        return "run", _verify_run(*inside), ()
     if is_store(path):
-        return "store", verify_store(Store(path)), ()
+        return "store", _verify_store(Store(path)), ()
     place = open_place(path)
     if place.path and place.path.resolve().suffix == ".zarr" and not (place.path.resolve().parent / CARD).is_file():
-        return "map", verify_map(place.path), ()
+        return "map", _verify_map(place.path), ()
     found = find_newest(str(path), CARDS)
     if found is None:
         raise UsageError(f"{path}: is no {_KNOWN}; give one of these directories")
@@ -142,7 +142,7 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
         f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)
     )
     if is_bucket(path):
-        yield from (line for line in verify_log(open_place(path)) if isinstance(line, str))
+        yield from (line for line in _verify_log(open_place(path)) if isinstance(line, str))
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
         yield from _verify_counts(place.proved(SAMPLES, checksums[SAMPLES]), card, where)
 
@@ -160,7 +160,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
         yield from (f"{where}: {problem}" for problem in find_leaks(card, table))
 
 
-def verify_store(store: Store) -> Iterator[CheckResult]:
+def _verify_store(store: Store) -> Iterator[CheckResult]:
     """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
     place = store.place
     yield find_broken_seal(place.read(MARK), place.where(MARK)) or ("files", 1)
@@ -174,13 +174,13 @@ def verify_store(store: Store) -> Iterator[CheckResult]:
             yield f"{place.where(name)}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones"
         elif name not in (LOG, "maps", "runs", _INDEX) and place.entries(name):
             yield _describe_stranger(place, name)
-    yield from verify_log(place)
+    yield from _verify_log(place)
     yield from _verify_maps(store)
     yield from _verify_runs(store)
     yield from _find_left_behind(place.path) if place.path else ()
 
 
-def verify_log(place: Place) -> Iterator[CheckResult]:
+def _verify_log(place: Place) -> Iterator[CheckResult]:
     """Yield how many commits a place has, and what is wrong with them and with snapshots."""
     log, state = place.below(LOG), refresh(place, State())
     yield "commits", state.number - len(state.problems)
@@ -202,7 +202,7 @@ def _verify_runs(store: Store) -> Iterator[CheckResult]:
     """Yield the same of all runs, of those that the log names and of which files are gone, and of ingestions that no commit names."""
     wrong, found = set[str](), store.ingestions()
     for run_id in store.run_ids():
-        for finding in verify_run(store, run_id):
+        for finding in _verify_run(store, run_id):
             wrong |= {run_id} if isinstance(finding, str) else set()
             yield finding
         for under in store.read_rows(run_id):
@@ -211,7 +211,7 @@ def _verify_runs(store: Store) -> Iterator[CheckResult]:
     yield from (line for (run_id, _), line in found.damaged.items() if run_id not in wrong)
 
 
-def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[CheckResult]:
+def _verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[CheckResult]:
     """Yield the same of one run: its log's description, its streams, and what became of it under every recipe, or one."""
     place = store.runs_place.below(run_id)
     names = [entry.name for entry in place.entries()]
@@ -224,7 +224,7 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
         with suppress(StoreError):
             known = read_as_at(place, name_document("run", number), RunJson)
             there |= set(known.streams)
-    yield from verify_files(place, known.streams if known else {})
+    yield from _verify_files(place, known.streams if known else {})
     recipes = [name for name in folders if name != _STREAMS and find_highest_numbers(place.files(name)).get("manifest")]
     for name in recipes if recipe is None else [recipe]:
         yield from _isolate_errors(_verify_ingestion(store.runs_place, run_id, name))
@@ -254,11 +254,11 @@ def _verify_maps(store: Store) -> Iterator[CheckResult]:
             with suppress(StoreError):
                 checksums = read_as_at(place, name_document(name, number), MapDocument).checksums
                 known |= set(checksums)
-                yield from verify_files(place, checksums) if number == last else ()
+                yield from _verify_files(place, checksums) if number == last else ()
     yield from _find_strangers(place, known)
 
 
-def verify_files(place: Place, checksums: Mapping[str, Checksum]) -> Iterator[CheckResult]:
+def _verify_files(place: Place, checksums: Mapping[str, Checksum]) -> Iterator[CheckResult]:
     """Read files again and compare them with what a sealed document has of them."""
     yield from find_wrong_files(place, checksums)
     yield "files", len(checksums)
@@ -281,11 +281,11 @@ def _find_left_behind(root: Path) -> Iterator[str]:
             yield f"{path}: was left by a killed command; the next tcpipe ingest or add-map removes it"
 
 
-def verify_map(path: Path) -> Iterator[CheckResult]:
+def _verify_map(path: Path) -> Iterator[CheckResult]:
     """Yield the same of one map."""
     yield "maps", 1
     place, checksums = Place(path), read_checksums(path)
-    yield from verify_files(place, checksums)
+    yield from _verify_files(place, checksums)
     yield from _find_strangers(place, {*checksums, CHECKSUMS})
 
 
