@@ -90,7 +90,8 @@ def run_all(
     Use it within ``contextlib.closing``: workers end when the iterator is closed.
 
     With ``cluster``, the address of a Dask scheduler or an executor, its workers do it instead of ``jobs`` processes. They see the same
-    files under the same names.
+    files under the same names. `UsageError`: there is no such scheduler, it has no workers, or one of them has several
+    threads or another tcpipe.
     """
     todo = enumerate(tasks)
     first = list(islice(todo, 1 + (jobs > 1)))

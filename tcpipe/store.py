@@ -446,7 +446,11 @@ def find_store_above(path: Path | str) -> tuple[Store, str, str | None] | None:
 
 
 def open_store(root: str | Path, *, create: bool = False) -> Store:
-    """Return the store at a path or URL."""
+    """Return the store at a path or URL; unless with ``create`` it has to be there.
+
+    `UsageError`: it is missing, a file, or of an earlier data model; `StoreError`: it cannot be reached or made, or is of one that this
+    version does not know.
+    """
     if is_url(root) and not is_bucket(root):
         raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)

@@ -114,7 +114,10 @@ class FetchedShards:
 
 
 def fetch_directory(path: str | Path) -> Path:
-    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs."""
+    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs.
+
+    `UsageError`: there is no card at the URL; `StoreError`: it cannot be read, or a file is not as the card says.
+    """
     return fetch_directory_by_range(path, by_range=lambda _: False)[0]
 
 

@@ -29,7 +29,7 @@ _MOSTLY = 0.5
 
 @dataclass(frozen=True, slots=True)
 class CovariateTable:
-    """A table of covariates, by rising and different stamps; ``findings`` name rows that are left out, and odd columns."""
+    """A table of covariates, by rising and different stamps; ``findings`` name rows left out, and columns that a few words make text."""
 
     name: str
     checksum: Checksum
@@ -46,7 +46,8 @@ class CovariateTable:
     def join(self, stamp_ns: NDArray[np.int64], *, max_age_s: float) -> tuple[pa.Table, NDArray[np.bool_]]:
         """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
 
-        ``stamp_ns`` may be in any order; columns are called as the file, without its ending, and the column.
+        ``stamp_ns`` (UTC, shape (N,)) may be in any order; columns are called as the file, without its ending, and the column. They are
+        null where no row reaches, or it has no value.
         """
         wanted = pl.DataFrame({_STAMP: stamp_ns}).with_row_index(_ROW).sort(_STAMP)
         there = self.rows.with_columns(pl.col(_STAMP).alias(_FOUND))
@@ -72,7 +73,8 @@ class CovariateTable:
 def read_covariates(path: Path, *, time_column: str | None = None, time_unit: TimeUnit = "auto") -> CovariateTable:
     """Read a table of covariates.
 
-    Without ``time_column`` the only one that has its name; text is ISO 8601, and UTC where it names no zone.
+    Without ``time_column`` the only one that has its name; ``time_unit`` is of stamps that are numbers, text is ISO 8601, and UTC where it
+    names no zone. `DatasetError`: it cannot be read, has no time, or two rows of one time differ.
     """
     try:
         if path.suffix.lower() == ".parquet":

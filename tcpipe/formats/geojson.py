@@ -102,7 +102,10 @@ class FeatureCollection:
 
 
 def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
-    """Read the polygon features of a file in their order, and one line for every unsound geometry."""
+    """Read the polygon features of a file in their order, and one line for every unsound geometry.
+
+    `RegionError`: not GeoJSON, or in another CRS.
+    """
     features: list[PolygonFeature] = []
     problems: list[str] = []
     for where, properties, geometry in _iterate_features(path):
@@ -246,7 +249,7 @@ class LineFeature(Generic[P]):
 
 
 def read_line(path: Path) -> NDArray[np.float64]:
-    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2."""
+    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` where there is none."""
     try:
         features = list(_iterate_features(path))
     except RegionError as error:

@@ -57,7 +57,10 @@ class HttpsClient:
             )
 
     def get(self, url: str, *, most: int, span: tuple[int, int] | None = None) -> tuple[bytes, HTTPMessage]:
-        """Return the body of a URL, or its bytes from first to last, and the head of the reply; a failed request is made three times."""
+        """Return the body of a URL, or its bytes from first to last, and the head of the reply; a failed request is made three times.
+
+        `MapError`: it may not be asked, is not there, or is larger, slower or shorter than it may be.
+        """
         headers = {"User-Agent": f"tcpipe/{__version__}"} | ({"Range": f"bytes={span[0]}-{span[1]}"} if span else {})
         for pause_s in _PAUSES_S:
             try:

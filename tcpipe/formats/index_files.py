@@ -163,7 +163,10 @@ _CELLS: Mapping[str, Callable[[RunFacts], object]] = {
 def write_index(
     place: Place, rows: Rows, digest: str, *, before: Rows | None = None, digest_before: str | None = None
 ) -> None:
-    """Write ``runs.parquet``; where that cannot be, the next commit writes it."""
+    """Write ``runs.parquet`` of a state of the log; where that cannot be, the next commit writes it.
+
+    ``before`` and ``digest_before`` are of an earlier state: of its table only the rows that have changed are made anew.
+    """
     before = before or {}
     table = None if digest_before is None else _read_index(place, digest_before)
     changed = [key for key, row in rows.items() if table is None or before.get(key) is not row]

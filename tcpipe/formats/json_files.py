@@ -127,7 +127,10 @@ def read_as(path: Path, cls: type[T]) -> T:
 
 
 def parse_typed(value: object, cls: type[T], path: Path | str) -> T:
-    """Return a JSON object as a dataclass: a key that it lacks is its default, one that the dataclass lacks is left aside."""
+    """Return a JSON object as a dataclass: a key that it lacks is its default, one that the dataclass lacks is left aside.
+
+    `StoreError`: a value is missing, or of another type; the line names ``path`` and the key.
+    """
     try:
         with _CONVERTING:
             return msgspec.convert(value, cls, str_keys=True, dec_hook=_from_text)

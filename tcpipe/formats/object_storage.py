@@ -206,7 +206,7 @@ def lay_out_objects(
 
     Objects whose names end as in ``by_range`` get stand-ins of their size that hold nothing; all others that are ``wanted`` are copied.
 
-    What goes wrong inside the block is told with the URL instead of the path.
+    `LogError`: there is no such object, or it cannot be read; what goes wrong inside the block has the URL in place of the path.
     """
     shown, query = split_url(url, one_object=True)
     with make_scratch_directory() as directory:

@@ -214,7 +214,8 @@ def open_sharded(
 ) -> ShardedArray:
     """Return the array in ``path``, once its description, ``zarr.json``, says that it has the form that is wanted.
 
-    Every number comes from the caller, who knows it from a card: of the description only the compression is used.
+    Every number comes from the caller, who knows it from a card: of the description only the compression is used. `StoreError`: there is
+    no description, or it says something else.
     """
     where = path / DESCRIPTION
     if not where.exists():
