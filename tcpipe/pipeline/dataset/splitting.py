@@ -94,8 +94,9 @@ def find_excluded(
         tables.append(pa.table([listed.ids, *texts], schema=EXCLUDED_IDS))
         if missing := int((rows < 0).sum()):
             names, subject = {"example": listed.ids[int(np.argmin(rows))]}, Subject("file", listed.name)
-            numbers = {"unmatched_count": missing, "listed_count": count}
-            findings.append(make_finding("exclusion-unmatched", subject, names=names, **numbers))
+            findings.append(
+                make_finding("exclusion-unmatched", subject, names=names, unmatched_count=missing, listed_count=count)
+            )
     return ExcludedSamples(mask, tuple(exclusions), pa.concat_tables(tables), tuple(findings))
 
 
