@@ -48,7 +48,7 @@ from tcpipe.learning.metrics import (
     compute_costs,
     compute_errors,
     compute_errors_by_class,
-    label_floor,
+    compute_label_floor,
 )
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import (
@@ -124,9 +124,8 @@ def evaluate(
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
         few = int((select_train(data, variant).column("fold") != fitting.fold).sum())
-        longer = np.ceil(fitted / fitting.batch_size) / np.ceil(
-            few / fitting.batch_size
-        )  # as many steps, not as many epochs
+        # as many steps, not as many epochs
+        longer = np.ceil(fitted / fitting.batch_size) / np.ceil(few / fitting.batch_size)
         rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
         train(dataset, place, config=rules, variant=variant, predictor=predictor)
         return load_model(place, predictor)
@@ -167,16 +166,16 @@ def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floo
 def _split_errors(
     data: Dataset, found: Measured, said: Predicted, spreads: Mapping[str, Spread], plant: PlantCosts | None
 ) -> SplitErrors:
-    def errors_of(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
+    def compute_by_class(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
         return compute_errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
 
-    runs, uncentred = found.split.column("run_id"), errors_of(said.uncentred)
+    runs, uncentred = found.split.column("run_id"), compute_by_class(said.uncentred)
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
         samples=len(found.split),
         classes=counts,
         class_order=tuple(counts),
-        errors=errors_of(said.costs, spreads),
+        errors=compute_by_class(said.costs, spreads),
         coverage={
             quantity: measure_coverage(
                 (spread.low <= found.costs[quantity]) & (found.costs[quantity] <= spread.high), runs
@@ -185,8 +184,8 @@ def _split_errors(
         },
         uncentred={quantity: by_class[ALL] for quantity, by_class in uncentred.items()},
         leakage=measure_leakage(data, found.split),
-        label_floor=label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
-        simulation_floor=None if plant is None else errors_of(plant(found.split)),
+        label_floor=compute_label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
+        simulation_floor=None if plant is None else compute_by_class(plant(found.split)),
     )
 
 

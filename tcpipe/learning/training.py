@@ -234,9 +234,8 @@ def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -
         *(name for name in LAYERS if name in named),
         *(name for name in data.card.layers if name in named - {*LAYERS}),
     ]
-    unused = [
-        name for name in data.card.layers if name not in taken and name not in COLOURS
-    ]  # colours of the grey ortho
+    shown = {*taken, *COLOURS}  # the grey ortho is of its colours
+    unused = [name for name in data.card.layers if name not in shown]
     logger.info("%s: layers: %s; not used: %s", data.path, ", ".join(channels), ", ".join(unused) or "none")
     if own := [] if is_chosen else [name for name in unused if name not in PAPER_LAYERS]:
         message = "%s: the model does not use %s; to use it: --layers %s"
@@ -337,7 +336,7 @@ def find_training_range(split: Split) -> TrainingRange:
     class_ids = split.column("terrain_class").astype(np.float64)
     ids, counts = np.unique(class_ids[np.isfinite(class_ids)].astype(int), return_counts=True)
     class_counts = dict(zip(ids.tolist(), counts.tolist(), strict=True))
-    own = {name: LayerRange.of(np.concatenate(parts)) for name, parts in sorted(means.items())}
+    own = {name: LayerRange.estimate(np.concatenate(parts)) for name, parts in sorted(means.items())}
     return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges, own)
 
 
@@ -418,9 +417,8 @@ def _make_residuals_table(samples: Samples, held_out: Prediction) -> pa.Table:
     held, said, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class", "fold")}
     if len(outputs) > 1:
-        columns |= make_residuals(
-            labels, said.mean, said.covariance
-        )  # what the labels have in common is in no residual
+        columns |= make_residuals(labels, said.mean, said.covariance)
+        # what the labels have in common is in no residual
         columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}
         columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
     else:
