@@ -117,8 +117,7 @@ def choose_kind(data: Dataset, config: FitConfig, variant: Variant, split: Split
     for name in AUTOMATIC:
         kind = find_kind(name)
         try:
-            train = split.with_channels(*kind.channels) if kind.channels else split
-            samples = make_samples(data, config, variant, kind, train)
+            samples = make_samples(data, config, variant, kind, split)
             losses[name] = _compute_losses(samples, cross_predict(kind, samples, part).mean)
         except ModelError as error:
             logger.info("%s is not compared: %s", name, error.problems[0])
@@ -267,8 +266,12 @@ def select_train(data: Dataset, variant: Variant, kind: type[Predictor] = Predic
 def make_samples(
     data: Dataset, rules: FitConfig, variant: Variant, kind: type[Predictor], train: Split | None = None
 ) -> Samples:
-    """Return what a model of a kind is fitted to: of ``train`` as it is, or of all that `select_train` finds."""
-    needs_folds, train = train is None, select_train(data, variant, kind) if train is None else train
+    """Return what a model of a kind is fitted to: labelled samples ``train``, or all that `select_train` finds, which need folds."""
+    needs_folds = train is None
+    if train is None:
+        train = select_train(data, variant, kind)
+    elif kind.channels:
+        train = train.with_channels(*kind.channels)
     outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
     folds = train.column("fold")
     fitted = train.take(folds != rules.fold)
@@ -283,10 +286,10 @@ def make_samples(
         )
     used = fitted if kind.stops_by_fold else train
     if rules.inverse_variance_weights and not variant.energy_only:
-        none = [label for label, weights in zip(outputs, used.weights.T, strict=True) if not weights.any()]
-        if none:
+        unstated = [label for label, weights in zip(outputs, used.weights.T, strict=True) if not weights.any()]
+        if unstated:
             raise DatasetError(
-                f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; "
+                f"{data.path}: no sample has a standard deviation of {', '.join(unstated)} to weigh it by; "
                 "train without --inverse-variance-weights"
             )
     extra_features: tuple[ExtraFeature, ...] = ()  # a network of energy alone takes none
