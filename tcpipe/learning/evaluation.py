@@ -140,11 +140,11 @@ def evaluate(
         model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
         dataset=EvaluatedDataset(data.card.name, compute_dataset_checksum(data.card), data.card.splits),
         config=config,
-        splits={name: _split_errors(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
+        splits={name: _measure_split(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
         ablation=tuple(ablation),
         energy=energy,
         networks=tuple(networks),
-        time=_time(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
+        time=_compare_times(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
         baselines=tuple(baselines),
         blocks=compute_block_errors(ours, names),
         repeatability=_estimate_repeatability(data.card, ENERGIES[ours.card.label_energy]),
@@ -163,7 +163,7 @@ def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floo
     return {quantity: found.get(column) for quantity, column in columns.items()}
 
 
-def _split_errors(
+def _measure_split(
     data: Dataset, found: Measured, said: Predicted, spreads: Mapping[str, Spread], plant: PlantCosts | None
 ) -> SplitErrors:
     def compute_by_class(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
@@ -229,7 +229,9 @@ def _find_fastest_mps(robot: str, data: Dataset) -> float | None:
     return known.get(robot, Robot()).max_velocity_mps
 
 
-def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
+def _compare_times(
+    ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None
+) -> dict[str, dict[str, Errors]]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's maximum speed."""
     found = {OURS: {name: _compute_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:

@@ -112,7 +112,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
         rows.append((quantity, "the model", *(_format_figure(error, "rmse", quantity) for error in own)))
         for name in names:
             results = (by_cell.get((name, split, quantity)) for split in splits)
-            cells = (_format_figure(result and result.errors, "rmse", quantity) for result in results)
+            cells = (_format_figure(None if row is None else row.errors, "rmse", quantity) for row in results)
             rows.append(("", name, *cells))
     header = ("", "", *(f"{split}, RMSE" for split in splits))
     text = (

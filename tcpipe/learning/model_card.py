@@ -57,7 +57,7 @@ _LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TrainingRange:
-    """What the training samples held: beyond it a model has no business."""
+    """What the training samples held; predictions beyond it are extrapolations."""
 
     class_counts: Mapping[int, int]
     """Samples by their terrain class."""
