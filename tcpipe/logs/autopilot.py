@@ -320,7 +320,7 @@ _SOURCES: dict[str, dict[str, tuple[str, _Convert]]] = {
 """Names of messages, best first, and how they are converted, by autopilot and topic."""
 
 _BESIDE = "GPA STER rover_rate_setpoint"
-CONVERTED = {name for columns in _SOURCES.values() for names, _ in columns.values() for name in names.split()} | {
+CONVERTED = {name for sources in _SOURCES.values() for names, _ in sources.values() for name in names.split()} | {
     *_BESIDE.split()
 }
 """Names of messages that are read here."""

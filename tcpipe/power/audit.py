@@ -153,7 +153,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     judged = {first: judge(first) for first in range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1)}
     first = max(judged, key=lambda at: judged[at][0])
     before, after = (
-        -float(by_volt[rows_].sum() / weight[rows_].sum()) for rows_ in (slice(first - 1), slice(first + 1, None))
+        -float(by_volt[blocks].sum() / weight[blocks].sum()) for blocks in (slice(first - 1), slice(first + 1, None))
     )
     is_sure = judged[first][0] > _SURE**2 and judged[first][1] > _GRADUAL**2
     least = read_threshold("current-gain-changes", "min_change_fraction")
