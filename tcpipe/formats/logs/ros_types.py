@@ -140,7 +140,8 @@ class TypeLibrary:
     ) -> MessageType | DefinitionError:
         """Return the type for a definition text ("" where the log has none).
 
-        Or what is in the way: no definition is known, or it cannot be parsed, is recursive, or uses a type no reader supports.
+        An error is returned, not raised, where no definition is known, or it cannot be parsed, is recursive, or uses a type no reader
+        supports.
         """
         key = (type_name, definition, schema_encoding, ros1)
         if key not in self._types:
