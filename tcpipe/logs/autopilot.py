@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
-from tcpipe.logs.fix_quality import classify_fixes, find_status
-from tcpipe.logs.messages import GNSS, Columns
+from tcpipe.logs.fix_quality import Columns, classify_fixes, find_status
+from tcpipe.logs.messages import GNSS
 from tcpipe.logs.roles import GPS_FIXES
 from tcpipe.logs.topics import AutopilotKind
 from tcpipe.tables.findings import Finding, Subject, make_finding

@@ -20,6 +20,7 @@ from tcpipe.logs import roles
 from tcpipe.logs.extrinsics import is_base
 from tcpipe.logs.fix_quality import (
     NO_HEIGHT_M2,
+    Columns,
     add_quality_std,
     classify_fixes,
     classify_status,
@@ -30,7 +31,6 @@ from tcpipe.logs.nmea import add_date, read_gga, read_over_ground
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
-Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
