@@ -39,8 +39,8 @@ from tcpipe.logs.wire_types import (
     WireType,
     count_fixed_elements,
     is_boundless,
+    make_record,
     parse_msg,
-    record,
 )
 
 Source = Literal["log", "given", "bundled"]
@@ -225,7 +225,7 @@ class _Unfold:
             twice = sorted(field for field, count in Counter(field for field, _ in fields).items() if count > 1)
             if twice:
                 raise DefinitionError(f"type {name} defines {', '.join(twice)} more than once")
-            self._records[name] = record(name, fields)
+            self._records[name] = make_record(name, fields)
         return self._records[name]
 
     def wire_type(self, described: Any, within: tuple[str, ...]) -> WireType:
