@@ -103,7 +103,7 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
         return None
     volt, amp = np.mean([value[0] for value in values], axis=0), np.sum([value[1] for value in values], axis=0)
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
-    volt, amp = (values - _compute_moving_mean(values, rows) for values in (volt, amp))
+    volt, amp = (signal - _compute_moving_mean(signal, rows) for signal in (volt, amp))
     return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
 
 

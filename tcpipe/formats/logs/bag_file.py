@@ -136,7 +136,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return replace(chunk, record=record, size=size)
 
     def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
-        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
         return read_indexed_messages(found)
 
     def read_walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
@@ -149,7 +149,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return chunk.record is not None and chunk.record.codec == "bz2"
 
     def needs_index(self, chunk: _Chunk) -> bool:
-        """Tell whether a broken index is worth a word: there should be one."""
+        """Tell whether a broken index is noted: there should be one."""
         return chunk.counts is not None and not chunk.cut
 
     def _step_through(self, chunk: _Chunk, data: memoryview) -> ChunkRecords:

@@ -186,7 +186,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
 
     @abstractmethod
     def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
-        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
 
     @abstractmethod
     def read_walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int]) -> Messages:
@@ -198,7 +198,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
 
     @abstractmethod
     def needs_index(self, chunk: AnyChunk) -> bool:
-        """Tell whether a broken index of this chunk is worth a word."""
+        """Tell whether a broken index of this chunk is noted."""
 
     @abstractmethod
     def note_lost(self, chunk: AnyChunk, error: DamageError) -> None:

@@ -127,7 +127,7 @@ class McapPart(ChunkedPart[Chunk]):
         return found
 
     def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
-        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
         messages, right = read_messages_at(found.data, found.offset)
         entries = found.entries
         room = entries.end - entries.offset - RECORD_HEAD - MESSAGE_HEAD
@@ -161,7 +161,7 @@ class McapPart(ChunkedPart[Chunk]):
         return bool(self._crc(chunk))
 
     def needs_index(self, chunk: Chunk) -> bool:
-        """Tell whether a broken index is worth a word: nothing else proves what the chunk holds."""
+        """Tell whether a broken index is noted: nothing else proves what the chunk holds."""
         return chunk.index is not None and not chunk.cut and not self._crc(chunk)
 
     def find_plain_data(self, chunk: Chunk) -> int | None:
