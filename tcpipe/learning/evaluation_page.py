@@ -5,7 +5,7 @@ The paper's own results (Eder and Steinbauer-Wagner, section V), to stand beside
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
 from typing import Literal
 
@@ -111,8 +111,8 @@ def _make_baselines_section(found: Evaluation) -> Section:
         own = (found.splits[split].errors[quantity][ALL] for split in splits)
         rows.append((quantity, "the model", *(_format_figure(error, "rmse", quantity) for error in own)))
         for name in names:
-            of = (by_cell.get((name, split, quantity)) for split in splits)
-            cells = (_format_figure(None if row is None else row.errors, "rmse", quantity) for row in of)
+            baselines = (by_cell.get((name, split, quantity)) for split in splits)
+            cells = (_format_figure(None if row is None else row.errors, "rmse", quantity) for row in baselines)
             rows.append(("", name, *cells))
     header = ("", "", *(f"{split}, RMSE" for split in splits))
     text = (
@@ -235,14 +235,9 @@ _TEXT = {
 
 def _make_other_sections(found: Evaluation) -> list[Section]:
     """Return tables III to V: other inputs, other networks, the expected time."""
-    ablation = [
-        (
-            "+".join(row.layers),
-            "",
-            {split: row.on(split)["E"] for split in found.ordered_splits},
-        )
-        for row in found.ablation
-    ]
+    ablation = {
+        "+".join(row.layers): {split: row.on(split)["E"] for split in found.ordered_splits} for row in found.ablation
+    }
     noise = f"Layers not named are replaced by noise ({found.config.noise_draws} draws)."
     networks = (
         "Beside the one network: one of each class with all layers, and Wei and Isler's, which predict E from heights alone.\n"
@@ -250,16 +245,13 @@ def _make_other_sections(found: Evaluation) -> list[Section]:
     )
     if not found.networks:
         networks += "They are trained only if the model is a network."
-    others = [
-        (what, "", found.energy[what])
-        for what in (OURS, ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY)
-        if what in found.energy
-    ]
-    times = [(EXPECTED, "", found.time[EXPECTED])] if EXPECTED in found.time else []
+    predictors = (OURS, ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY)
+    energies = {name: found.energy[name] for name in predictors if name in found.energy}
+    times = {name: found.time[name] for name in (EXPECTED,) if name in found.time}
     of_time = "The expected time is d / v at the robot's maximum speed."
     return [
         _make_other_section("Table III: ablation, E", noise, found, "E", ablation),
-        _make_other_section("Table IV: energy, one network or one per class", networks, found, "E", others),
+        _make_other_section("Table IV: energy, one network or one per class", networks, found, "E", energies),
         _make_other_section("Table V: time against the expected time", of_time, found, "T", times),
     ]
 
@@ -269,16 +261,16 @@ def _make_other_section(
     text: str,
     found: Evaluation,
     quantity: Literal["E", "T"],
-    lines: Iterable[tuple[str, str, Mapping[str, Errors]]],
+    errors_by_predictor: Mapping[str, Mapping[str, Errors]],
 ) -> Section:
-    """Return errors of a quantity on every split by predictor, beside the paper's; each with a remark that the paper's lacks."""
+    """Return errors of a quantity on every split by predictor, beside the paper's."""
     splits = found.ordered_splits
     rows: list[tuple[str, ...]] = []
-    for what, remark, errors in lines:
+    for name, errors in errors_by_predictor.items():
         figures = [_format_figures(errors.get(split), quantity) for split in splits]
-        rows.append((what, remark, *(figure for pair in figures for figure in pair)))
-        if not remark and what in PAPER:
-            pairs = [PAPER[what][SPLITS.index(split)] for split in splits]
+        rows.append((name, "", *(figure for pair in figures for figure in pair)))
+        if name in PAPER:
+            pairs = [PAPER[name][SPLITS.index(split)] for split in splits]
             rows.append(("", "paper", *(_format_paper_figure(value) for pair in pairs for value in pair)))
     header = ("", "", *(f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in MEASURES))
     return Section(title, text, header=header, rows=rows, figures_from=2)
