@@ -20,6 +20,9 @@ _CONTACT_FRACTION = 1e-3
 _CHUNK = 4_096
 """Footprints looked at together: each may be near hundreds of others."""
 
+_PAIRS = 65_536
+"""Pairs that are geometries at one time (1 kB each)."""
+
 CLOSE = 1.05
 """Ground nearer than so many chords to a training sample counts as covered: consecutive samples are one chord apart."""
 
@@ -153,8 +156,12 @@ def find_near_pairs(queries_xy_m: Floats, tree: cKDTree, *, within_m: float) -> 
 
 def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Ints) -> Floats:
     """Return the share of the ground of ``queries[i]`` that ``references[j]`` covers too, (P,); corners in order around, (N, 4, 2)."""
-    ours, theirs = shapely.polygons(queries), shapely.polygons(references[j])
-    return np.asarray(shapely.area(shapely.intersection(ours[i], theirs)) / shapely.area(ours)[i])
+    ours, shared_m2 = shapely.polygons(queries), np.empty(len(i))
+    for first in range(0, len(i), _PAIRS):
+        part = slice(first, first + _PAIRS)
+        theirs = shapely.polygons(references[j[part]])
+        shared_m2[part] = shapely.area(shapely.intersection(ours[i[part]], theirs))
+    return np.asarray(shared_m2 / shapely.area(ours)[i])
 
 
 def compute_nearest_m(queries: Floats, ground: Ground) -> Floats:
