@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from path_coverage import drive, store_of
+from path_coverage import make_store, simulate_drives
 
 from tcpipe.dataset import Dataset, open_dataset
 from tcpipe.errors import TcpipeError
@@ -35,9 +35,7 @@ def make_subset(data: Dataset, name: ModelKind | Literal["auto"], count: int, se
     config, train = FitConfig(model=name, seed=seed), select_train(data, Variant())
     train = train.take(np.sort(np.random.default_rng(seed).permutation(len(train))[:count]))
     chosen = choose_kind(data, config, Variant(), train) if name == "auto" else name
-    kind = find_kind(chosen)
-    split = train.with_channels(*kind.channels) if kind.channels else train
-    return chosen, make_samples(data, config, Variant(), kind, split)
+    return chosen, make_samples(data, config, Variant(), find_kind(chosen), train)
 
 
 def measure(data: Dataset, name: str, count: int, seed: int) -> dict[str, tuple[float, float]]:
@@ -56,7 +54,7 @@ def measure(data: Dataset, name: str, count: int, seed: int) -> dict[str, tuple[
         power, velocity = predict_samples(predictor, held).mean.T
         said = compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), 1.0)
         true = compute_costs(*held.labels.T, 1.0)
-        found[split] = tuple(float(np.sqrt(np.mean((said[of] - true[of]) ** 2))) for of in ("E", "T"))
+        found[split] = tuple(float(np.sqrt(np.mean((said[cost] - true[cost]) ** 2))) for cost in ("E", "T"))
     return found
 
 
@@ -73,7 +71,8 @@ def main() -> None:
     told = parser.parse_args()
     if told.make:
         here = told.dataset.parent
-        store = store_of(here, drive(here / "site", told.drives, told.metres, payload_kg=0.0, seed=told.site_seed))
+        site = simulate_drives(here / "site", told.drives, told.metres, seed=told.site_seed)
+        store = make_store(here, site)
         recipe = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="run"))
         build_dataset(told.dataset, store=store, recipe=recipe)
     data = open_dataset(told.dataset)
@@ -85,7 +84,7 @@ def main() -> None:
                 print(f"{count:>6} {name:10}: {error}")
                 continue
             for split in found[0]:
-                energy, time = np.array([of[split] for of in found]).T
+                energy, time = np.array([errors[split] for errors in found]).T
                 print(
                     f"{count:>6} {name:10} {split:6}: E {energy.mean():6.2f} ± {energy.std():.2f} J, T {time.mean():.4f} s",
                     flush=True,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from path_coverage import drive, store_of
+from path_coverage import make_store, simulate_drives
 
 from tcpipe.dataset import open_dataset
 from tcpipe.dataset.extra_features import read_extra_features
@@ -51,7 +51,7 @@ def make_bands(world: World, count: int, rng: np.random.Generator) -> dict[str, 
 
 def build(out: Path, drives: int, variance: float, bands: int) -> Path:
     """Return a dataset of the simulated drives, with both layers."""
-    site = drive(out / "site", drives, _METRES, seed=0, hidden_variance=variance)
+    site = simulate_drives(out / "site", drives, _METRES, seed=0, hidden_variance=variance)
     made = scale_hidden_variance(find_scenario("paper_quick").world, variance)
     world = made.site
     rasters = {}
@@ -63,7 +63,7 @@ def build(out: Path, drives: int, variance: float, bands: int) -> Path:
             affine=affine, crs=f"EPSG:{world.epsg}", dtype="float32", bands=bands,
         )  # fmt: skip
     recipe = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="run", test_fraction=0.34))
-    store = store_of(out, site, rasters)
+    store = make_store(out, site, rasters)
     print(str(build_dataset(out / "dataset", store=store, recipe=recipe)).splitlines()[0])
     return out / "dataset"
 
@@ -78,7 +78,7 @@ def measure(dataset: Path, out: Path, kind: str, more: tuple[str, ...]) -> str:
     train(dataset, out, config=config)
     model, held = load_model(out), data["test"]
     said = model.predict(held.with_layout(model.card.layout).patches, read_extra_features(held)).mean
-    told, true = (compute_costs(*of.astype(float).T, 1.0) for of in (said, held.labels))
+    told, true = (compute_costs(*outputs.astype(float).T, 1.0) for outputs in (said, held.labels))
     energy, time = (float(np.sqrt(np.mean((told[name] - true[name]) ** 2))) for name in ("E", "T"))
     return (
         f"E {energy:6.2f} J, T {time:.4f} s on {len(held)} samples of {len(set(held.column('run_id')))} held-out drives"

@@ -22,7 +22,7 @@ import numpy as np
 
 from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, format_adaptations, predict
 from tcpipe.cost.coverage import measure_coverage
-from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
+from tcpipe.cost.prediction_errors import COVERAGE, Errors
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.training import train
@@ -40,7 +40,7 @@ LENGTHS = (1, 10, 30, 100)
 KNOWN_M = (0.0, 10.0, 50.0, 100.0)
 
 
-def drive(
+def simulate_drives(
     place: Path, count: int, metres: float, *, seed: int, payload_kg: float = 0.0, hidden_variance: float = 1.0
 ) -> SimulatedSite:
     """Simulate drives over the small site, whose rolling resistance that no raster shows has so many times its variance."""
@@ -56,7 +56,7 @@ def drive(
     return simulate(place, scenario=replace(site, drives=drives), seed=seed)
 
 
-def store_of(place: Path, site: SimulatedSite, layers: Mapping[str, Path] | None = None) -> Path:
+def make_store(place: Path, site: SimulatedSite, layers: Mapping[str, Path] | None = None) -> Path:
     """Ingest the logs of a site and add its map, with further layers."""
     store = place / "store"
     done = ingest(site.logs, store=store, recipe=replace(Recipe(), robot="husky"))
@@ -67,13 +67,15 @@ def store_of(place: Path, site: SimulatedSite, layers: Mapping[str, Path] | None
 
 def measure(here: Path, seed: int, *, given: argparse.Namespace) -> tuple[Model, list[Run]]:
     """Return a model of some drives, and further drives as it predicts and they measured them."""
-    site = drive(here / "train" / "site", given.train, given.metres, payload_kg=0.0, seed=seed)
-    store = store_of(here / "train", site)
+    site = simulate_drives(here / "train" / "site", given.train, given.metres, seed=seed)
+    store = make_store(here / "train", site)
     build_dataset(here / "dataset", store=store, recipe=replace(Recipe(), robot="husky"))
     train(here / "dataset", here / "model", config=FitConfig(model=given.kind))
     model = load_model(here / "model")
-    further = drive(here / "further" / "site", given.further, given.metres, payload_kg=given.payload, seed=seed + 1000)
-    store = store_of(here / "further", further)
+    further = simulate_drives(
+        here / "further" / "site", given.further, given.metres, payload_kg=given.payload, seed=seed + 1000
+    )
+    store = make_store(here / "further", further)
     source, opened = choose_map(store, None), open_store(store)
     return model, collect_runs(model, source, opened, [run.run_id for run in opened.runs()])
 
@@ -91,15 +93,15 @@ def list_paths(found: Found, quantity: str, length: int) -> Iterator[tuple[str, 
             yield run.name, errors[quantity], metres.take((at >= first) & (at < first + length))
 
 
-def coverage_line(quantity: str, length: int, found: Found) -> str:
+def format_coverage(quantity: str, length: int, found: Found) -> str:
     """Return how many paths of a length are inside their interval, and how wide that is."""
     inside, names, widths = [], [], []
-    for name, errors, of in list_paths(found, quantity, length):
-        said = predict(errors, of)
+    for name, errors, path in list_paths(found, quantity, length):
+        said = predict(errors, path)
         low, high = (float(said.low[0]), float(said.high[0])) if length == 1 else said.total.interval
-        inside.append(low <= float(of.measured.sum()) <= high)
+        inside.append(low <= float(path.measured.sum()) <= high)
         names.append(name)
-        widths.append((high - low) / 2.0 / float(np.abs(of.predicted).sum()))
+        widths.append((high - low) / 2.0 / float(np.abs(path.predicted).sum()))
     if not inside:
         return f"{quantity:8} {length:4d} m: no drive is as long"
     share = measure_coverage(np.array(inside), np.array(names))
@@ -110,13 +112,13 @@ def coverage_line(quantity: str, length: int, found: Found) -> str:
     return f"{quantity:8} {length:4d} m: {share} of {share.samples}: {verdict}; ± {width:.1f} %"
 
 
-def budget_line(found: Found, length: int = 30) -> str:
+def format_budget(found: Found, length: int = 30) -> str:
     """Return for how many ways there and back of a drive a budget suffices that `plan-path --budget --return` calls enough at 95 %."""
     is_enough, names = [], []
-    for name, errors, of in list_paths(found, "energy", 2 * length):
+    for name, errors, path in list_paths(found, "energy", 2 * length):
         at = np.arange(2 * length)
-        sums = [predict(errors, of.take(way)).total for way in (at < length, at >= length)]
-        is_enough.append(float(of.measured.sum()) <= (sums[0] + sums[1]).compute_quantile(RISK))
+        sums = [predict(errors, path.take(way)).total for way in (at < length, at >= length)]
+        is_enough.append(float(path.measured.sum()) <= (sums[0] + sums[1]).compute_quantile(RISK))
         names.append(name)
     if not is_enough:
         return f"budget 2 x {length} m: no drive is as long"
@@ -138,7 +140,7 @@ def main() -> None:
     for seed in range(given.seed, given.seed + given.models):
         with tempfile.TemporaryDirectory() as name:
             model, runs = measure(Path(name), seed, given=given)
-        errors = fit_errors(model.residuals)
+        errors = model.errors
         assert errors is not None, "too few samples to train on"
         found += [(errors, replace(run, name=f"{seed}-{run.name}")) for run in runs]
         metres = np.mean([run.metres["energy"].length_m.sum() for run in runs])
@@ -146,8 +148,8 @@ def main() -> None:
         print(f"seed {seed}: {fitted} samples of {given.train} drives; {len(runs)} further ones, {metres:.0f} m each")
     for quantity in ("duration", "energy"):
         for length in LENGTHS:
-            print(coverage_line(quantity, length, found))
-    print(budget_line(found))
+            print(format_coverage(quantity, length, found))
+    print(format_budget(found))
     known_m = [metres for metres in KNOWN_M if metres <= given.metres / 3.0]
     both = {quantity: errors[quantity] for quantity in ("energy", "duration")}
     print(*format_adaptations(list(compare_adaptations(both, runs, known_m))), sep="\n")

@@ -44,7 +44,7 @@ from tcpipe.learning.metrics import (
     Spread,
     compute_costs,
     compute_errors,
-    label_floor,
+    compute_label_floor,
 )
 from tcpipe.learning.table_model import grow
 from tcpipe.store import Store
@@ -269,7 +269,7 @@ def _row(names: tuple[str, ...], of: Errors, quantity: str, scatter: float) -> s
 def floor_lines(name: str, of: Metre) -> Iterator[str]:
     """Yield the rows of what the labels' own deviations make of a perfect prediction."""
     measured, std = _measured(of), {"T": of.duration_std, "E": of.energy_std}
-    found = label_floor(
+    found = compute_label_floor(
         {name: std[name] for name in measured}, measured, np.zeros(len(of.power), np.int64), {0: "unknown"}
     )
     for quantity in measured:

@@ -24,7 +24,7 @@ def run_train(options: TrainOptions) -> TrainResult:
     """Train a model on a dataset and write the model folder ``out``, whole or not at all.
 
     ``str`` of the result is what the command prints. Raises `UsageError` where an option is out of its range, or ``out`` holds something
-    else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the interrupted training is another one.
+    else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the state of an interrupted training is damaged.
     """
     from tcpipe.errors import UsageError
     from tcpipe.formats.recipe_toml import resolve_recipe

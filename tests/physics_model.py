@@ -78,7 +78,7 @@ class PhysicsModel:
     def card(self):
         layout = TensorLayout(self.channels, make_paper_layers(PAPER_LAYERS, self.classes), self.patch_px)
         seen = TrainingRange(self.class_counts, self.pixel_classes, self.training_range)
-        own = {of.name: getattr(self, of.name) for of in fields(PhysicsModel)}
+        own = {entry.name: getattr(self, entry.name) for entry in fields(PhysicsModel)}
         return SimpleNamespace(
             **own | {"inputs": self, "layout": layout, "class_table": self.classes, "training_range": seen}
         )

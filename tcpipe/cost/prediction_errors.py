@@ -116,7 +116,7 @@ class Errors:
     common_share : standard deviation of the labels' common error, of the prediction; 0 where the labels do not state it.
     stated_share, usual_stated : what a spread has of the standard deviation that the model states, and its mean over held-out samples.
     lag_m, correlation : of two metres so far apart on one run, from each lag to the next.
-    of_run : the last of them, each run's own, raised for the small number of runs.
+    of_run : variance of a run's own error over its spread, raised for the small number of runs.
     runs, samples : that were held out.
     """
 
@@ -375,8 +375,8 @@ def _estimate_ratio(predicted: Floats, true: Floats, block: Ints) -> tuple[float
     return found, float(np.sqrt((of_block**2).sum() * several / (several - 1.0))) / whole
 
 
-_FEWEST_FREEDOM = 5.0
-"""Of the spread of errors of one fold."""
+_ONE_FOLD_FREEDOM = 5.0
+"""Degrees of freedom of the spread of errors of one fold."""
 
 
 def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats, stated: Floats) -> Errors:
@@ -393,7 +393,7 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
     low, high = np.quantile(standard, (_TAIL, 1.0 - _TAIL)).tolist()
     lag_m, correlation = _estimate_correlation(standard, held)
     runs = int(np.unique(held.run).size)
-    wider = float(stdtrit(_FEWEST_FREEDOM, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH if held.is_one_fold else 1.0
+    wider = float(stdtrit(_ONE_FOLD_FREEDOM, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH if held.is_one_fold else 1.0
     floor, share, stated_share = (float(part) * scale * wider for part in shares)
     found = Errors(
         floor, share, of_class, min(low, 0.0), max(high, 0.0), bias_std, lag_m, correlation, 0.0, runs, standard.size,

@@ -108,8 +108,7 @@ def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[S
     )
     if kind.features is None:  # trees take the turn, but not the commanded speed
         kind = type(kind.__name__, (kind,), {"features": turn})
-    split = train.with_channels(*kind.channels) if kind.channels else train
-    samples = make_samples(data, FitConfig(), Variant(), kind, split)
+    samples = make_samples(data, FitConfig(), Variant(), kind, train)
     try:
         fitted = kind.fit_folds(samples, Job("", Path()))
     except ModelError:
@@ -220,16 +219,12 @@ def make_energy_table(
         networks[ALL_LAYERS_PER_CLASS] = _train_by_class(ours, trained, "class", Variant())
         if "height" in data.card.layers:
             of_height = Variant(channels=("height",), energy_only=True)
-            networks[PER_CLASS] = _train_by_class(ours, trained, "wei_isler_class", of_height)
-            grass = {entry.id for entry in ours.card.class_table.classes if entry.name == "grass"} & networks[
-                PER_CLASS
-            ].keys()
-            networks[GRASS_ONLY] = {class_id: networks[PER_CLASS][class_id] for class_id in grass}
-    known = (
-        set.intersection(*(set(class_names) for name, class_names in networks.items() if name != GRASS_ONLY))
-        if networks
-        else set()
-    )
+            per_class = _train_by_class(ours, trained, "wei_isler_class", of_height)
+            grass = {entry.id for entry in ours.card.class_table.classes if entry.name == "grass"}
+            networks[PER_CLASS] = per_class
+            networks[GRASS_ONLY] = {class_id: network for class_id, network in per_class.items() if class_id in grass}
+    own = [set(by_class) for name, by_class in networks.items() if name != GRASS_ONLY]
+    known = set.intersection(*own) if own else set()
     errors, results = dict[str, dict[str, Errors]](), list[BaselineResult]()
     for split, part in sets.items():
         rows = np.flatnonzero(np.isin(part.class_ids, list(known)) | (not known))

@@ -48,7 +48,7 @@ from tcpipe.learning.metrics import (
     compute_costs,
     compute_errors,
     compute_errors_by_class,
-    label_floor,
+    compute_label_floor,
 )
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import (
@@ -124,9 +124,8 @@ def evaluate(
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
         few = int((select_train(data, variant).column("fold") != fitting.fold).sum())
-        longer = np.ceil(fitted / fitting.batch_size) / np.ceil(
-            few / fitting.batch_size
-        )  # as many steps, not as many epochs
+        # as many steps, not as many epochs
+        longer = np.ceil(fitted / fitting.batch_size) / np.ceil(few / fitting.batch_size)
         rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
         train(dataset, place, config=rules, variant=variant, predictor=predictor)
         return load_model(place, predictor)
@@ -141,11 +140,11 @@ def evaluate(
         model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
         dataset=EvaluatedDataset(data.card.name, compute_dataset_checksum(data.card), data.card.splits),
         config=config,
-        splits={name: _split_errors(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
+        splits={name: _measure_split(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
         ablation=tuple(ablation),
         energy=energy,
         networks=tuple(networks),
-        time=_time(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
+        time=_compare_times(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
         baselines=tuple(baselines),
         blocks=compute_block_errors(ours, names),
         repeatability=_estimate_repeatability(data.card, ENERGIES[ours.card.label_energy]),
@@ -164,19 +163,19 @@ def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floo
     return {quantity: found.get(column) for quantity, column in columns.items()}
 
 
-def _split_errors(
+def _measure_split(
     data: Dataset, found: Measured, said: Predicted, spreads: Mapping[str, Spread], plant: PlantCosts | None
 ) -> SplitErrors:
-    def errors_of(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
+    def compute_by_class(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
         return compute_errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
 
-    runs, uncentred = found.split.column("run_id"), errors_of(said.uncentred)
+    runs, uncentred = found.split.column("run_id"), compute_by_class(said.uncentred)
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
         samples=len(found.split),
         classes=counts,
         class_order=tuple(counts),
-        errors=errors_of(said.costs, spreads),
+        errors=compute_by_class(said.costs, spreads),
         coverage={
             quantity: measure_coverage(
                 (spread.low <= found.costs[quantity]) & (found.costs[quantity] <= spread.high), runs
@@ -185,8 +184,8 @@ def _split_errors(
         },
         uncentred={quantity: by_class[ALL] for quantity, by_class in uncentred.items()},
         leakage=measure_leakage(data, found.split),
-        label_floor=label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
-        simulation_floor=None if plant is None else errors_of(plant(found.split)),
+        label_floor=compute_label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
+        simulation_floor=None if plant is None else compute_by_class(plant(found.split)),
     )
 
 
@@ -230,7 +229,9 @@ def _find_fastest_mps(robot: str, data: Dataset) -> float | None:
     return known.get(robot, Robot()).max_velocity_mps
 
 
-def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
+def _compare_times(
+    ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None
+) -> dict[str, dict[str, Errors]]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's maximum speed."""
     found = {OURS: {name: _compute_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:

@@ -56,8 +56,7 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
     rows, splits = find_worst_rows(table, _WORST), to_texts(table.column("split"))
     first = [np.flatnonzero(splits == name)[:_MOST_SHOWN] for name in dict.fromkeys(splits.tolist())]
     shown, split = np.unique(np.concatenate([*first, rows])), splits[rows]
-    # A layer of several bands has no picture.
-    plain = tuple(name for name, layer in data.card.layers.items() if "bands" not in layer)
+    plain = tuple(name for name, layer in data.card.layers.items() if "bands" not in layer)  # several make no picture
     parts: list[Pixels] = []
     for name in dict.fromkeys(split.tolist()):
         ids, view = table.column("sample_id").take(pa.array(rows[split == name])), data[name].view

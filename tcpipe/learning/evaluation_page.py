@@ -111,8 +111,8 @@ def _make_baselines_section(found: Evaluation) -> Section:
         own = (found.splits[split].errors[quantity][ALL] for split in splits)
         rows.append((quantity, "the model", *(_format_figure(error, "rmse", quantity) for error in own)))
         for name in names:
-            baselines = (by_cell.get((name, split, quantity)) for split in splits)
-            cells = (_format_figure(None if row is None else row.errors, "rmse", quantity) for row in baselines)
+            results = (by_cell.get((name, split, quantity)) for split in splits)
+            cells = (_format_figure(None if row is None else row.errors, "rmse", quantity) for row in results)
             rows.append(("", name, *cells))
     header = ("", "", *(f"{split}, RMSE" for split in splits))
     text = (
@@ -245,13 +245,13 @@ def _make_other_sections(found: Evaluation) -> list[Section]:
     )
     if not found.networks:
         networks += "They are trained only if the model is a network."
-    predictors = (OURS, ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY)
-    energies = {name: found.energy[name] for name in predictors if name in found.energy}
-    times = {name: found.time[name] for name in (EXPECTED,) if name in found.time}
+    compared = (OURS, ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY)
+    others = {name: found.energy[name] for name in compared if name in found.energy}
+    times = {EXPECTED: found.time[EXPECTED]} if EXPECTED in found.time else {}
     of_time = "The expected time is d / v at the robot's maximum speed."
     return [
         _make_other_section("Table III: ablation, E", noise, found, "E", ablation),
-        _make_other_section("Table IV: energy, one network or one per class", networks, found, "E", energies),
+        _make_other_section("Table IV: energy, one network or one per class", networks, found, "E", others),
         _make_other_section("Table V: time against the expected time", of_time, found, "T", times),
     ]
 
@@ -261,13 +261,13 @@ def _make_other_section(
     text: str,
     found: Evaluation,
     quantity: Literal["E", "T"],
-    errors_by_predictor: Mapping[str, Mapping[str, Errors]],
+    errors: Mapping[str, Mapping[str, Errors]],
 ) -> Section:
-    """Return errors of a quantity on every split by predictor, beside the paper's."""
+    """Return errors of a quantity by predictor, on every split, beside the paper's."""
     splits = found.ordered_splits
     rows: list[tuple[str, ...]] = []
-    for name, errors in errors_by_predictor.items():
-        figures = [_format_figures(errors.get(split), quantity) for split in splits]
+    for name, by_split in errors.items():
+        figures = [_format_figures(by_split.get(split), quantity) for split in splits]
         rows.append((name, "", *(figure for pair in figures for figure in pair)))
         if name in PAPER:
             pairs = [PAPER[name][SPLITS.index(split)] for split in splits]

@@ -129,23 +129,23 @@ def compute_errors_by_class(
     spreads : what is stated of the predictions' errors, by quantity.
     """
 
-    def errors_of(quantity: str, rows: NDArray[np.bool_]) -> Errors:
+    def compute_rows(quantity: str, rows: NDArray[np.bool_]) -> Errors:
         spread = (spreads or {}).get(quantity)
         said, true = predicted[quantity][rows], measured[quantity][rows]
         return compute_errors(said, true, LEAST[quantity], spread and spread.take(rows))
 
-    return {quantity: _group_by_class(partial(errors_of, quantity), class_ids, names) for quantity in predicted}
+    return {quantity: _group_by_class(partial(compute_rows, quantity), class_ids, names) for quantity in predicted}
 
 
 def _group_by_class(
-    errors_of: Callable[[NDArray[np.bool_]], Errors], class_ids: NDArray[np.int64], names: Mapping[int, str]
+    compute: Callable[[NDArray[np.bool_]], Errors], class_ids: NDArray[np.int64], names: Mapping[int, str]
 ) -> dict[str, Errors]:
-    """Return errors by the name of each class that occurs, and of `ALL`."""
+    """Return what is computed of rows, by the name of each class that occurs, and of `ALL`."""
     rows = {name: class_ids == class_id for class_id, name in names.items()} | {ALL: np.ones(len(class_ids), np.bool_)}
-    return {name: errors_of(here) for name, here in rows.items() if here.any() or name == ALL}
+    return {name: compute(here) for name, here in rows.items() if here.any() or name == ALL}
 
 
-def label_floor(
+def compute_label_floor(
     deviations: Costs, measured: Costs, class_ids: NDArray[np.int64], names: Mapping[int, str]
 ) -> dict[str, dict[str, Errors]]:
     """Return the errors that a perfect prediction would have for the labels' own deviations, shape (N,) each.
@@ -153,13 +153,13 @@ def label_floor(
     The labels' errors are taken as Gaussian: a mean absolute error of sqrt(2 / pi) deviations.
     """
 
-    def floor_of(quantity: str, rows: NDArray[np.bool_]) -> Errors:
+    def compute_rows(quantity: str, rows: NDArray[np.bool_]) -> Errors:
         label, std = measured[quantity][rows], deviations[quantity][rows]
         large = label >= LEAST[quantity]
         mape = 100.0 * np.sqrt(2.0 / np.pi) * float(np.mean(std[large] / label[large])) if large.any() else None
         return Errors(len(std), float(np.sqrt(np.mean(std**2))) if len(std) else None, mape, int(large.sum()))
 
-    return {quantity: _group_by_class(partial(floor_of, quantity), class_ids, names) for quantity in deviations}
+    return {quantity: _group_by_class(partial(compute_rows, quantity), class_ids, names) for quantity in deviations}
 
 
 def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dict[str, Array]:

@@ -40,7 +40,7 @@ class LayerRange:
     """Of all training samples and bands, how far from the mean, in standard deviations."""
 
     @classmethod
-    def of(cls, values: NDArray[np.float64]) -> LayerRange:
+    def estimate(cls, values: NDArray[np.float64]) -> LayerRange:
         """Return the range of patches, shape (N, bands)."""
         mean, std = values.mean(axis=0), values.std(axis=0)
         plain = cls(tuple(mean.tolist()), tuple(np.maximum(std, _LEAST_SHARE * np.abs(mean) + 1e-9).tolist()), 0.0)
@@ -57,7 +57,7 @@ _LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TrainingRange:
-    """What the training samples held: beyond it a model has no business."""
+    """What the training samples held; predictions beyond it are extrapolations."""
 
     class_counts: Mapping[int, int]
     """Samples by their terrain class."""

@@ -91,6 +91,10 @@ class Model:
         """What held-out samples show of its errors; None of too few."""
         return fit_errors(self.residuals)
 
+    @cached_property
+    def _correlation(self) -> float:
+        return estimate_correlation(self.residuals)
+
     def ask(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
         """Return what the predictor says of patches in [0, 1], shape (N, px, px, depth), and the covariances that it states.
 
@@ -127,7 +131,7 @@ class Model:
             for name, value, stated_std in zip(("power", "velocity"), said.mean.T, stated, strict=True)
         ])  # fmt: skip
         covariance = std.T[:, :, None] * std.T[:, None, :]
-        covariance[:, [0, 1], [1, 0]] *= estimate_correlation(self.residuals)
+        covariance[:, [0, 1], [1, 0]] *= self._correlation
         return Prediction(said.mean, covariance)
 
 
@@ -150,6 +154,11 @@ def load_model(path: str | Path, predictor: str | None = None) -> Model:
     ----------
     path : its folder, or the URL of one in a bucket.
     predictor : ``FILE.py[:NAME]`` or entry point of the code of a model that was trained with one; it is run.
+
+    Raises
+    ------
+    UsageError : there is no model, or the model needs its code and gets none, or the other way round.
+    ModelError : a file is damaged or missing, it is of another schema, or the code fails.
     """
     place = fetch_directory(path)
     card = read_model_card(place)
@@ -226,7 +235,7 @@ def set_physics(model: Model, dataset: str | Path) -> Model:
 
 
 def read_model_card(place: Path) -> ModelCard:
-    """Return model.json of a folder; `ModelError` says what the folder is otherwise."""
+    """Return model.json of a folder; `UsageError` where there is none, `ModelError` where it is damaged or of another schema."""
     if not place.is_dir():
         raise UsageError(f"{place}: there is no such model; run 'tcpipe train' first")
     where = place / CARD

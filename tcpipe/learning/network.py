@@ -13,7 +13,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -89,6 +89,14 @@ class Network(nn.Module):
         """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
         return {name: value.numpy(force=True).copy() for name, value in self._list_weights().items()}
 
+    @classmethod
+    def from_arrays(cls, *sizes: int, arrays: Arrays) -> Self:
+        """Return a network of these sizes with its weights; `ModelError` if they are another's, before memory is taken."""
+        with torch.device("meta"):
+            network = cls(*sizes)
+        network.load(arrays)
+        return network
+
     def load(self, arrays: Arrays) -> None:
         """Put weights in, on the device that there is; `ModelError` if they are another network's."""
         forms = {name: ("float32", tuple(value.shape)) for name, value in self._list_weights().items()}
@@ -137,14 +145,6 @@ def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Seq
     nn.init.normal_(network.head.weight, 0.0, 0.01, generator=drawn)
     network.head.bias.data[:] = torch.tensor(list(start))
     made: ResNet18 = network.to(find_device(), memory_format=torch.channels_last)
-    return made
-
-
-def load_network(network: type[Network], *sizes: int, arrays: Arrays) -> Network:
-    """Return a network of these sizes with its weights; `ModelError` if they are another's, before memory is taken."""
-    with torch.device("meta"):
-        made = network(*sizes)
-    made.load(arrays)
     return made
 
 

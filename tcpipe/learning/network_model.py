@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,9 +131,9 @@ class NetworkModel(Predictor):
         """Return the network with these weights; its width is that of the first ones."""
         sizes = inputs.depth, len(inputs.outputs), arrays.get("stem_convolution/kernel", np.empty(0)).shape[-1]
         check_trainable(*sizes)
-        from tcpipe.learning.network import ResNet18, load_network  # noqa: PLC0415  torch takes seconds and half a gigabyte
+        from tcpipe.learning.network import ResNet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
 
-        return cls(cast("ResNet18", load_network(ResNet18, *sizes, arrays=arrays)), inputs)
+        return cls(ResNet18.from_arrays(*sizes, arrays=arrays), inputs)
 
     @classmethod
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:

@@ -151,7 +151,7 @@ def predict_spreads(model: Model, said: Predicted, class_ids: NDArray[np.int64])
         errors, d = (
             model.errors[CALLED[quantity]],
             model.card.chord_m if quantity in "TE" else 1.0,
-        )  # of a metre's errors
+        )  # errors are of a metre
         ground = costs / d, class_ids, said.stated[quantity] / d
         low, high = errors.compute_intervals(*ground)
         found[quantity] = Spread(d * errors.compute_std(*ground), d * low, d * high)

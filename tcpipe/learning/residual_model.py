@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,16 +80,16 @@ class ResidualModel(Predictor):
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> ResidualModel:
         """Return the model of these arrays."""
         require_torch()
-        from tcpipe.learning.network import SmallNetwork, load_network  # noqa: PLC0415
+        from tcpipe.learning.network import SmallNetwork  # noqa: PLC0415
 
         outputs = len(inputs.outputs)
         forms = {**list_curve_arrays(outputs), "scale": ("float64", (outputs,))}
         weights = {name: array for name, array in arrays.items() if name not in forms}
-        network = load_network(SmallNetwork, inputs.depth, outputs, arrays=weights)
+        network = SmallNetwork.from_arrays(inputs.depth, outputs, arrays=weights)
         rest = {name: array for name, array in arrays.items() if name in forms}
         check_arrays(rest, forms)
         curves, rest = read_curves("linear", rest)
-        return cls(curves, cast("SmallNetwork", network), rest["scale"], inputs)
+        return cls(curves, network, rest["scale"], inputs)
 
 
 def _add_planes(inputs: Inputs, patches: Any, labels: Any, weights: Any) -> tuple[Patches, Patches, Patches]:

@@ -117,8 +117,7 @@ def choose_kind(data: Dataset, config: FitConfig, variant: Variant, split: Split
     for name in AUTOMATIC:
         kind = find_kind(name)
         try:
-            train = split.with_channels(*kind.channels) if kind.channels else split
-            samples = make_samples(data, config, variant, kind, train)
+            samples = make_samples(data, config, variant, kind, split)
             losses[name] = _compute_losses(samples, cross_predict(kind, samples, part).mean)
         except ModelError as error:
             logger.info("%s is not compared: %s", name, error.problems[0])
@@ -234,9 +233,8 @@ def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -
         *(name for name in LAYERS if name in named),
         *(name for name in data.card.layers if name in named - {*LAYERS}),
     ]
-    unused = [
-        name for name in data.card.layers if name not in taken and name not in COLOURS
-    ]  # colours of the grey ortho
+    shown = {*taken, *COLOURS}  # the grey ortho is of its colours
+    unused = [name for name in data.card.layers if name not in shown]
     logger.info("%s: layers: %s; not used: %s", data.path, ", ".join(channels), ", ".join(unused) or "none")
     if own := [] if is_chosen else [name for name in unused if name not in PAPER_LAYERS]:
         message = "%s: the model does not use %s; to use it: --layers %s"
@@ -268,8 +266,12 @@ def select_train(data: Dataset, variant: Variant, kind: type[Predictor] = Predic
 def make_samples(
     data: Dataset, rules: FitConfig, variant: Variant, kind: type[Predictor], train: Split | None = None
 ) -> Samples:
-    """Return what a model of a kind is fitted to: of ``train`` as it is, or of all that `select_train` finds."""
-    needs_folds, train = train is None, select_train(data, variant, kind) if train is None else train
+    """Return what a model of a kind is fitted to: labelled samples ``train``, or all that `select_train` finds, which need folds."""
+    needs_folds = train is None
+    if train is None:
+        train = select_train(data, variant, kind)
+    elif kind.channels:
+        train = train.with_channels(*kind.channels)
     outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
     folds = train.column("fold")
     fitted = train.take(folds != rules.fold)
@@ -284,10 +286,10 @@ def make_samples(
         )
     used = fitted if kind.stops_by_fold else train
     if rules.inverse_variance_weights and not variant.energy_only:
-        none = [label for label, weights in zip(outputs, used.weights.T, strict=True) if not weights.any()]
-        if none:
+        unstated = [label for label, weights in zip(outputs, used.weights.T, strict=True) if not weights.any()]
+        if unstated:
             raise DatasetError(
-                f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; "
+                f"{data.path}: no sample has a standard deviation of {', '.join(unstated)} to weigh it by; "
                 "train without --inverse-variance-weights"
             )
     extra_features: tuple[ExtraFeature, ...] = ()  # a network of energy alone takes none
@@ -337,7 +339,7 @@ def find_training_range(split: Split) -> TrainingRange:
     class_ids = split.column("terrain_class").astype(np.float64)
     ids, counts = np.unique(class_ids[np.isfinite(class_ids)].astype(int), return_counts=True)
     class_counts = dict(zip(ids.tolist(), counts.tolist(), strict=True))
-    own = {name: LayerRange.of(np.concatenate(parts)) for name, parts in sorted(means.items())}
+    own = {name: LayerRange.estimate(np.concatenate(parts)) for name, parts in sorted(means.items())}
     return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges, own)
 
 
@@ -418,9 +420,8 @@ def _make_residuals_table(samples: Samples, held_out: Prediction) -> pa.Table:
     held, said, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class", "fold")}
     if len(outputs) > 1:
-        columns |= make_residuals(
-            labels, said.mean, said.covariance
-        )  # what the labels have in common is in no residual
+        columns |= make_residuals(labels, said.mean, said.covariance)
+        # what the labels have in common is in no residual
         columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}
         columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
     else:

@@ -330,7 +330,7 @@ def test_ground_unlike_that_of_training_in_a_layer_of_one_s_own_is_named(models)
     other[:, 3] += 3.0 * (other[:, 3].max() - other[:, 3].min())
     assert (known.compute_distance(layer.compute_means(other)) > known.largest).all()
     classes = Layer("x", "categorical", "x", np.dtype(np.uint8), np.dtype(np.uint8), classes=PAPER_CLASSES)
-    seen = LayerRange.of(classes.compute_means(np.full((5, 2, 2), 4, np.uint8)))
+    seen = LayerRange.estimate(classes.compute_means(np.full((5, 2, 2), 4, np.uint8)))
     new = seen.compute_distance(classes.compute_means(np.array([[[4, 4], [4, 4]], [[4, 4], [4, 5]]], np.uint8)))
     assert (new > seen.largest).tolist() == [False, True]
 

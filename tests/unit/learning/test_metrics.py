@@ -16,7 +16,7 @@ from tcpipe.learning.metrics import (
     compare_errors,
     compute_errors,
     compute_errors_by_class,
-    label_floor,
+    compute_label_floor,
 )
 
 _VALUES = st.floats(20.0, 500.0)
@@ -61,7 +61,7 @@ def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
     rng = np.random.default_rng(5)
     truth, sigma = rng.uniform(100.0, 300.0, 200_000), rng.uniform(2.0, 9.0, 200_000)
     labels, ids = truth + sigma * rng.standard_normal(truth.size), np.full(truth.size, 4)
-    told = label_floor({"w": sigma}, {"w": labels}, ids, {4: "grass"})["w"][ALL]
+    told = compute_label_floor({"w": sigma}, {"w": labels}, ids, {4: "grass"})["w"][ALL]
     seen = compute_errors(truth, labels, LEAST["w"])
     assert told.rmse == pytest.approx(seen.rmse, rel=0.01)
     assert told.mape_percent == pytest.approx(seen.mape_percent, rel=0.01)

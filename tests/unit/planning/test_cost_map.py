@@ -16,7 +16,6 @@ from physics_model import PhysicsModel, energy_joule, power_watt, velocity_mps
 from planning_worlds import plane
 from ruamel.yaml import YAML
 
-from tcpipe.cost.prediction_errors import fit_errors
 from tcpipe.errors import MapError, ModelError, UsageError
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.pipeline.verify import verify
@@ -107,7 +106,7 @@ def test_bands_say_what_they_are_and_the_last_four_sum_up_the_courses(made):
     assert known[16] == known[:16].min()
     assert known[17] == pytest.approx(known[:16].mean(), rel=1e-6)
     assert known[18] == pytest.approx(ANGLES_DEG[known[:16].argmin()], rel=1e-6)
-    errors = fit_errors(MODEL.residuals)["energy"]
+    errors = MODEL.errors["energy"]
     assert known[19] == pytest.approx(errors.compute_std(known[:16], np.full(16, 4)).mean(), rel=1e-5)
     assert known[19] == pytest.approx(0.1 * known[17], rel=0.1)  # as its residuals were made
     downhill = np.degrees(np.arctan2(-0.1, -0.2)) % 360.0
