@@ -94,6 +94,12 @@ def standardize_features(inputs: Sequence[ExtraFeature], features: ExtraFeatures
     return _scale_values(inputs, {"turn_radpm": features.turn_radpm, "command_mps": features.command_mps})
 
 
+def standardize_columns(inputs: Sequence[ExtraFeature], columns: NDArray[np.floating]) -> Floats:
+    """Return the same from `COLUMNS`, shape (N, 4)."""
+    turn, command = _form_values(list(columns.T.astype(np.float64)))
+    return _scale_values(inputs, {"turn_radpm": turn, "command_mps": command})
+
+
 def _form_values(columns: Sequence[Floats]) -> tuple[Floats, Floats]:
     rate, duration, arc, command = columns
     return rate * duration / arc, command
@@ -117,5 +123,4 @@ def append_column_planes(
     inputs: Sequence[ExtraFeature], patches: NDArray[np.float32], columns: NDArray[np.floating]
 ) -> NDArray[np.float32]:
     """Return patches of a batch with a plane for each extra feature, from `COLUMNS` of the batch, shape (N, 4)."""
-    turn, command = _form_values(list(columns.T.astype(np.float64)))
-    return append_planes(patches, _scale_values(inputs, {"turn_radpm": turn, "command_mps": command}))
+    return append_planes(patches, standardize_columns(inputs, columns))
