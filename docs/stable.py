@@ -25,6 +25,7 @@ from tcpipe.pipeline.maps import AddedMap
 from tcpipe.planning.drives import DrivesResult
 from tcpipe.planning.path_cost import PATH_SEGMENTS
 from tcpipe.planning.path_files import PathResult, PlanResult
+from tcpipe.tables.columns import Column
 from tcpipe.tables.levels import LABELLED_SEGMENTS, MASKED_TRACK, REJECTIONS, SAMPLES, STREAMS
 from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_COLUMNS, EARLIER_KEYS
 
@@ -55,7 +56,7 @@ def describe_stable() -> dict[str, list[str]]:
         "commands": [line for name, command in cli.commands.items() for line in _iterate_options(name, command)],
         "recipe": recipe + [f"{key} = {name}" for key, name in EARLIER_KEYS.items()],
         "columns": [
-            line for table in _TABLES for column in table.columns for line in _describe_column(table.name, column)
+            line for table in _TABLES for column in table.columns for line in _iterate_column(table.name, column)
         ] + [f"{earlier} = {name}" for earlier, name in EARLIER_COLUMNS.items()],
         "documents": [f"{name}: {key}" for name, found in sorted(keys.items()) for key in found],
     }  # fmt: skip
@@ -72,7 +73,7 @@ def _iterate_python() -> Iterator[str]:
         yield name
         if inspect.isroutine(function := getattr(tcpipe, name)):
             parameters = inspect.signature(function).parameters.values()
-            yield from (f"{name}({of.name}{'' if of.default is of.empty else '='})" for of in parameters)
+            yield from (f"{name}({each.name}{'' if each.default is each.empty else '='})" for each in parameters)
     for cls in _RESULTS:
         fields = getattr(cls, "__dataclass_fields__", {})
         yield from (f"{cls.__name__}.{name}" for name in sorted({*dir(cls), *fields}) if not name.startswith("_"))
@@ -89,14 +90,14 @@ def _iterate_options(name: str, command: click.Command) -> Iterator[str]:
             flags.append(parameter.earlier)
         choices = [*parameter.type.choices] if isinstance(parameter.type, click.Choice) else []
         choices += [earlier for earlier, choice in EARLIER_CHOICES.items() if choice in choices]
-        for flag in (
-            flags if isinstance(parameter, click.Option) else [str(parameter.make_metavar(click.Context(command)))]
-        ):
+        if not isinstance(parameter, click.Option):
+            flags = [str(parameter.make_metavar(click.Context(command)))]
+        for flag in flags:
             yield f"{name} {flag}"
             yield from (f"{name} {flag} {choice}" for choice in choices)
 
 
-def _describe_column(table: str, column: Any) -> Iterator[str]:
+def _iterate_column(table: str, column: Column) -> Iterator[str]:
     unit = f" [{column.unit}]" if column.unit else ""
     yield f"{table}.{column.name}: {column.dtype}{unit}"
     for bit in column.flags or ():
@@ -116,10 +117,8 @@ def _iterate_keys(
     for key, value in schema.get("properties", {}).items():
         yield f"{path}{key}"
         yield from _iterate_keys(value, file, schemas, f"{path}{key}.", above)
-    for word, place in (("items", "[]."), ("additionalProperties", "*.")):
+    for word, below in (("items", f"{path.rstrip('.')}[]."), ("additionalProperties", f"{path}*.")):
         if isinstance(value := schema.get(word), dict):
-            yield from _iterate_keys(
-                value, file, schemas, f"{path.rstrip('.')}[]." if place == "[]." else f"{path}*.", above
-            )
+            yield from _iterate_keys(value, file, schemas, below, above)
     for choice in schema.get("anyOf", ()):
         yield from _iterate_keys(choice, file, schemas, path, above)

@@ -150,7 +150,7 @@ _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
 _SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
 _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
-_TOLD_S = 10.0  # the share told is that of the change over so long
+_SHARE_S = 10.0  # the share of the data is that of the change over so long
 _ROUNDS = 16  # of which the first half takes medians
 _GATE = 9.0  # of z², afterwards
 _TRUNCATED = 0.9733  # mean of z² below the gate
@@ -322,7 +322,7 @@ class _Fit:
         return dict(zip(self._names, self._variances.tolist(), strict=True))
 
     def find_density(self, name: str, prior: float) -> tuple[float, float]:
-        """Return a density, and its share told; the larger of fit and prior where the data tell less than half of it."""
+        """Return a density, and the data's share of it; the larger of fit and prior where that is less than half."""
         if name not in self._names:
             return prior, 0.0
         row = self._names.index(name)
@@ -340,16 +340,16 @@ class _Fit:
             return prior
         factors = np.zeros(len(self._names))
         for tau, row, _ in parts:
-            factors[row] = -2.0 * np.expm1(-_TOLD_S / tau)
+            factors[row] = -2.0 * np.expm1(-_SHARE_S / tau)
         data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         shape = np.zeros((_SUMMARY_S.size, len(self._names)))
         for tau, row, _ in parts:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
         unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
         fitted = shape @ self._variances + _CAUTION * unsure
-        untold = (self._longest_s < _SUMMARY_S) | (data_share < DETERMINED)
+        undetermined = (self._longest_s < _SUMMARY_S) | (data_share < DETERMINED)
         return _summarize(
-            np.where(untold, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), data_share
+            np.where(undetermined, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), data_share
         )
 
     def find_parts(self, *names: str) -> list[tuple[float, int, float]]:
@@ -446,7 +446,7 @@ def _share_process(process: GaussMarkov, tau_s: float, taus_s: Sequence[float]) 
 def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
     """Return the process whose structure function is nearest to one at `_SUMMARY_S`, in the logarithm."""
     if not (structure > 0.0).all():
-        return GaussMarkov(0.0, _TOLD_S, data_share)
+        return GaussMarkov(0.0, _SHARE_S, data_share)
     shape = -2.0 * np.expm1(-_SUMMARY_S / _SUMMARY_TAU_S[:, None])
     ratio = np.log(structure / shape)
     best = int(np.argmin(ratio.std(1)))
@@ -521,10 +521,10 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
         if fixes is not None:
             correlated = fixes.correlated.difference_variance(_TIME_S)
             fitted = [
-                (2.0 * fixes.white_m2 + 0.0 * _TIME_S, fixes.white_data_share),
+                (np.full_like(_TIME_S, 2.0 * fixes.white_m2), fixes.white_data_share),
                 (correlated, fixes.correlated.data_share),
             ]
-            found[name] = _make_facts("m", fitted, 2.0 * fixes.claimed_m2 + 0.0 * _TIME_S)
+            found[name] = _make_facts("m", fitted, np.full_like(_TIME_S, 2.0 * fixes.claimed_m2))
     for role, odometry in m.odometries().items():
         speed_mps, own = np.abs(odometry.velocity_mps[:, 0]), noise.odometries[role]
         driving = speed_mps > _DRIVING_MPS
@@ -554,7 +554,7 @@ def _sum_white(stamp_ns: NDArray[np.int64], variance: Floats) -> Floats:
 
 
 def _make_facts(unit: str, fitted: Sequence[tuple[Floats, float]], claimed: Floats) -> NoiseFacts:
-    """Return the facts of variances over each time, each with the share of it that the data tell."""
+    """Return the facts of variances over each time, each with the share of it that the data determine."""
     whole = np.sum([variance for variance, _ in fitted], axis=0)
     from_data = np.sum([share * variance for variance, share in fitted], axis=0) / whole
     rows = (np.sqrt(whole), np.sqrt(claimed), from_data)

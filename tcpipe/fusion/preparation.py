@@ -512,10 +512,10 @@ def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, qua
     if moving.sum() < _FEWEST:
         return False
     turned = rotate(quat, measured_mps)
-    as_told, as_turned = (
+    as_stated, as_turned = (
         _compute_misfit((v[1:] + v[:-1])[good, :2] / 2.0, way, moving) for v in (measured_mps, turned)
     )
-    return as_told < _FITS and as_turned > _FITS_NOT
+    return as_stated < _FITS and as_turned > _FITS_NOT
 
 
 def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:

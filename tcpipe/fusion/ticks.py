@@ -115,8 +115,8 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         count = np.bincount(at, minlength=size)
         has_samples, width = count > 0, values.shape[1]
 
-        def mean(values_: Floats) -> Floats:
-            return np.bincount(at, values_, size)[has_samples] / count[has_samples]
+        def mean(samples: Floats) -> Floats:
+            return np.bincount(at, samples, size)[has_samples] / count[has_samples]
 
         for axis in range(width):
             value[has_samples, kind, axis] = mean(values[:, axis])

@@ -189,33 +189,33 @@ def filter_forward(
     nis = [np.full(source.stamp_ns.size, np.nan) for source in sources]
     outcome = [np.full(source.stamp_ns.size, NOT_RUN, np.int8) for source in sources]
     rejected_since_ns: list[list[int]] = [[] for _ in sources]
-    for stamp_ns, event, row in _iterate_events([*(source.stamp_ns for source in sources), output_ns]):
+    for stamp_ns, series, row in _iterate_events([*(source.stamp_ns for source in sources), output_ns]):
         ukf.advance(q, (stamp_ns - clock_ns) * 1e-9)
         clock_ns = stamp_ns
-        if event == len(sources):
+        if series == len(sources):
             states[row], variances[row] = ukf.x, np.diag(ukf.P)
             if row == output_ns.size - 1:
                 break
             continue
-        source, rejected = sources[event], rejected_since_ns[event]
-        nis[event][row] = ukf.fuse(source, row, gates[event])
-        outcome[event][row] = ACCEPTED
-        if nis[event][row] <= gates[event]:
+        source, rejected = sources[series], rejected_since_ns[series]
+        nis[series][row] = ukf.fuse(source, row, gates[series])
+        outcome[series][row] = ACCEPTED
+        if nis[series][row] <= gates[series]:
             rejected.clear()
             continue
-        outcome[event][row] = REJECTED
+        outcome[series][row] = REJECTED
         rejected.append(stamp_ns)
         if len(rejected) >= _LOCKOUT_COUNT and stamp_ns - rejected[0] >= _LOCKOUT_S * 1e9:
             ukf.open_up(source, row)
             ukf.fuse(source, row, math.inf)
-            outcome[event][row] = RECOVERED
+            outcome[series][row] = RECOVERED
             rejected.clear()
     return ForwardResult(states, variances, nis, outcome)
 
 
 def _iterate_events(stamps_ns: Sequence[NDArray[np.int64]]) -> Iterator[tuple[int, int, int]]:
     """Yield stamp [ns], series and row in order of time; of one stamp, the earlier series first."""
-    return merge(*(zip(map(int, stamps), repeat(event), count()) for event, stamps in enumerate(stamps_ns)))
+    return merge(*(zip(map(int, stamps), repeat(series), count()) for series, stamps in enumerate(stamps_ns)))
 
 
 def predict_states(x: _Array, dt: float) -> _Array:

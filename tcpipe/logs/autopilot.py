@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
-from tcpipe.logs.fix_quality import classify_fixes, find_status
-from tcpipe.logs.messages import GNSS, Columns
+from tcpipe.logs.fix_quality import Columns, classify_fixes, find_status
+from tcpipe.logs.messages import GNSS
 from tcpipe.logs.roles import GPS_FIXES
 from tcpipe.logs.topics import AutopilotKind
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -320,7 +320,7 @@ _SOURCES: dict[str, dict[str, tuple[str, _Convert]]] = {
 """Names of messages, best first, and how they are converted, by autopilot and topic."""
 
 _BESIDE = "GPA STER rover_rate_setpoint"
-CONVERTED = {name for columns in _SOURCES.values() for names, _ in columns.values() for name in names.split()} | {
+CONVERTED = {name for sources in _SOURCES.values() for names, _ in sources.values() for name in names.split()} | {
     *_BESIDE.split()
 }
 """Names of messages that are read here."""

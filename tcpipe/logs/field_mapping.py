@@ -206,7 +206,7 @@ def find_other_unit(expression: Expression, unit: str) -> str | None:
     """Return the unit that an expression's columns state, if it is not the field's own but of its quantity (for rad/s also a speed's)."""
     others = UNITS[unit] | (UNITS["m/s"] if unit == "rad/s" else {})
     named = [split_unit(column)[1] for column, _ in expression.operands()]
-    return next((unit for unit in named if unit and others.get(unit, 1.0) != 1.0), None)
+    return next((stated for stated in named if stated and others.get(stated, 1.0) != 1.0), None)
 
 
 def _choose_factor(unit: str, expression: Expression, name: str, units: Mapping[str, str] | None) -> float | str:
@@ -411,11 +411,11 @@ def list_number_fields(topic: Topic) -> list[str]:
 
 
 def _iterate_below(messages: Mapping[str, FieldTypes], type_name: str, prefix: str = "") -> Iterator[str]:
-    for name, message in messages.get(type_name, ()):
-        dotted = f"{prefix}{name}{'' if message.length is None else '[]'}"
+    for name, field_type in messages.get(type_name, ()):
+        dotted = f"{prefix}{name}{'' if field_type.length is None else '[]'}"
         if dotted.count("[]") > 1:
             continue
-        if message.name in BASE_TYPES - {"string", "wstring"}:
+        if field_type.name in BASE_TYPES - {"string", "wstring"}:
             yield dotted
         elif dotted.count(".") < _DEEPEST:
-            yield from _iterate_below(messages, message.name, f"{dotted}.")
+            yield from _iterate_below(messages, field_type.name, f"{dotted}.")

@@ -20,6 +20,7 @@ from tcpipe.logs import roles
 from tcpipe.logs.extrinsics import is_base
 from tcpipe.logs.fix_quality import (
     NO_HEIGHT_M2,
+    Columns,
     add_quality_std,
     classify_fixes,
     classify_status,
@@ -30,7 +31,6 @@ from tcpipe.logs.nmea import add_date, read_gga, read_over_ground
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
-Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -314,8 +314,8 @@ def _compute_course_velocity(speed: Floats, course_rad: Floats, var: Floats) -> 
 def _read_velocity_sentences(columns: Columns) -> Readings:
     texts = [str(sentence) for sentence in columns["sentence"]]
     ground_velocity, gga = read_over_ground(texts), read_gga(texts)
-    of_told = {name: values[ground_velocity.row] for name, values in columns.items()}
-    at_ns = of_told[LOG_TIME].astype(np.int64)
+    of_velocity = {name: values[ground_velocity.row] for name, values in columns.items()}
+    at_ns = of_velocity[LOG_TIME].astype(np.int64)
     time_of_day_ns = ground_velocity.time_of_day_ns
     if (
         ground_velocity.row.size and gga.row.size and (time_of_day_ns < 0).all()
@@ -339,7 +339,7 @@ def _read_velocity_sentences(columns: Columns) -> Readings:
         "not_finite": ~np.isfinite(over_ground.sum(-1)),
     }
     found = _select_rows(
-        of_told, values, drops, notes={"course_unknown": int((ground_velocity.speed_mps < _HELD_COURSE_MPS).sum())}
+        of_velocity, values, drops, notes={"course_unknown": int((ground_velocity.speed_mps < _HELD_COURSE_MPS).sum())}
     )
     own_time_ns = add_date(time_of_day_ns[found.row], found.log_time_ns)
     others = len(texts) - len(ground_velocity.row)

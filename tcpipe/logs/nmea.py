@@ -68,7 +68,7 @@ class OverGround:
 def read_gga(sentences: Sequence[str]) -> Gga:
     """Return the GGA sentences among ``sentences``."""
     row, broken, (time_ns, lat, lon, quality, *others) = _read(sentences, "GGA", _parse_gga, 7)
-    return Gga(row, broken, _whole(time_ns), lat, lon, _whole(quality), *others)
+    return Gga(row, broken, _to_integers(time_ns), lat, lon, _to_integers(quality), *others)
 
 
 def read_over_ground(sentences: Sequence[str]) -> OverGround:
@@ -76,7 +76,7 @@ def read_over_ground(sentences: Sequence[str]) -> OverGround:
     has_rmc = any(_SENTENCES["RMC"].search(text) for text in sentences)
     kind, parse = ("RMC", _parse_rmc) if has_rmc else ("VTG", _parse_vtg)
     row, broken, (time_ns, speed, course, status) = _read(sentences, kind, parse, 4)
-    return OverGround(row, broken, _whole(time_ns), speed, np.radians(course), _whole(status))
+    return OverGround(row, broken, _to_integers(time_ns), speed, np.radians(course), _to_integers(status))
 
 
 def _read(
@@ -100,7 +100,8 @@ def _split_fields(body: str, checksum: str | None) -> list[str]:
     return body.split(",")
 
 
-def _whole(values: Floats) -> Ints:
+def _to_integers(values: Floats) -> Ints:
+    """Return values as integers, -1 where there is none."""
     return np.where(np.isfinite(values), values, -1).astype(np.int64)
 
 
@@ -109,24 +110,29 @@ def _parse_gga(parts: list[str]) -> tuple[float, ...]:
     latitude = _parse_degrees(parts[2], 2) * {"N": 1.0, "S": -1.0, "": np.nan}[parts[3]]
     longitude = _parse_degrees(parts[4], 3) * {"E": 1.0, "W": -1.0, "": np.nan}[parts[5]]
     numbers = [float(text) if text else np.nan for text in (parts[6], parts[8], parts[9], parts[11])]
-    return _time_of_day_ns(parts[1]), latitude, longitude, *numbers
+    return _parse_time_of_day_ns(parts[1]), latitude, longitude, *numbers
 
 
 def _parse_rmc(parts: list[str]) -> tuple[float, ...]:
     """Return time of day [ns], speed [m/s], course [deg] and status."""
-    parts = [*map(str.strip, parts), *[""] * 3]
+    parts = _strip_and_pad(parts)
     status = _STATUS_OF_MODE.get(parts[12], -1) if parts[2] == "A" else -1
-    return _time_of_day_ns(parts[1]), _number(parts[7]) * KNOT_MPS, _number(parts[8]), status
+    return _parse_time_of_day_ns(parts[1]), _parse_number(parts[7]) * KNOT_MPS, _parse_number(parts[8]), status
 
 
 def _parse_vtg(parts: list[str]) -> tuple[float, ...]:
     """Return what `_parse_rmc` does; there is no time."""
-    parts = [*map(str.strip, parts), *[""] * 3]
-    speed = _number(parts[5]) * KNOT_MPS if parts[5] else _number(parts[7]) / 3.6
-    return -1, speed, _number(parts[1]), _STATUS_OF_MODE.get(parts[9], -1)
+    parts = _strip_and_pad(parts)
+    speed = _parse_number(parts[5]) * KNOT_MPS if parts[5] else _parse_number(parts[7]) / 3.6
+    return -1, speed, _parse_number(parts[1]), _STATUS_OF_MODE.get(parts[9], -1)
 
 
-def _number(text: str) -> float:
+def _strip_and_pad(parts: list[str]) -> list[str]:
+    """Return fields without blanks, and empty ones for the last three, which older sentences lack."""
+    return [*map(str.strip, parts), *[""] * 3]
+
+
+def _parse_number(text: str) -> float:
     """Return a speed or a course, NaN for an empty field; `ValueError` for what neither can be."""
     value = float(text) if text else np.nan
     if abs(value) > _VAST:
@@ -146,7 +152,7 @@ def _parse_degrees(text: str, degree_digits: int) -> float:
     return float(text[:degree_digits]) + float(text[degree_digits:]) / 60.0 if text else np.nan
 
 
-def _time_of_day_ns(text: str) -> int:
+def _parse_time_of_day_ns(text: str) -> int:
     """Return UTC since midnight [ns]; -1 where the field is empty or no time."""
     found = _TIME.match(text)
     if found is None:
@@ -159,7 +165,7 @@ def _time_of_day_ns(text: str) -> int:
 
 
 def add_date(time_of_day_ns: NDArray[np.int64], log_time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return UTC stamps [ns], 0 where the time of day is not known: on the day that keeps it nearest to the log's clock.
+    """Return UTC stamps [ns], shape (N,): on the day that keeps the time nearest to the log's clock; 0 where it is negative (unknown).
 
     A constant offset between both clocks, even one near half a day, keeps one sign throughout: the first row decides, and later rows stay
     within half a day of its offset.

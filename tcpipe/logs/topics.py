@@ -73,8 +73,8 @@ class Topic:
 class Damage:
     """A damaged place of a log, and what it cost where that is known.
 
-    ``cause`` is a code in the catalogue of findings, ``file`` of a directory its name and that of the file, ``places`` how many are counted
-    together, ``reason`` what the template of the cause needs beside numbers.
+    ``cause`` is a code in the catalogue of findings, ``file`` of a directory its name and that of the file, ``offset`` [byte] where in the
+    file, ``places`` how many are counted together, ``reason`` what the template of the cause needs beside numbers.
     """
 
     cause: str
@@ -281,7 +281,7 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
         return by_name[0], f"topic {by_name[1].name} has its name"
     for topic in listed:
         if topic.type_name == _POWER_OF_ANY_CLEARPATH:
-            if other := next((found for topic in listed if (found := _SERIAL_NUMBER.search(topic.name.lower()))), None):
+            if other := next((found for each in listed if (found := _SERIAL_NUMBER.search(each.name.lower()))), None):
                 return GENERIC, f"topics are named after the platform {other[1].upper()}, which has no profile"
             first = next((n for n, robot in robots.items() if robot.platform == _FIRST_TO_PUBLISH_IT), GENERIC)
             return first, f"topic {topic.name} is {topic.type_name}, and nothing names another platform"

@@ -105,7 +105,7 @@ def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
             return False
 
 
-def record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
+def make_record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
     """Make a record; how wide it unfolds follows from its fields."""
     return Record(name, fields, sum(count_leaves(field_type) for _, field_type in fields))
 

@@ -268,8 +268,9 @@ def read_classes(source: MapReader, grid: MapGrid) -> Classes:
 
 def make_survey(model: Model, source: MapReader, costs: CostGrid | float) -> LazyCostGrid:
     """Return a survey of which all is known, from a cost map, or of cells of this side [m] of which nothing is."""
-    is_known = isinstance(costs, CostGrid)
-    grid = costs if isinstance(costs, CostGrid) else make_empty_grid(make_grid(source, costs))
-    known = np.full((2, grid.grid.rows, grid.grid.cols), is_known)
-    frames = CellFrames(grid.grid, where=f"map {source.name}")
-    return LazyCostGrid(model, source, grid, known[0], known[1], frames)
+    is_known = True
+    if not isinstance(costs, CostGrid):
+        costs, is_known = make_empty_grid(make_grid(source, costs)), False
+    known = np.full((2, costs.grid.rows, costs.grid.cols), is_known)
+    frames = CellFrames(costs.grid, where=f"map {source.name}")
+    return LazyCostGrid(model, source, costs, known[0], known[1], frames)

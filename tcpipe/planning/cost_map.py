@@ -182,6 +182,9 @@ def make_cost_map(
     origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
         without.
     step : is told how many blocks of how many are done.
+
+    Raises `ModelError` or `MapError` where the map lacks what the model needs, is smaller than a cell or cannot be read; `UsageError` or
+    `StoreError` where ``out`` is something else or cannot be written, or the origin is far from the map.
     """
     check_model(model, source)
     key = make_cost_map_key(model, source, cell_size_m)

@@ -241,9 +241,10 @@ def iterate_predictions(
 
 
 def predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats) -> Prediction:
-    """Return what the model says of the patches that it is asked about, shape (N,), else NaN; tensors are formed in batches.
+    """Return power [W] and velocity [m/s] of N patches; NaN where the model is not asked, or predicts no motion.
 
-    ``turn_radpm`` is how far a metre of each turns; NaN is as usual, and so is the speed that is commanded.
+    ``asked`` and ``turn_radpm``, how far a metre of each turns (NaN: as usual), have shape (N,). The speed that is commanded is the
+    usual. Raises `ModelError` where the model gives something else than power and velocity.
     """
     form = model.card.layout
     pixels = {layer: patches.pixels[layer] for layer in form.layers}

@@ -329,6 +329,8 @@ def evaluate_drives(
 
     Where the dataset's runs were moved onto their map (``sample.align``), drives are moved together with
     those of them that are in the store, or a finding says why not.
+
+    Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
     """
     if is_url(out):
         with write_generation(str(out), JSON) as made:
@@ -373,11 +375,11 @@ def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Findin
         yield make_finding("no-drive-compared", model)
     for name, quantity in (("time", "duration_s"), ("energy", "energy_joule")):
         sums: dict[str, IntervalComparison] = {drive.run_id: getattr(drive, quantity) for drive in compared}
-        for run_id, sums_of_run in sums.items():
-            error = abs(sums_of_run.off_percent) / 100.0
+        for run_id, comparison in sums.items():
+            error = abs(comparison.off_percent) / 100.0
             if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
                 yield make_finding(f"{name}-far-off", Subject("run", run_id), error_fraction=error)
-        if held := [run_sums.held for run_sums in sums.values() if run_sums.held is not None]:
+        if held := [comparison.held for comparison in sums.values() if comparison.held is not None]:
             yield from find_miscalibration(measure_coverage(np.array(held), np.arange(len(held))), name, model)
     if 0 < len(compared) < read_threshold("few-drives", "min_drive_count"):
         yield make_finding("few-drives", model, drive_count=len(compared))

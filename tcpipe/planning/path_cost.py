@@ -128,6 +128,8 @@ def compute_path_cost(
     where : what the path is called in errors.
     known : metres of a run of the robot that is to drive the path.
     shortest_m : the least length of a path, without it that of a path segment.
+
+    Raises `PathError` where the path is too short, or nowhere on the map; `ModelError` where the map lacks what the model needs.
     """
     check_model(model, source)
     segments = _cut_into_segments(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
@@ -191,11 +193,9 @@ def _sum_costs(  # noqa: PLR0917
         raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
     if errors is not None:
         begin_m, rise_m = ELSEWHERE_M + np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
-        for name, distribution in found.items():
+        for name, predicted in found.items():
             std = segments.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
-            there = Metres(
-                distribution.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std
-            )
+            there = Metres(predicted.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std)
             found[name] = (
                 predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
             )
@@ -221,7 +221,7 @@ def _sum_costs(  # noqa: PLR0917
         reason_names=[" ".join(flag_names(int(value), Reason)) for value in said.reasons],
     )
     without_cost = int(table.column("duration_s").null_count)
-    sums = None if errors is None else {name: distribution.total for name, distribution in found.items()}
+    sums = None if errors is None else {name: adapted.total for name, adapted in found.items()}
     totals = PathTotals(
         model=model.name,
         map=source.name,

@@ -116,6 +116,9 @@ def plan_paths(
     allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
     risk : the probability with which a path shall take no more than what is least; None: its prediction is least.
     step : is told how many blocks of how many are looked at, or predicted, in each round.
+
+    Raises `PathError` where an end is off the map or on closed ground, or no path connects them; `ModelError` where the model states no
+    errors for ``risk``.
     """
     errors = survey.model.errors
     if risk is not None and errors is None:

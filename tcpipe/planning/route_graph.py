@@ -98,6 +98,9 @@ def write_route_graph(
     graph, store : the graph's file, or without one the store whose runs propose one.
     origin_deg : longitude and latitude where the graph's frame has x = y = 0, its axes those of the map's CRS; the CRS's own without.
     two_way : whether an edge is added for each that has none back.
+
+    Raises `PathError`, `ModelError` or `MapError` where the graph, the model or the map cannot be used; `UsageError` or `StoreError` where
+    ``out`` is the graph itself, has a wrong name or cannot be written, or the store has no runs on the map.
     """
     if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
         raise UsageError(f"{out}: expected the name of a file that ends in .geojson or .json")

@@ -222,7 +222,7 @@ class Turning:
     def energy_joule(
         self, turn_rad: Floats, length_m: Floats, class_id: NDArray[np.uint8], *, is_driven: bool = False
     ) -> Floats:
-        """Return what turns cost beyond the usual [J], shape (N,), of N path segments of path of these lengths on these classes.
+        """Return what turns cost beyond the usual [J], shape (N,), of N path segments of these lengths on these classes.
 
         A driven one may turn less than usual and cost less; a drawn one turns no less: nobody drives as straight as a line.
         """

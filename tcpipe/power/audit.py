@@ -103,7 +103,7 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
         return None
     volt, amp = np.mean([value[0] for value in values], axis=0), np.sum([value[1] for value in values], axis=0)
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
-    volt, amp = (values - _compute_moving_mean(values, rows) for values in (volt, amp))
+    volt, amp = (signal - _compute_moving_mean(signal, rows) for signal in (volt, amp))
     return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
 
 
@@ -153,7 +153,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     judged = {first: judge(first) for first in range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1)}
     first = max(judged, key=lambda at: judged[at][0])
     before, after = (
-        -float(by_volt[rows_].sum() / weight[rows_].sum()) for rows_ in (slice(first - 1), slice(first + 1, None))
+        -float(by_volt[blocks].sum() / weight[blocks].sum()) for blocks in (slice(first - 1), slice(first + 1, None))
     )
     is_sure = judged[first][0] > _SURE**2 and judged[first][1] > _GRADUAL**2
     least = read_threshold("current-gain-changes", "min_change_fraction")

@@ -240,9 +240,9 @@ def _read_joints(columns: Columns, source: PowerSource, topic: str) -> RailReadi
     watt = (motion.torque_nm * motion.speed_radps).sum(axis=1)
     if np.isnan(watt).all():
         return reject_power(topic, "joints-apart", names={"joints": ", ".join(motion.names)})
-    sign_name, net = sign_by_mean(watt, np.ones(len(watt)))
-    sign = {"drawn_positive": 1, "drawn_negative": -1, "auto": sign_name}[source.sign]
-    if not sign or sign_name == -sign:
+    mean_sign, net = sign_by_mean(watt, np.ones(len(watt)))
+    sign = {"drawn_positive": 1, "drawn_negative": -1, "auto": mean_sign}[source.sign]
+    if not sign or mean_sign == -sign:
         return reject_power(topic, "torque-against-motion" if sign else "sign-unknown", net_fraction=abs(net))
     found = compute_joint_power(motion, source, sign=sign)
     return RailReadings(source.rail or topic, np.full(len(watt), UNIT_VOLT), found.watt, joints=found)

@@ -256,8 +256,7 @@ page.start(async () => {
     "w, smallest first": (i) => -c.power[i],
   };
   fillSelect(at("sort"), Object.keys(orders).filter((name) => orders[name] !== undefined));
-  fillSelect(at("layer"), (sheets?.layers ?? []).map((layer) => layer.name));
-  if (sheets?.layers.some((layer) => layer.name === "ortho")) at("layer").value = "ortho";
+  page.fillLayers(at("layer"), sheets?.layers ?? []);
   function drawPage() {
     const key = orders[at("sort").value], rows = [...(filters.size ? selected : sheets?.rows ?? [])];
     if (key) {
@@ -318,11 +317,8 @@ page.start(async () => {
     make("a", "", { href, download: "sample_ids.csv" }).click();
   };
   at("copy-ids").onclick = () => {
-    const area = make("textarea", selected.map((i) => `${idOf(i)}\n`).join(""));
-    document.body.append(area);
-    area.select();
-    at("copy-ids").textContent = document.execCommand("copy") ? "Copied" : "The browser does not copy: download them";  // also in pages without a server
-    area.remove();
+    const isCopied = page.copy(selected.map((i) => `${idOf(i)}\n`).join(""));
+    at("copy-ids").textContent = isCopied ? "Copied" : "The browser does not copy: download them";
   };
   drawSelection();
 });

@@ -61,16 +61,9 @@ const page = (() => {
     repaint();
   });
 
-  document.querySelectorAll(".copy").forEach((button) => button.addEventListener("click", async () => {
-    const text = button.previousElementSibling.textContent;
-    try {
-      await navigator.clipboard.writeText(text);
-    } catch {  // a browser that allows it only to pages of a server
-      getSelection().selectAllChildren(button.previousElementSibling);
-      document.execCommand("copy");
-    }
-    button.textContent = "Copied";
-  }));
+  document.querySelectorAll(".copy").forEach((button) => {
+    button.onclick = () => { button.textContent = copy(button.previousElementSibling.textContent) ? "Copied" : "The browser does not copy"; };
+  });
 
   // What the pages' own scripts share.
   const model = (name) => figures ? Bokeh.documents[0].get_model_by_name(name) : null;
@@ -141,14 +134,27 @@ const page = (() => {
     fillSelect(at("ground"), [...names, "none"]);
     at("ground").onchange = () => names.forEach((name) => { model(`layer ${name}`).visible = name === at("ground").value; });
   }
+  // Copies a text and returns whether the browser did; pages without a server are not allowed to use `navigator.clipboard`.
+  function copy(text) {
+    const area = make("textarea", text), focused = document.activeElement;
+    document.body.append(area);
+    area.select();
+    const copied = document.execCommand("copy");
+    area.remove();
+    focused.focus({ preventScroll: true });
+    return copied;
+  }
+  function fillLayers(select, layers) {
+    fillSelect(select, layers.map((layer) => layer.name));
+    if (layers.some((layer) => layer.name === "ortho")) select.value = "ortho";
+  }
   // Patches as buttons (gallery.html): `of(row)` gives a row's class, split and words, `choose(row)` is what a click does.
   function gallery(sheets, of, choose) {
     let most = 60;
     const rows = sheets.rows.map(of);
     fillSelect(at("gallery-class"), [...new Set(rows.map((one) => one.kind))].sort());
     fillSelect(at("gallery-split"), [...new Set(rows.map((one) => one.split))].sort());
-    fillSelect(at("gallery-layer"), sheets.layers.map((layer) => layer.name));
-    at("gallery-layer").value = (sheets.layers.find((layer) => layer.name === "ortho") ?? sheets.layers[0]).name;
+    fillLayers(at("gallery-layer"), sheets.layers);
     const draw = () => {
       const [kind, split] = [at("gallery-class").value, at("gallery-split").value];
       const layer = sheets.layers.find((one) => one.name === at("gallery-layer").value);
@@ -218,7 +224,7 @@ const page = (() => {
     }));
   }
   return {
-    at, fixed, make, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, clickNearest, gallery, mean, stepThrough, unpack,
+    at, copy, fixed, make, fillLayers, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, clickNearest, gallery, mean, stepThrough, unpack,
     data: read("page-data"),
     // What a page's own script does when the figures that it asks for are drawn; what it returns is called with the view of each that follows.
     start: (of) => { work = of; },

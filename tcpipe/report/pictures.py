@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -200,10 +200,9 @@ def shade_heights(height_m: NDArray[np.generic], pixel_size_m: float) -> NDArray
 _PLAIN_PNG: dict[str, Any] = {"Software": None}
 
 
-def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str, str] | None = None) -> None:
-    """Write a picture, grey (R, C) or colour (R, C, 3), as PNG with texts by key; the same picture gives the same bytes."""
+def write_overview(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write a picture, grey (R, C) or colour (R, C, 3), as PNG; the same picture gives the same bytes."""
     from matplotlib.image import imsave  # noqa: PLC0415  a page of a store needs no picture
 
     with write_atomic_file(path) as temporary:
-        metadata = {**_PLAIN_PNG, **(texts or {})}
-        imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=metadata)
+        imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=_PLAIN_PNG)

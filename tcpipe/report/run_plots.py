@@ -343,7 +343,7 @@ def time_plots(
         plots.append(_draw_labels(first))
     for plot in plots[1:-1]:
         plot.figure.xaxis.visible = False
-    for plot in {id(plot): plot for plot in (first, plots[-1])}.values():
+    for plot in (first, plots[-1]) if len(plots) > 1 else (first,):
         plot.figure.xaxis.axis_label = "time since the track began [s]"
         plot.figure.height += 40
     border_px = max(112, 16 + 7 * max(map(len, first.figure.y_range.factors)))
@@ -383,13 +383,13 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts, findings: S
     least_s = 0.004 * timeline.end_s  # so that a moment can be seen
     events = [
         (
-            finding.finding.code,
-            finding.start_s,
-            max(finding.end_s, finding.start_s + least_s),
-            SEVERITY_COLOURS[finding.finding.severity],
-            describe_finding(finding.finding),
+            span.finding.code,
+            span.start_s,
+            max(span.end_s, span.start_s + least_s),
+            SEVERITY_COLOURS[span.finding.severity],
+            describe_finding(span.finding),
         )
-        for finding in findings
+        for span in findings
     ]
     problems = dict.fromkeys(row for row, *_ in events)
     events += _iterate_events(timeline, facts)

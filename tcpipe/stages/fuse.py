@@ -230,10 +230,8 @@ def find_clock_jumps(inputs: FusionInputs) -> Iterator[tuple[int, Finding]]:
         if m.gnss is None or odometry is None:
             continue
         for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > _JUMP_NS]:
-            step_s, at_s = (
-                float(np.diff(ends_ns)[0]) * 1e-9,
-                float(ends_ns[1] - min(stamps_ns[0] for stamps_ns in stamps)) * 1e-9,
-            )
+            step_s = float(np.diff(ends_ns)[0]) * 1e-9
+            at_s = float(ends_ns[1] - min(each[0] for each in stamps)) * 1e-9
             driven = np.interp(ends_ns, odometry.stamp_ns, odometry.velocity_mps[:, 0])
             moved_m = [np.diff(np.interp(ends_ns, m.gnss.stamp_ns, axis)) for axis in m.gnss.position_enu_m[:, :2].T]
             slowest_mps = float(np.abs(driven).min())

@@ -191,7 +191,7 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
     """Return the error of each segment's displacement [m], shape (M,): the smoother's, else by the rows' standard deviations."""
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     duration_s = (end_ns - start_ns).astype(np.float64) * 1e-9
-    told_m = np.column_stack([interpolate(stamp_ns, to_floats(rows, name), start_ns) for name in _DISPLACEMENTS])
+    lag_std_m = np.column_stack([interpolate(stamp_ns, to_floats(rows, name), start_ns) for name in _DISPLACEMENTS])
     start_std_m, end_std_m = (
         compute_along_std_m(
             interpolate(stamp_ns, to_floats(rows, "x_std_m"), at_ns),
@@ -207,7 +207,7 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
         end_std_m=end_std_m,
         smoothed=smoothed,
         lags_s=DISPLACEMENT_LAGS_S,
-        lag_std_m=told_m,
+        lag_std_m=lag_std_m,
     )
 
 
@@ -232,7 +232,7 @@ def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
     """Return the resolution of the power of all rails together [W]; 0 where none shows."""
     steps = [
         float(np.median(each.voltage_volt)) * estimate_resolution(each.current)
-        for each in next((rail_facts for rail_facts in rails.values() if rail_facts), [])
+        for each in next((of_epoch for of_epoch in rails.values() if of_epoch), [])
         if len(each.voltage_volt)
     ]
     return float(np.linalg.norm(steps)) if steps else 0.0

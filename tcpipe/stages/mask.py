@@ -256,7 +256,7 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
     table = track.table
     course = np.arctan2(to_floats(table, "north_velocity_mps"), to_floats(table, "east_velocity_mps"))
     common_mps = _compute_common_std_mps(track)
-    told_m = np.column_stack([to_floats(table, name) for name in _DISPLACEMENTS])
+    lag_std_m = np.column_stack([to_floats(table, name) for name in _DISPLACEMENTS])
     return compute_chord_ahead_std_m(
         rows,
         velocity_std_mps=_subtract_variance(to_floats(table, "forward_velocity_std_mps"), common_mps),
@@ -265,7 +265,7 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
         slowest_mps=config.turning_velocity_mps,
         smoothed=track.info.estimator == "smoother",
         lags_s=DISPLACEMENT_LAGS_S,
-        lag_std_m=_subtract_variance(told_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
+        lag_std_m=_subtract_variance(lag_std_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.logs.extrinsics import Transforms
+from tcpipe.logs.field_mapping import Array
 from tcpipe.logs.messages import LOG_TIME
 from tcpipe.logs.topics import Topic
 from tcpipe.power.rails import Rail, make_rail, make_samples
@@ -19,7 +20,6 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import Streams
 
 T = TypeVar("T", bound=np.generic)
-Array = NDArray[Any]
 Arrays = dict[str, Array]
 
 

@@ -211,9 +211,7 @@ def check_same_layers(sources: Sequence[MapReader], config: SampleConfig) -> Non
             continue
         for name, layer in layers.items():
             its = theirs[name]
-            got, wanted = (
-                f"{layer_.signature}{f', {layer_.stored}' if layer_.bands else ''}" for layer_ in (its, layer)
-            )
+            got, wanted = (f"{each.signature}{f', {each.stored}' if each.bands else ''}" for each in (its, layer))
             if got != wanted:
                 problems.append(f"map {other.name}: {name} is {got}, but {wanted} in map {first.name}")
             elif layer.classes is not None and its.classes is not None and its.classes != layer.classes:

@@ -12,7 +12,7 @@ from rosbags.typesys import get_types_from_msg
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_part import MessageBlock
 from tcpipe.formats.logs.ros_types import MessageType
-from tcpipe.logs.wire_types import Array, Record, Scalar, Text, record
+from tcpipe.logs.wire_types import Array, Record, Scalar, Text, make_record
 
 CODES = ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 HEADERS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4), None: ("<", 1)}
@@ -63,7 +63,7 @@ def wire_types():
 
     def records(children, *, fewest=0):
         fields = st.lists(children, min_size=fewest, max_size=4)
-        return fields.map(lambda of: record("a/msg/R", tuple((f"f{n}", field) for n, field in enumerate(of))))
+        return fields.map(lambda of: make_record("a/msg/R", tuple((f"f{n}", field) for n, field in enumerate(of))))
 
     def arrays(elements):
         return st.builds(Array, elements, st.none() | st.integers(1, 3))
@@ -73,7 +73,7 @@ def wire_types():
         leaves | arrays(leaves), lambda inner: records(inner) | arrays(records(leaves, fewest=1)), max_leaves=8
     )
     return st.lists(fields, min_size=1, max_size=5).map(
-        lambda of: record("a/msg/A", tuple((f"f{n}", field) for n, field in enumerate(of)))
+        lambda of: make_record("a/msg/A", tuple((f"f{n}", field) for n, field in enumerate(of)))
     )
 
 
@@ -135,7 +135,7 @@ def test_every_type_in_every_serialisation(header, alike, count, seed, data):
 
 @pytest.mark.parametrize("header", list(HEADERS))
 def test_a_message_that_fits_no_definition_costs_only_itself(header):
-    of = record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
+    of = make_record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
     rng = np.random.default_rng(0)
     values = [random_value(of, rng, rng) for _ in range(100)]
     payloads = [Writer(header).message(of, value) for value in values]
@@ -161,9 +161,9 @@ def _definitions():
 
 
 def test_arrays_of_messages_that_hold_short_arrays_of_messages():
-    leaf = record("a/msg/Leaf", (("x", Scalar("f8")),))
-    inner = record("a/msg/Inner", (("b", Array(leaf, 2)), ("c", Array(Scalar("i2"), 4))))
-    outer = record("a/msg/Outer", (("a", Array(inner, 5)),))
+    leaf = make_record("a/msg/Leaf", (("x", Scalar("f8")),))
+    inner = make_record("a/msg/Inner", (("b", Array(leaf, 2)), ("c", Array(Scalar("i2"), 4))))
+    outer = make_record("a/msg/Outer", (("a", Array(inner, 5)),))
     values = [
         {"a": [{"b": [{"x": m + 10.0 * i + j} for j in range(2)], "c": [m, i, -m, -i]} for i in range(5)]}
         for m in range(12)
@@ -180,7 +180,7 @@ def test_arrays_of_messages_that_hold_short_arrays_of_messages():
 
 @pytest.mark.parametrize("header", [b"\x00\x01", None])
 def test_a_list_too_long_to_be_walked_side_by_side_is_read_message_by_message(header):
-    of = record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
+    of = make_record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
     values = [{"texts": ["a"] * count, "number": float(count)} for count in (21_000, 2, 0)]
     payloads = [Writer(header).message(of, value) for value in values]
     found = decoded(of, payloads, "cdr" if header else "ros1", _definitions())

@@ -108,7 +108,7 @@ class AutopilotRecords:
     def add(self, name: str, instance: int, layout: Layout, offsets: Int64, scales: Mapping[str, float]) -> None:
         """Add the messages of an instance; without a time they cannot be used."""
         clock = next(
-            (name for name in _CLOCKS if name in (layout.names or ()) and layout[name].str in ("<u8", "<u4")), None
+            (field for field in _CLOCKS if field in (layout.names or ()) and layout[field].str in ("<u8", "<u4")), None
         )
         if clock is None:
             self.add_damage("messages-not-decoded", f"/{name}", 0, reason=f"{name} has no time")
@@ -409,7 +409,9 @@ def _add_instances(
     records: AutopilotRecords, name: str, layout: Layout, offsets: Int64, scales: Mapping[str, float]
 ) -> None:
     """Add messages, those of each instance of a sensor apart."""
-    instance = next((name for name in _INSTANCES if name in (layout.names or ()) and layout[name].str == "|u1"), None)
+    instance = next(
+        (field for field in _INSTANCES if field in (layout.names or ()) and layout[field].str == "|u1"), None
+    )
     if instance is None:
         records.add(name, 0, layout, offsets, scales)
         return

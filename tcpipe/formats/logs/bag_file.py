@@ -39,7 +39,7 @@ from tcpipe.formats.logs.log_part import (
     decompress_prefix,
     outline_of,
 )
-from tcpipe.logs.topics import Damage, Topic, compute_silence_ns, normalize_type_name
+from tcpipe.logs.topics import Topic, compute_silence_ns, normalize_type_name
 
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MAX_CHUNK_HEADER = 128
@@ -135,13 +135,13 @@ class BagPart(ChunkedPart[_Chunk]):
             return chunk
         return replace(chunk, record=record, size=size)
 
-    def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
-        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+    def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
         return read_indexed_messages(found)
 
-    def walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
+    def read_walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
-        found = self._walked(chunk, data)
+        found = self._step_through(chunk, data)
         return found.messages(data, wanted)
 
     def is_proved(self, chunk: _Chunk) -> bool:
@@ -149,10 +149,10 @@ class BagPart(ChunkedPart[_Chunk]):
         return chunk.record is not None and chunk.record.codec == "bz2"
 
     def needs_index(self, chunk: _Chunk) -> bool:
-        """Tell whether a broken index is worth a word: there should be one."""
+        """Tell whether a broken index is noted: there should be one."""
         return chunk.counts is not None and not chunk.cut
 
-    def _walked(self, chunk: _Chunk, data: memoryview) -> ChunkRecords:
+    def _step_through(self, chunk: _Chunk, data: memoryview) -> ChunkRecords:
         """Step through the records of a chunk, and note what is wrong with them."""
         walked = walk_chunk(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, walked.count)
@@ -326,9 +326,9 @@ class BagPart(ChunkedPart[_Chunk]):
         try:
             data = self.load(chunk)
         except DamageError as error:
-            self.damage.append(self.lost(chunk, error))
+            self.note_lost(chunk, error)
             return
-        found = self._walked(chunk, data)
+        found = self._step_through(chunk, data)
         self._chunks.append(chunk)
         self._bounds.count(len(self._chunks), 0)
         for number in found.offsets.keys() & self._connections.keys():
@@ -390,10 +390,10 @@ class BagPart(ChunkedPart[_Chunk]):
         tally.starts.append(start_ns)
         tally.ends.append(end_ns)
 
-    def lost(self, chunk: _Chunk, error: DamageError) -> Damage:
-        """Return the damage of a chunk that is lost as a whole, counted by the bag's index."""
+    def note_lost(self, chunk: _Chunk, error: DamageError) -> None:
+        """Note the damage of a chunk that is lost as a whole, counted by the bag's index."""
         lost = sum(chunk.counts.values()) if chunk.counts else None
-        return Damage(error.cause, self.name, chunk.offset, messages_lost=lost, reason=error.reason)
+        self._note(error.cause, chunk.offset, messages_lost=lost, reason=error.reason)
 
 
 def _find_needed_bytes(offset: int, record: BagRecord) -> tuple[int, int]:

@@ -153,7 +153,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
     def _note(
         self,
         cause: str,
-        offset: int,
+        offset: int | None,
         *,
         messages_lost: int | None = None,
         bytes_lost: int | None = None,
@@ -185,11 +185,11 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Return where in the file the records of a chunk begin, of which pieces can be read; None where it must be loaded."""
 
     @abstractmethod
-    def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
-        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+    def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
 
     @abstractmethod
-    def walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int]) -> Messages:
+    def read_walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
 
     @abstractmethod
@@ -198,11 +198,11 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
 
     @abstractmethod
     def needs_index(self, chunk: AnyChunk) -> bool:
-        """Tell whether a broken index of this chunk is worth a word."""
+        """Tell whether a broken index of this chunk is noted."""
 
     @abstractmethod
-    def lost(self, chunk: AnyChunk, error: DamageError) -> Damage:
-        """Return the damage of a chunk that is lost as a whole, counted by the index."""
+    def note_lost(self, chunk: AnyChunk, error: DamageError) -> None:
+        """Note the damage of a chunk that is lost as a whole, counted by the index."""
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
@@ -228,7 +228,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         doubtful: Sequence[int] = span.chunks
         if span.entries is not None:
             found = self.read_excerpt(span, span.entries, [chunk for _, chunk in members])
-            messages, true = self.indexed(found)
+            messages, true = self.read_indexed(found)
             ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
             doubtful = np.unique(found.entries.chunk[~true]).tolist()
             if doubtful:
@@ -240,9 +240,9 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
             try:
                 data = self.load(chunk)
             except DamageError as error:
-                self.damage.append(self.lost(chunk, error))
+                self.note_lost(chunk, error)
                 continue
-            messages = self.walked(chunk, data, wanted)
+            messages = self.read_walked(chunk, data, wanted)
             entries = None if span.entries is None else span.entries.at(span.entries.chunk == number)
             self._note_index_disagreement(chunk, messages, entries)
             yield from self._split_in_time(messages, base + messages.offset)
@@ -259,7 +259,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
                     data = self.load(chunks[number])
             except DamageError as error:
                 lost.append(number)
-                self.damage.append(self.lost(chunks[number], error))
+                self.note_lost(chunks[number], error)
         found = Excerpt(data, offset, entries)
         return found.at(~np.isin(entries.chunk, lost)) if lost else found
 
@@ -277,7 +277,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Return messages as blocks, without those whose time is past what 63 bits hold."""
         times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
         if not times.all():
-            self.damage.append(Damage("time-invalid", self.name, messages_lost=int((~times).sum())))
+            self._note("time-invalid", None, messages_lost=int((~times).sum()))
             messages, ordinal = messages.at(times), ordinal[times]
         return messages.blocks(ordinal)
 

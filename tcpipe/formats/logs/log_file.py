@@ -78,8 +78,8 @@ _KNOWN_MAGIC = (
 def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
     """Open a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; `LogError` says what else it is.
 
-    Or the URL of one (``s3://…``): of an .mcap or .bag with an index only what is asked for is fetched, anything else is copied until the
-    log is closed. ``message_definitions``: a directory of .msg files for types that the log does not define.
+    ``path`` may be the URL of one (``s3://…``): of an .mcap or .bag with an index only what is asked for is fetched, anything else is
+    copied until the log is closed. ``message_definitions``: a directory of .msg files for types that the log does not define.
     """
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}

@@ -57,7 +57,7 @@ from tcpipe.formats.logs.mcap_records import (
     read_summary,
     record_offsets,
 )
-from tcpipe.logs.topics import Damage, Topic, compute_silence_ns, normalize_type_name
+from tcpipe.logs.topics import Topic, compute_silence_ns, normalize_type_name
 
 _LOOSE_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
@@ -126,23 +126,23 @@ class McapPart(ChunkedPart[Chunk]):
             self._bytes.skips()
         return found
 
-    def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
-        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+    def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
         messages, right = read_messages_at(found.data, found.offset)
         entries = found.entries
         room = entries.end - entries.offset - RECORD_HEAD - MESSAGE_HEAD
         same = (messages.channel == entries.channel) & (messages.log_time_ns == entries.log_time_ns)
         return messages, right & same & (messages.length <= room)
 
-    def _records(self, chunk: Chunk, data: memoryview) -> tuple[Int64Array, int]:
+    def _step_through(self, chunk: Chunk, data: memoryview) -> tuple[Int64Array, int]:
         """Return where the records of a chunk begin, and where they end."""
         records, end = record_offsets(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, len(records))
         return records, end
 
-    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
+    def read_walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; where these end too early, or are none, that is noted."""
-        records, end = self._records(chunk, data)
+        records, end = self._step_through(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
         if lost := every - len(messages.offset):
@@ -161,7 +161,7 @@ class McapPart(ChunkedPart[Chunk]):
         return bool(self._crc(chunk))
 
     def needs_index(self, chunk: Chunk) -> bool:
-        """Tell whether a broken index is worth a word: nothing else proves what the chunk holds."""
+        """Tell whether a broken index is noted: nothing else proves what the chunk holds."""
         return chunk.index is not None and not chunk.cut and not self._crc(chunk)
 
     def find_plain_data(self, chunk: Chunk) -> int | None:
@@ -332,7 +332,7 @@ class McapPart(ChunkedPart[Chunk]):
 
     def _take_record(self, contents: Contents, opcode: int, position: int, after: int, end: int) -> None:
         if opcode == OP_CHUNK:
-            contents.chunks.append(self._walked_chunk(position, after))
+            contents.chunks.append(self._parse_chunk(position, after))
             self._bounds.count(len(contents.chunks), 0)
         elif opcode == OP_MESSAGE and after <= end:
             self._untimed += 1
@@ -345,7 +345,7 @@ class McapPart(ChunkedPart[Chunk]):
         elif opcode == OP_MESSAGE_INDEX and contents.chunks and not contents.chunks[-1].headless:
             self._take_message_index(contents, position, after)
 
-    def _walked_chunk(self, position: int, after: int) -> Chunk:
+    def _parse_chunk(self, position: int, after: int) -> Chunk:
         chunk = parse_chunk_head(self._bytes.peek(position + RECORD_HEAD, CHUNK_HEAD + 4), position)
         is_whole = chunk.end == after and chunk.uncompressed_bytes <= MAX_CHUNK_BYTES
         if not is_whole or chunk.compression not in ("", "lz4", "zstd"):
@@ -417,9 +417,9 @@ class McapPart(ChunkedPart[Chunk]):
         try:
             data = self.load(chunk)
         except DamageError as error:
-            self.damage.append(self.lost(chunk, error))
+            self.note_lost(chunk, error)
             return
-        records, _ = self._records(chunk, data)
+        records, _ = self._step_through(chunk, data)
         self._declare(chunk, data, records)
         if chunk.index is None:
             self._tally_messages(data, find_message_offsets(data, records))
@@ -481,16 +481,14 @@ class McapPart(ChunkedPart[Chunk]):
             stamps = gather_integers(data, messages[rows] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
-    def lost(self, chunk: Chunk, error: DamageError) -> Damage:
-        """Return the damage of a chunk that is lost as a whole, counted by the message index beside it."""
+    def note_lost(self, chunk: Chunk, error: DamageError) -> None:
+        """Note the damage of a chunk that is lost as a whole, counted by the message index beside it."""
         try:
             lost = sum(len(self._index_entries(at, channel)) for channel, at in (chunk.index or {}).items())
         except DamageError:
             lost = 0
         size = chunk.uncompressed_bytes
-        return Damage(
-            error.cause, self.name, chunk.offset, messages_lost=lost or None, bytes_lost=size, reason=error.reason
-        )
+        self._note(error.cause, chunk.offset, messages_lost=lost or None, bytes_lost=size, reason=error.reason)
 
 
 def _find_needed_bytes(chunk: Chunk) -> tuple[int, int]:

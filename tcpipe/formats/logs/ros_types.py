@@ -39,8 +39,8 @@ from tcpipe.logs.wire_types import (
     WireType,
     count_fixed_elements,
     is_boundless,
+    make_record,
     parse_msg,
-    record,
 )
 
 Source = Literal["log", "given", "bundled"]
@@ -140,7 +140,8 @@ class TypeLibrary:
     ) -> MessageType | DefinitionError:
         """Return the type for a definition text ("" where the log has none).
 
-        Or what is in the way: no definition is known, or it cannot be parsed, is recursive, or uses a type no reader supports.
+        An error is returned, not raised, where no definition is known, or it cannot be parsed, is recursive, or uses a type no reader
+        supports.
         """
         key = (type_name, definition, schema_encoding, ros1)
         if key not in self._types:
@@ -224,7 +225,7 @@ class _Unfold:
             twice = sorted(field for field, count in Counter(field for field, _ in fields).items() if count > 1)
             if twice:
                 raise DefinitionError(f"type {name} defines {', '.join(twice)} more than once")
-            self._records[name] = record(name, fields)
+            self._records[name] = make_record(name, fields)
         return self._records[name]
 
     def wire_type(self, described: Any, within: tuple[str, ...]) -> WireType:

@@ -306,7 +306,7 @@ def _is_blamed(
         return False
     among = [p for p in pairs if {p.late, p.against} <= {role, *agreeing}]
     for p in among:
-        late_s, against_s = (float(_compute_lateness(offsets[role], p.from_middle_s)) for role in (p.late, p.against))
+        late_s, against_s = (float(_compute_lateness(offsets[each], p.from_middle_s)) for each in (p.late, p.against))
         if abs(p.offset_s - late_s + against_s) > max(_SURE * _get_std_s(p), _NOTED_S):
             return False
     kinds = ([p for p in among if (p.by == YAW_RATE) == turning] for turning in (True, False))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcpipe.logs.wire_cursors import Grid, LayoutError, find_dialect, walk
-from tcpipe.logs.wire_types import Array, Scalar, Text, record
+from tcpipe.logs.wire_types import Array, Scalar, Text, make_record
 
 U8, U32, F32, F64 = Scalar("u1"), Scalar("u4"), Scalar("f4"), Scalar("f8")
 LITTLE = b"\x00\x01\x00\x00"
@@ -24,7 +24,7 @@ def offsets(values):
 
 
 def test_cdr_aligns_each_field_to_its_size_from_behind_the_header():
-    of = record("a/msg/A", (("flag", U8), ("value", F64), ("name", Text()), ("after", F32)))
+    of = make_record("a/msg/A", (("flag", U8), ("value", F64), ("name", Text()), ("after", F32)))
     payload = LITTLE + b"\x07" + bytes(7) + struct.pack("<dI", 2.5, 3) + b"hi\0" + b"\0" + struct.pack("<f", 1.0)
     found, _ = walked(of, [payload, payload])
     flag, value, name, after = found.root.fields
@@ -33,14 +33,14 @@ def test_cdr_aligns_each_field_to_its_size_from_behind_the_header():
 
 
 def test_ros1_packs_without_gaps_and_texts_have_no_terminator():
-    of = record("a/msg/A", (("flag", U8), ("value", F64), ("name", Text()), ("after", F32)))
+    of = make_record("a/msg/A", (("flag", U8), ("value", F64), ("name", Text()), ("after", F32)))
     payload = b"\x07" + struct.pack("<dI", 2.5, 2) + b"hi" + struct.pack("<f", 1.0)
     found, _ = walked(of, [payload], "ros1")
     assert [offsets(of) for of in found.root.fields] == [[0], [1], [13], [15]]
 
 
 def test_plain_xcdr2_aligns_doubles_to_four():
-    of = record("a/msg/A", (("flag", U8), ("value", F64)))
+    of = make_record("a/msg/A", (("flag", U8), ("value", F64)))
     found, _ = walked(of, [b"\x00\x07\x00\x00" + b"\x01\0\0\0" + struct.pack("<d", 2.5)])
     assert offsets(found.root.fields[1]) == [8]
 
@@ -48,8 +48,8 @@ def test_plain_xcdr2_aligns_doubles_to_four():
 @pytest.mark.parametrize("counts", [(30_000, 30_000), (30_000, 2)], ids=["alike", "not alike"])
 def test_many_elements_with_padding_behind_them_are_one_step(counts):
     """Points of a lidar: four bytes aligned, three bytes at the end."""
-    point = record("a/msg/P", (("t", U32), ("x", F32), ("tag", U8), ("line", Array(U8, 2))))
-    of = record("a/msg/A", (("points", Array(point, None)), ("end", U8)))
+    point = make_record("a/msg/P", (("t", U32), ("x", F32), ("tag", U8), ("line", Array(U8, 2))))
+    of = make_record("a/msg/A", (("points", Array(point, None)), ("end", U8)))
     written = np.zeros(
         max(counts), np.dtype([("t", "<u4"), ("x", "<f4"), ("tag", "u1"), ("line", "u1", 2), ("", "u1")])
     )
@@ -67,7 +67,7 @@ def test_many_elements_with_padding_behind_them_are_one_step(counts):
 
 
 def test_messages_of_one_size_may_have_texts_of_different_lengths():
-    of = record("a/msg/A", (("first", Text()), ("second", Text())))
+    of = make_record("a/msg/A", (("first", Text()), ("second", Text())))
     found, _ = walked(of, [b"\x01\0\0\0a\x02\0\0\0bc", b"\x02\0\0\0gh\x01\0\0\0i"], "ros1")
     assert [of.lengths.tolist() for of in found.root.fields] == [[1, 2], [2, 1]]
     assert [offsets(of) for of in found.root.fields] == [[4, 15], [9, 21]]
@@ -84,7 +84,7 @@ def test_messages_of_one_size_may_have_texts_of_different_lengths():
     ids=["endless sequence", "cut", "bytes left over"],
 )
 def test_what_does_not_fit_is_refused(payload, count):
-    of = record("a/msg/A", (("values", Array(F64, None)),))
+    of = make_record("a/msg/A", (("values", Array(F64, None)),))
     assert not walked(of, [payload] * count)[0].fits.any()
 
 
@@ -95,5 +95,5 @@ def test_an_encoding_that_is_none_of_ros_is_refused(payload):
 
 
 def test_an_endless_sequence_of_nothing_is_refused_at_once():
-    of = record("a/msg/A", (("nothings", Array(record("a/msg/E", ()), None)),))
+    of = make_record("a/msg/A", (("nothings", Array(make_record("a/msg/E", ()), None)),))
     assert not walked(of, [struct.pack("<I", 2**32 - 1)], "ros1")[0].fits.any()
