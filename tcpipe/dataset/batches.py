@@ -102,12 +102,12 @@ class StoredPixels:
             if number % CACHED_PIECES == 0:
                 self.files.expect(pieces[number : number + CACHED_PIECES], layers)
             here = np.flatnonzero(piece_of == piece)
-            pixels = self._piece(piece, tuple(layers))
+            pixels = self._read_piece(piece, tuple(layers))
             for layer in layers:
                 out[layer][here] = pixels[layer][rows[here] - self.files.starts[piece]]
         return out
 
-    def _piece(self, piece: int, layers: tuple[str, ...]) -> Pixels:
+    def _read_piece(self, piece: int, layers: tuple[str, ...]) -> Pixels:
         key = (piece, layers)
         if key in self._pieces:
             self._pieces.move_to_end(key)

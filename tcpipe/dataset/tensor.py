@@ -37,12 +37,12 @@ class TensorLayout:
     @cached_property
     def layers(self) -> tuple[str, ...]:
         """Stored layers that are needed."""
-        return tuple(sort_layers({name: self.known[name] for name in map(self._of, self.channels)}))
+        return tuple(sort_layers({name: self.known[name] for name in map(self._name_layer, self.channels)}))
 
     @cached_property
     def planes(self) -> tuple[str, ...]:
         """Names along the tensor's last axis: channels, those of several planes as ``name[1]``, ``name[2]`` …."""
-        widths = ((channel, self._width(channel)) for channel in self.channels)
+        widths = ((channel, self._count_planes(channel)) for channel in self.channels)
         return tuple(
             f"{channel}[{place + 1}]" if width > 1 else channel for channel, width in widths for place in range(width)
         )
@@ -57,11 +57,11 @@ class TensorLayout:
         """Samples whose tensors are formed at once where all are wanted one after another: 40 MB, 2,048 at most."""
         return max(min(_BATCH_BYTES // (4 * self.depth * self.patch_px**2), _BATCH_ROWS), 1)
 
-    def _of(self, channel: str) -> str:
+    def _name_layer(self, channel: str) -> str:
         return channel if channel in self.known else channel.removesuffix(ONE_HOT)
 
-    def _width(self, channel: str) -> int:
-        layer = self.known[self._of(channel)]
+    def _count_planes(self, channel: str) -> int:
+        layer = self.known[self._name_layer(channel)]
         return max(len(layer.bands), 1) if layer.name == channel else round(layer.high)
 
     def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats:
@@ -76,21 +76,21 @@ class TensorLayout:
         out = np.empty((len(rows), px, px, self.depth), np.float32)
         at = 0
         for channel in self.channels:
-            layer = self.known[self._of(channel)]
+            layer = self.known[self._name_layer(channel)]
             if layer.name != channel:
-                for place in range(self._width(channel)):
+                for place in range(self._count_planes(channel)):
                     is_it = np.equal(_BYTES, place + 1).astype(np.float32)
                     form_bytes(pixels[layer.name], rows, flips, is_it, at + place, out)
             elif layer.bands:
                 values = np.array(pixels[channel][rows])
                 values[flips] = values[flips, :, ::-1]
-                out[..., at : at + self._width(channel)] = layer.band_channels(values, px)
+                out[..., at : at + self._count_planes(channel)] = layer.band_channels(values, px)
             elif layer.stored == np.uint8:
                 form_bytes(pixels[channel], rows, flips, layer.channel_of_bytes, at, out)
             else:
                 scaling = (np.float32(number) for number in layer.scaling)
                 form_numbers(pixels[channel], rows, flips, layer.stored.type(layer.nodata), *scaling, at, out)
-            at += self._width(channel)
+            at += self._count_planes(channel)
         return out
 
 

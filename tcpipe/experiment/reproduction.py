@@ -98,11 +98,12 @@ class Reproduction:
     def __str__(self) -> str:
         """Return every claim and how it stands, as plain lines."""
         claims = self.values.claims
+        verdicts = ", ".join(f"{count} {name}" for name, count in _count_verdicts(claims).items())
         return clean_lines(
             (
                 "the data are simulated: compare the pattern with the paper, not the numbers",
                 *map(str, claims),
-                f"of {len(claims)} claims: {_count_verdicts(claims)}",
+                f"of {len(claims)} claims: {verdicts}",
                 "spent: " + ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items()),
                 f"open {self.directory / PAGE}",
             )
@@ -140,8 +141,8 @@ def reproduce(
     return Reproduction(place, values, dict(seconds))
 
 
-def _count_verdicts(claims: Sequence[Claim]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in Counter(claim.verdict for claim in claims).items())
+def _count_verdicts(claims: Sequence[Claim]) -> Counter[str]:
+    return Counter(claim.verdict for claim in claims)
 
 
 @contextmanager
@@ -176,13 +177,12 @@ def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int
 def _render_page(values: ReproductionSummary, runs: Sequence[Evaluation]) -> str:
     """Return the HTML page of all trainings."""
     claims = values.claims
-    verdicts = Counter(claim.verdict for claim in claims)
     audits = (f"{split}: {format_leakage(part.leakage)}" for split, part in runs[0].splits.items())
     return render_page(
         title="The paper's experiment on a simulated site",
         lead="All tables of a training are in seed-N/evaluation/evaluation.html.",
         numbers=[
-            *(Number(f"{count} of {len(claims)}", f"claims {name}") for name, count in verdicts.items()),
+            *(Number(f"{count} of {len(claims)}", f"claims {name}") for name, count in _count_verdicts(claims).items()),
             Number(f"{len(runs)}", "training" if len(runs) == 1 else "trainings"),
         ],
         warnings=[SIMULATED, *([values.plan.warning] if values.plan.warning else [])],

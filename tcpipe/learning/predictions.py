@@ -92,7 +92,7 @@ class Predicted:
         power, velocity = said.mean[:, 0], np.ones(len(said.mean))
         names = ("E",) if is_energy else QUANTITIES
         if is_energy:
-            residuals, chord_m = _of_energy_alone(residuals), 1.0
+            residuals, chord_m = _convert_energy_residuals(residuals), 1.0
         else:
             velocity = np.maximum(said.mean[:, 1], LEAST_VELOCITY_MPS)
         centred = fit_bias_correction(residuals).apply(power, velocity, class_ids)
@@ -132,7 +132,7 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
     return Predicted.centre(model.residuals, Prediction.concatenate(parts), class_ids, model.card.chord_m)
 
 
-def _of_energy_alone(residuals: Residuals) -> Residuals:
+def _convert_energy_residuals(residuals: Residuals) -> Residuals:
     """Return the residuals of a model of energy as those of a power at 1 m/s."""
     if "energy_predicted_joule" not in residuals:
         return {}
