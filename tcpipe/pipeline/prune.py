@@ -91,16 +91,7 @@ def prune(
         raise UsageError(f"{opened.root}: no run or recipe is called {min(unknown)}; nothing is removed")
     referred, unread = _find_references(log.state)
     removed, kept, decided = list[Leftover](), list[Leftover](), set[str]()
-    superseded = list(_iterate_superseded(opened, found))
-    for what, run_id, recipe_id in (
-        *_iterate_begun(opened, log.state, min_age_s, but={run_id for _, run_id, _ in superseded}),
-        *_iterate_old_recipes(found, ingest_key(ruling)),
-        *superseded,
-    ):
-        place = opened.runs_place.below(f"{run_id}/{recipe_id}" if recipe_id else run_id)
-        parts = [(run_id, recipe_id)]
-        if not recipe_id:
-            parts = [key for key in {**found.rows, **log.state.pruned} if key[0] == run_id]
+    for what, place, run_id, parts in _iterate_ingestions(opened, log.state, found, ingest_key(ruling), min_age_s):
         why, size_bytes = unread or _find_reason_to_stay(place, parts, referred, keep), _measure_size(place)
         if why is None and not dry_run and not _remove(log, found, place, run_id, parts):
             why = "another call has changed its run meanwhile"
@@ -137,6 +128,20 @@ _Target = tuple[str, str, str]
 """What something is, its run, and its recipe: "" where all of the run is to go."""
 
 
+def _iterate_ingestions(
+    store: Store, state: State, found: Ingestions, key: str, min_age_s: float
+) -> Iterator[tuple[str, Place, str, list[tuple[str, str]]]]:
+    """Yield what may go of runs that the log knows: what it is, where it lies, its run, and the ingestions in it."""
+    superseded = list(_iterate_superseded(store, found))
+    begun = _iterate_begun(store, state, min_age_s, but={run_id for _, run_id, _ in superseded})
+    for what, run_id, recipe_id in (*begun, *_iterate_old_recipes(found, key), *superseded):
+        if recipe_id:
+            yield what, store.runs_place.below(f"{run_id}/{recipe_id}"), run_id, [(run_id, recipe_id)]
+        else:
+            parts = [part for part in {**found.rows, **state.pruned} if part[0] == run_id]
+            yield what, store.runs_place.below(run_id), run_id, parts
+
+
 def _remove(log: LogWriter, found: Ingestions, place: Place, run_id: str, parts: Sequence[tuple[str, str]]) -> bool:
     """Remove ingestions, unless another call changed their run, or built a dataset of them, since they were ``found``.
 
@@ -151,13 +156,15 @@ def _remove(log: LogWriter, found: Ingestions, place: Place, run_id: str, parts:
         is_as_found = not (is_used or is_changed)
         return Entries(removed=tuple(parts) if is_as_found else ())
 
-    def find_turn(entry: Entry) -> tuple[bool, bool]:  # its page, and its documents, so that no reader looks for the rest
-        return entry.name.endswith(".parquet"), split_number(entry.name) is not None
-
     log.commit("pruned", make)
-    for entry in sorted(place.entries() if is_as_found else (), key=find_turn):
+    for entry in sorted(place.entries() if is_as_found else (), key=_find_turn):
         place.delete(entry.name)
     return is_as_found
+
+
+def _find_turn(entry: Entry) -> tuple[bool, bool]:
+    """Return when a file goes: pages first, then documents, so that no reader looks for the rest."""
+    return entry.name.endswith(".parquet"), split_number(entry.name) is not None
 
 
 def _iterate_begun(store: Store, state: State, min_age_s: float, *, but: Collection[str]) -> Iterator[_Target]:

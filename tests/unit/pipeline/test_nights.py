@@ -310,6 +310,32 @@ def test_a_run_that_is_pruned_while_it_is_ingested_is_not_committed_but_made_by_
     assert verify(store).problems == ()
 
 
+def test_a_superseded_run_that_is_pruned_while_its_log_is_back_is_made_by_the_next_call(tmp_path, night, monkeypatch):
+    whole, log, store = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap", tmp_path / "store"
+    copy_part(whole, log, 0.6)
+    half = night()[0]["run.mcap"].run.run_id
+    shutil.copy(whole, log)
+    night()
+    copy_part(whole, tmp_path / "logs" / "back.mcap", 0.6)
+    real, other = ingest_module._make_entries, Recipe(label=LabelConfig(velocity="fused"))
+
+    def meanwhile(log, task, of):
+        monkeypatch.setattr(ingest_module, "_make_entries", real)
+        assert [each.what for each in prune(store=store).removed] == ["superseded run"]
+        return real(log, task, of)
+
+    def ingest_again():
+        (result,) = ingest([tmp_path / "logs" / "back.mcap"], store=store, recipe=other).results
+        return result
+
+    monkeypatch.setattr(ingest_module, "_make_entries", meanwhile)
+    result = ingest_again()
+    assert (result.status, Store(store).state().find_rows(half)) == ("failed", [])
+    result = ingest_again()
+    assert (result.status, result.run.run_id in counted(tmp_path)) == ("damaged", True)
+    assert verify(store).problems == ()
+
+
 def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit_wins(tmp_path, night, monkeypatch):
     shutil.copy(drive_at(tmp_path / "elsewhere" / "first.mcap", seed=7), tmp_path / "logs" / "second.mcap")
     real = ingest_module._make_entries
