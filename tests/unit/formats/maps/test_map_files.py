@@ -9,8 +9,6 @@ import pytest
 import rasterio
 import xarray
 from map_worlds import World
-from object_gateway import in_environment
-from storage_server import object_store
 
 from tcpipe.errors import MapError
 from tcpipe.formats.bucket_directories import fetch_files
@@ -129,25 +127,23 @@ def test_overviews_across_shards_have_no_seam(wide):
         assert (level.read("terrain", 0, side, 0, side) > 0).all()
 
 
-def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path, monkeypatch):
-    path, served = wide[0], tmp_path / "served" / "tests" / "m.zarr"
-    shutil.copytree(path, served)
+def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path, served):
+    path, files = wide[0], tmp_path / "served" / "tests" / "m.zarr"
+    shutil.copytree(path, files)
     checksums = {f"m.zarr/{name}": of for name, of in compute_checksums(path).items()}
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        root, shards = fetch_files(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)
-        here, there = open_map(path), open_map(root / "m.zarr", shards)
-        opened, requests = fetched.sent_bytes, len(fetched)
-        for layer in here.layers:  # of one tile
-            np.testing.assert_array_equal(there.read(layer, 10, 500, 600, 1000), here.read(layer, 10, 500, 600, 1000))
-        there.expect([(0, 1)])
-        assert set(fetched[requests:]) == {f"m.zarr/{layer}/c/0/0" for layer in here.layers}
-        assert len(fetched) - requests == 2 * len(here.layers)  # the index of a shard, and its tile
-        whole = sum((served / layer / "c" / "0" / "0").stat().st_size for layer in here.layers)
-        assert fetched.sent_bytes - opened < 0.1 * whole
-        (served / "height" / "c" / "1" / "1").unlink()
-        with pytest.raises(MapError, match=r"height, rows 2050 to 2090.*cannot be read.*is missing"):
-            there.read("height", 2050, 2090, 2050, 2090)
+    root, shards = fetch_files(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)
+    here, there = open_map(path), open_map(root / "m.zarr", shards)
+    opened, requests = served.sent_bytes, len(served)
+    for layer in here.layers:  # of one tile
+        np.testing.assert_array_equal(there.read(layer, 10, 500, 600, 1000), here.read(layer, 10, 500, 600, 1000))
+    there.expect([(0, 1)])
+    assert set(served[requests:]) == {f"m.zarr/{layer}/c/0/0" for layer in here.layers}
+    assert len(served) - requests == 2 * len(here.layers)  # the index of a shard, and its tile
+    whole = sum((files / layer / "c" / "0" / "0").stat().st_size for layer in here.layers)
+    assert served.sent_bytes - opened < 0.1 * whole
+    (files / "height" / "c" / "1" / "1").unlink()
+    with pytest.raises(MapError, match=r"height, rows 2050 to 2090.*cannot be read.*is missing"):
+        there.read("height", 2050, 2090, 2050, 2090)
 
 
 def test_what_is_no_map_says_so(path, tmp_path):
