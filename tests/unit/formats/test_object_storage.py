@@ -8,7 +8,7 @@ from storage_server import FORBIDDEN
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import is_log_file, open_log
-from tcpipe.formats.object_storage import is_url, lay_out_objects, make_stand_ins
+from tcpipe.formats.object_storage import lay_out_objects, make_stand_ins
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
 
@@ -25,13 +25,6 @@ def bucket(tmp_path, served):
     (root / "field" / "video.mp4").write_bytes(bytes(1000))
     (root / "junk.bag").write_bytes(b"nonsense")
     return root, served
-
-
-def test_what_is_a_url():
-    assert is_url("s3://bucket/run.mcap")
-    assert is_url("file:///tmp/run.mcap")
-    assert not is_url("drives/run.mcap")
-    assert not is_url("C:\\run.mcap")
 
 
 def test_a_log_behind_a_url_is_read_as_any_other(bucket):

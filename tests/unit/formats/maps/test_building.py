@@ -74,19 +74,15 @@ CONVENTIONS = {
     "rotated": (Affine(0.08, 0.06, LEFT, 0.06, -0.08, TOP), {}),
     "flat pixels": (Affine(0.1, 0.0, LEFT, 0.0, -0.2, TOP), {"rows": 200}),
     "mirrored": (Affine(-0.1, 0.0, LEFT + 40.0, 0.0, -0.1, TOP), {}),
+    "pixel is point": (NORTH_UP, {}),
 }
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_pixel_conventions_show_the_same_ground(tmp_path, name):
     affine, size = CONVENTIONS[name]
-    write_tif(tmp_path / "h.tif", raster_of(plane, affine, **size), WORLD.crs, affine)
-    _, source = built(tmp_path, height=tmp_path / "h.tif")
-    check_plane(source)
-
-
-def test_pixel_is_point_is_half_a_pixel_off_pixel_is_area(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP, point=True)
+    point = name == "pixel is point"  # half a pixel off pixel is area
+    write_tif(tmp_path / "h.tif", raster_of(plane, affine, **size), WORLD.crs, affine, point=point)
     _, source = built(tmp_path, height=tmp_path / "h.tif")
     check_plane(source)
 

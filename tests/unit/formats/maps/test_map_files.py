@@ -69,16 +69,6 @@ def test_gdal_opens_each_layer_in_its_place(path):
         np.testing.assert_allclose(values, wanted, atol=1e-4)
 
 
-def test_an_open_map_knows_what_it_is(path):
-    source = open_map(path)
-    assert (source.name, tuple(source.layers), source.classes.count) == ("garden", ("height", "ortho", "terrain"), 7)
-    assert source.facts.sources == {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif"}
-    assert source.read("height", 3, 5, 7, 11).shape == (2, 4)
-    summary = source.summary()
-    assert (summary.crs, summary.rows, summary.pixel_size_m) == (WORLD.crs, 200, 0.1)
-    assert summary.covered == {"height": 1.0, "ortho": 1.0, "terrain": 1.0}
-
-
 def test_overviews_are_maps_of_the_same_ground(path):
     source = open_map(path)
     assert source.factors == (1, 2, 4, 8)
