@@ -33,8 +33,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
         yield running
 
 
-def test_workers_do_all_tasks_and_what_they_say_is_said_here(cluster, caplog, monkeypatch):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+def test_workers_do_all_tasks_and_what_they_say_is_said_here(cluster, caplog):
     with caplog.at_level(STEP, "tcpipe"):
         outcomes = sorted(run_all(where, range(9), jobs=1, cluster=cluster.address), key=lambda outcome: outcome.index)
     assert [outcome.result[0] for outcome in outcomes] == [value * value for value in range(9)]
@@ -127,7 +126,6 @@ def test_a_scheduler_without_workers_and_a_worker_of_many_threads_are_one_line(t
 
 
 def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
     with dask_cluster(tmp_path, workers=1) as brief:
         with closing(run_all(time.sleep, [0, 600], jobs=1, cluster=brief.address)) as outcomes:
             next(outcomes)
@@ -186,9 +184,8 @@ def read_tables(store):
 
 
 def test_any_executor_does_all_tasks_says_once_what_they_say_and_makes_the_same_bytes(
-    executor, drive, tmp_path, caplog, monkeypatch
+    executor, drive, tmp_path, caplog
 ):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
     with caplog.at_level(logging.INFO, "tcpipe"):
         outcomes = sorted(run_all(where, range(2), jobs=1, cluster=executor), key=lambda outcome: outcome.index)
     assert [outcome.result[0] for outcome in outcomes] == [0, 1]
@@ -207,8 +204,7 @@ def test_what_has_not_begun_when_a_call_ends_does_not_begin(tmp_path):
     assert time.monotonic() - began_s < 20.0
 
 
-def test_a_task_whose_worker_died_is_named_and_a_stopped_executor_is_one_line(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+def test_a_task_whose_worker_died_is_named_and_a_stopped_executor_is_one_line(caplog):
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as processes:
         assert [outcome.died for outcome in run_all(die, [1, 2], jobs=1, cluster=processes)] == [True, True]
     assert "executor ProcessPoolExecutor: a task ended without a result (BrokenProcessPool: " in caplog.text

@@ -302,7 +302,7 @@ def _make_state():
 
 
 @given(st.data())
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("state") / "model.checkpoint"
     state, again = _make_state(), _make_state()
