@@ -20,7 +20,7 @@ import bokeh
 import numpy as np
 import pyarrow as pa
 from bokeh.document import Document
-from bokeh.models import HoverTool
+from bokeh.models import HoverTool, NoOverlap
 from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 
@@ -184,7 +184,7 @@ def draw_ratios(
         name,
         alt=f"{label}, a point with its 95 % interval for each; the table lists the same.",
         axes=(label, ""),
-        legend={"below 1": KEPT, "open": FAINT, "above 1": DROPPED},
+        legend={"below 1": KEPT, "not significant": FAINT, "above 1": DROPPED},
         height_px=90 + 20 * len(known),
         tools="save",
         x_axis_type="log",
@@ -201,6 +201,7 @@ def draw_ratios(
     points = plot.figure.scatter("value", "name", size=9, color="colour", source=lines.data_source)
     plot.figure.hover.renderers = [points]
     plot.figure.xaxis.ticker.desired_num_ticks = 5
+    plot.figure.xaxis.major_label_policy = NoOverlap()
     plot.figure.ygrid.visible = False
     return plot
 
