@@ -86,10 +86,6 @@ def _format_figure(error: Errors | None, measure: str, quantity: str) -> str:
     return f"{value:.{_DIGITS[quantity]}f}"
 
 
-def _format_figures(error: Errors | None, quantity: str) -> list[str]:
-    return [_format_figure(error, measure, quantity) for measure in MEASURES]
-
-
 def _format_paper_figure(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
@@ -265,11 +261,11 @@ def _make_other_section(
     splits = found.ordered_splits
     rows: list[tuple[str, ...]] = []
     for name, by_split in errors.items():
-        figures = [_format_figures(by_split.get(split), quantity) for split in splits]
-        rows.append((name, "", *(figure for pair in figures for figure in pair)))
+        figures = (_format_figure(by_split.get(split), measure, quantity) for split in splits for measure in MEASURES)
+        rows.append((name, "", *figures))
         if name in PAPER:
-            pairs = [PAPER[name][SPLITS.index(split)] for split in splits]
-            rows.append(("", "paper", *(_format_paper_figure(value) for pair in pairs for value in pair)))
+            values = (value for split in splits for value in PAPER[name][SPLITS.index(split)])
+            rows.append(("", "paper", *map(_format_paper_figure, values)))
     header = ("", "", *(f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in MEASURES))
     return Section(title, text, header=header, rows=rows)
 

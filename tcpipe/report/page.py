@@ -53,9 +53,8 @@ from tcpipe.tables.findings import AFFECTED, Affected, Finding, Grade, Severity,
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Invisible characters and those that reverse the direction of text; a name may contain them."""
 
-_NUMBER = r"[-+±]?\d+(?:\.\d+)?(?: ?(?:[%°]|[a-zA-Z/]{1,3}\b))?(?: \([^)]*\))?"
-_NUMBERS = re.compile(rf"{_NUMBER}(?:(?:, | to ){_NUMBER})*")
-_NO_NUMBER = ("", "–", "none", "nan")
+_NUMBER = r"[-+±]?(?:\d+(?:\.\d+)?|nan)(?: ?(?:[%°]|[a-zA-Z/]{1,3}\b))?(?: \([^)]*\))?"
+_NUMBERS = re.compile(rf"{_NUMBER}(?:(?:, | to ){_NUMBER})*|(?:–|none)?")
 
 _SCRIPTS = "<!-- scripts -->"
 
@@ -162,16 +161,8 @@ class Section:
     """Sections below it, which have no parts; those without figures wait behind their titles."""
 
     def list_number_columns(self) -> list[bool]:
-        """Return which columns of the table contain numbers, or texts that show only numbers, and are aligned to the right."""
-        texts = [
-            [str(cell) for cell in column if not isinstance(cell, Link | Shaded)]
-            for column in zip(*self.rows, strict=True)
-        ]
-        return [
-            any(_NUMBERS.fullmatch(text) for text in column)
-            and all(_NUMBERS.fullmatch(text) or text in _NO_NUMBER for text in column)
-            for column in texts
-        ]
+        """Return which columns of the table show only numbers, which are aligned to the right."""
+        return [all(_NUMBERS.fullmatch(str(cell)) for cell in column) for column in zip(*self.rows, strict=True)]
 
 
 def render_page(

@@ -54,7 +54,7 @@ page.start(() => {
     const [name, , number] = columns[i];
     const button = make("button", head.textContent, { type: "button", className: "sort" });
     button.onclick = () => { [by, falls] = [name, by === name ? !falls : Boolean(number)]; draw(); };
-    if (number) head.classList.add("number");
+    head.classList.toggle("number", Boolean(number));
     head.replaceChildren(button);
   });
   more.onclick = () => { most += 100; draw(); };
