@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
-from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+from synthetic_store import add_run, box, lanes, open_world, region_file, segments
 
 from tcpipe.cli import cli
 from tcpipe.dataset import open_dataset
@@ -19,7 +19,6 @@ from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
 from tcpipe.tables.findings import select_findings
 
 WHY = "the robot pushed a fence"
@@ -31,8 +30,7 @@ def add(store, run_id, y_m, start_ns):
 
 @pytest.fixture
 def store(tmp_path):
-    opened = open_store(tmp_path / "store", create=True)
-    add_world(opened, tmp_path)
+    opened = open_world(tmp_path)
     add(opened, "a", 0.0, 10**18)
     add(opened, "b", 3.0, 2 * 10**18)
     return opened
