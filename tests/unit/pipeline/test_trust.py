@@ -251,22 +251,13 @@ def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path
 def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
     store = Store(copy("store"))
     sample = open_dataset(made / "zarr")["train"].samples["sample_id"][0].as_py()
-    put_map(
-        store,
-        "site",
-        height=made / "rasters" / "height.tif",
-        inputs=MapInputs({"height": {"height.tif": "another"}}),
-    )
+    height = WORLD.write(tmp_path, pixel_size_m=0.2)["height"]
+    put_map(store, "site", height=height, inputs=MapInputs({"height": {"height.tif": "another"}}))
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
     assert "terrain: map site no longer has this layer" in found
     assert found[-1] == "map site was added again later, from other files"
     elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pixel_size_m=0.2)
-    put_map(
-        store,
-        "site",
-        height=elsewhere["height"],
-        inputs=MapInputs({"height": {"height.tif": "another"}}),
-    )
+    put_map(store, "site", height=elsewhere["height"], inputs=MapInputs({"height": {"height.tif": "another"}}))
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
     assert found[0] == "map site no longer gives a patch for it"
 

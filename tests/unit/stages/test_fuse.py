@@ -226,7 +226,7 @@ def test_a_gap_of_all_motion_is_a_step_in_the_stamps(streams):
 
 
 def test_the_paper_estimator_and_another_rate_by_the_recipe(streams, truth):
-    begun = {role: to_integers(table, "stamp_ns") < drive.ZERO_NS + 20e9 for role, table in streams.tables.items()}
+    begun = {role: to_integers(table, "stamp_ns") < drive.ZERO_NS + 14e9 for role, table in streams.tables.items()}
     tables = {role: table.filter(pa.array(begun[role])) for role, table in streams.tables.items()}
     track = fuse_run(replace(streams, tables=tables), FuseConfig(estimator="ukf", rate_hz=10.0), run_id="r")
     assert track.info.estimator == "ukf"
