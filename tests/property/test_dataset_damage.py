@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, TcpipeError
@@ -13,7 +13,6 @@ from tcpipe.formats.integrity import SEAL
 from tcpipe.formats.json_files import MOST_BYTES, digest, to_json
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
 
 FORMATS = ("zarr", "parquet")
 
@@ -22,8 +21,7 @@ FORMATS = ("zarr", "parquet")
 def made(tmp_path_factory):
     """Twelve samples in either format."""
     directory = tmp_path_factory.mktemp("damage")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory / "rasters")
+    store = open_world(directory)
     add_run(store, "a", segments("a", *lanes(0.0, -6.0, 6.0)))
     for name in FORMATS:
         build_dataset(directory / name, store=store.root, recipe=Recipe(), holdout="sample", file_format=name)
