@@ -153,7 +153,7 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
             return
     checksums = parse_typed(parse_json(found.data, where), Checksums, where).checksums
     wrong = list(find_wrong_files(place, checksums))
-    yield from (*wrong, repair) if wrong else ()
+    yield from _repair_by(repair, wrong)
     yield "files", len(checksums)
     yield from (
         f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)
@@ -336,7 +336,7 @@ def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator
     try:
         yield from findings
     except TcpipeError as error:
-        yield from (*error.problems, repair)
+        yield from _repair_by(repair, error.problems)
 
 
 def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[CheckResult]:
@@ -363,7 +363,7 @@ def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Ch
             known |= set(read_as_at(place, name, Manifest).checksums)
     yield from _find_strangers(place, known)
     wrong = list(find_wrong_files(place, manifest.checksums))
-    yield from (*wrong, repair) if wrong else ()
+    yield from _repair_by(repair, wrong)
     yield "files", len(manifest.checksums)
     for name, checksum in manifest.checksums.items() if not wrong else ():
         table, rows = PurePosixPath(name).stem, read_row_count(place.local(name, checksum))
