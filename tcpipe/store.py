@@ -234,10 +234,9 @@ class Store:
         """Where tables for other tools lie."""
         return self.place.below("index")
 
-    def write_index(self, state: State, *, before: State | None = None) -> None:
-        """Write the table of all runs for other tools; one that was written at the state ``before`` is brought up to date."""
-        before = before or State()
-        write_index(self.index_place, state.runs, state.digest, before=before.runs, digest_before=before.digest or None)
+    def write_index(self, state: State) -> None:
+        """Write the table of all runs for other tools."""
+        write_index(self.index_place, state.runs)
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.

@@ -1,6 +1,7 @@
 """The recipe: every key that rules the pipeline, one frozen dataclass a stage, with its default, its bounds and its reason.
 
-It is checked when it is made, in TOML and in Python alike. ``formats.recipe_toml`` reads it from TOML; docs/reference/recipe.md and ``tcpipe init`` are written from the docstrings here.
+It is checked when it is made, in TOML and in Python alike. ``formats.recipe_toml`` reads it from TOML; docs/reference/recipe.md and
+``tcpipe init`` are written from the docstrings here.
 Units stand in the names. Rulings and their sources: docs/explanation/rulings.md.
 
 A bound is where a value can mean nothing any more, or costs without end: it is far outside of what any robot, sensor or site asks for.
