@@ -147,14 +147,14 @@ def make_zarr_writers(
     directory: Path,
     out: Place,
     pixels: Pixels,
-    sample_ids: Callable[[int, int], Sequence[str]],
+    sample_ids: pa.ChunkedArray,
     *,
     compression: Compression,
     threads: int,
 ) -> list[Drawer]:
     """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written to ``out``.
 
-    ``sample_ids`` gives the ids of the rows from one up to another; ``threads`` does not change the bytes.
+    ``threads`` does not change the bytes.
     """
     n, px = len(pixels.slots), pixels.patch_px
     shard = _choose_shard_rows(n)
@@ -188,8 +188,8 @@ def make_zarr_writers(
         attributes={"long_name": "joins patches and samples"},
     )
     for first in range(0, n, SHARD_ROWS):
-        last = min(first + SHARD_ROWS, n)
-        ids[first:last] = np.array(sample_ids(first, last), dtype=object)
+        few = sample_ids.slice(first, SHARD_ROWS)
+        ids[first : first + len(few)] = np.array(few.to_pylist(), dtype=object)
     consolidate_metadata(group)
     arrays = {name: _open_layer_array(directory, layer, n, px) for name, layer in pixels.layers.items()}
     rows = (slice(first, first + shard) for first in range(0, n, shard))

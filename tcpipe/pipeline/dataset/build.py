@@ -363,7 +363,8 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
     figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
-    shards = write_patches(directory, content, options.file_format, workers, compression=recipe.dataset.compression)
+    ids, compression = figures.column("sample_id"), recipe.dataset.compression
+    shards = write_patches(directory, content, ids, options.file_format, workers, compression=compression)
     _write_overviews(directory, content.sources)
     balance, drive_next = measure_balance(
         figures.select(BALANCE_COLUMNS),

@@ -77,10 +77,6 @@ class Redaction:
         """Return the public lon, lat [deg] of places (lon, lat) [deg], shape (..., 2)."""
         return _move_to_origin(self.in_plane(lonlat_deg))
 
-    def segment_id(self, name: str, run_id: str) -> str:
-        """Return the public id of a run's segment."""
-        return self.runs[run_id] + name[len(run_id) :]
-
     def table(self, samples: pa.Table) -> pa.Table:
         """Return samples with public places and names; courses and x, y are along the maps' grid.
 
@@ -104,7 +100,7 @@ class Redaction:
         columns["map"] = [self.maps[name] for name in samples.column("map").to_pylist()]
         for name in ("sample_id", "segment_id"):
             pairs = zip(samples.column(name).to_pylist(), runs, strict=True)
-            columns[name] = [self.segment_id(segment, run_id) for segment, run_id in pairs]
+            columns[name] = [self.runs[run_id] + segment[len(run_id) :] for segment, run_id in pairs]
         for name, values in columns.items():
             field = samples.schema.field(name)
             samples = samples.set_column(samples.schema.get_field_index(name), field, pa.array(values, field.type))
@@ -174,7 +170,7 @@ def redact_content(content: Content, redaction: Redaction) -> Content:
     added = content.samples.added  # descriptions of its columns name files
     bare = pa.schema([field.with_metadata({"unit": "", "doc": ""}) for field in added.schema])
     sampled = replace(sampled, footprint_lonlat_deg=footprints)
-    samples = replace(content.samples, sampled=sampled, added=added.cast(bare), redaction=redaction)
+    samples = replace(content.samples, sampled=sampled, added=added.cast(bare), redact=redaction.table)
     return replace(content, samples=samples, registrations=[() for _ in content.registrations])
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -156,33 +155,8 @@ class _Batch:
     spool: Spool
 
 
-@dataclass(frozen=True, slots=True)
-class _HeldMap:
-    source: MapFile
-    tiles: TilePool
-
-
-_held: OrderedDict[Path, _HeldMap] = OrderedDict()
-"""Maps of this process, while it samples."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Batches(Sequence[_Batch]):
-    """Batches that are made on access, so that one copy of their segments exists at a time."""
-
-    rows: Sequence[NDArray[np.int64]]
-    whole: _Batch
-    """All segments as one batch."""
-
-    def __len__(self) -> int:
-        """Return the number of batches."""
-        return len(self.rows)
-
-    def __getitem__(self, index: int) -> _Batch:  # type: ignore[override]  # nobody asks for slices
-        """Return one batch."""
-        rows = self.rows[index]
-        segments = take_rows(self.whole.segments, rows)
-        return replace(self.whole, number=index, ranks=self.whole.ranks[rows], segments=segments)
+_held = dict[Path, tuple[MapFile, TilePool]]()
+"""Maps of this process, while it samples, the last used one last."""
 
 
 def sample_all_segments(
@@ -218,7 +192,10 @@ def sample_all_segments(
     if count := len(spool.place.files()):
         logger.info("resuming: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
-    batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, shifts, spool))
+    batches = (  # made when a worker can have them: one copy of their segments exists at a time
+        _Batch(index, ranks[at], take_rows(placed, at), maps, config, gnss_crs, shifts, spool)
+        for index, at in enumerate(rows)
+    )
     lost_by, slots = (make_mapped_array(directory, (segments.num_rows,), kind) for kind in (np.uint32, np.int64))
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     findings: dict[int, tuple[Finding, ...]] = {}
@@ -284,8 +261,7 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     try:
         if (sampled := batch.spool.find(batch.number)) is not None:
             return sampled
-        held = [_reuse_map(*arguments, batch.config) for arguments in batch.maps()]
-        sources, pools = [each.source for each in held], [each.tiles for each in held]
+        sources, pools = zip(*(_reuse_map(*arguments, batch.config) for arguments in batch.maps()), strict=True)
         sampled = sample_on_maps(
             batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools, shifts=batch.shifts
         )
@@ -294,13 +270,12 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
         return error
 
 
-def _reuse_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> _HeldMap:
+def _reuse_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> tuple[MapFile, TilePool]:
     """Return a map with the tiles of this process's last batch: the next batch is near and needs the same ones."""
-    held = _held.pop(path, None)
-    if held is None:
+    if (held := _held.pop(path, None)) is None:
         source = open_map(path, fetched)
-        held = _HeldMap(source, TilePool(choose_level(source, config.patch_m / config.patch_px)))
+        held = source, TilePool(choose_level(source, config.patch_m / config.patch_px))
     _held[path] = held
     if len(_held) > _HELD_MAPS:
-        _held.popitem(last=False)
+        del _held[next(iter(_held))]
     return held
