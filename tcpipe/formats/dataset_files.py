@@ -29,14 +29,14 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
-from tcpipe.formats.json_files import Json, parse_typed, read_document
+from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS, READ_VERSIONS
+from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
 
@@ -79,10 +79,10 @@ MOST_PX = 1024
 
 @contextmanager
 def _convert_errors(remedy: str = "") -> Iterator[None]:
-    """Raise a `StoreError` as `DatasetError`, ``remedy`` added to its lines."""
+    """Raise a `StoreError`, or that a recipe cannot be, as `DatasetError`, ``remedy`` added to its lines."""
     try:
         yield
-    except StoreError as error:
+    except (StoreError, RecipeError) as error:
         raise DatasetError(*(f"{problem}{remedy}" for problem in error.problems)) from None
 
 
@@ -249,10 +249,7 @@ def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array
 
 
 def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
-    """Return the card of the dataset in ``directory``, of any data model.
-
-    One of this data model is ``proved`` against its seal.
-    """
+    """Return the card of the dataset in ``directory``, ``proved`` against its seal."""
     if not directory.exists():
         raise UsageError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
     if not directory.is_dir():
@@ -266,37 +263,27 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
 
 def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> DatasetCard:
     """Return the card in the bytes of a file; as `read_card`."""
+
+    def is_current(card: Mapping[str, object]) -> bool:
+        return card.get("kind") == KIND and card.get("data_model_version") == DATA_MODEL_VERSION
+
     with _convert_errors():
-        found = verify_document(data, where, ours=lambda found: proved and _is_current(found))
+        found = verify_document(data, where, ours=lambda found: proved and is_current(found))
+        if is_current(found):
+            return parse_typed(found, DatasetCard, where)
     if found.get("kind") != KIND:
         raise DatasetError(f"{where}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
-    if not _is_current(found) or "verdict" not in found:  # before data model 3.0 its findings were sentences
-        found.pop("findings", None)
-    try:
-        return parse_typed(found, DatasetCard, where)
-    except (StoreError, RecipeError) as error:
-        directory, version = str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")
-        problems = error.problems if _is_current(found) else (_describe_outdated(directory, version),)
-        raise DatasetError(*problems) from None
-
-
-def _describe_outdated(directory: Path | str, version: Json) -> str:
+    directory, version = str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
-    return f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}"
+    raise DatasetError(f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}")
 
 
-def _is_current(card: Mapping[str, object]) -> bool:
-    return card.get("kind") == KIND and card.get("data_model_version") in READ_VERSIONS
-
-
-def read_current_card(directory: Path) -> DatasetCard:
-    """Return the card of a dataset of this data model, whose samples and descriptions of patches are as they were written.
+def read_intact_card(directory: Path) -> DatasetCard:
+    """Return the card of a dataset whose samples and descriptions of patches are as they were written.
 
     Patches carry checksums of their own, which are proved when they are read.
     """
     card = read_card(directory)
-    if card.data_model_version not in READ_VERSIONS:
-        raise DatasetError(_describe_outdated(directory, card.data_model_version))
     described = [name for name in card.checksums if Path(name).name == DESCRIPTION]
     with _convert_errors():
         prove_files(directory, card.checksums, [SAMPLES, *described])

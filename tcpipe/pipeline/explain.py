@@ -23,8 +23,8 @@ from tcpipe.formats.dataset_files import (
     find_places_in_files,
     is_shard,
     open_patches,
-    read_current_card,
     read_exclusion_reason,
+    read_intact_card,
     read_samples,
     sample_columns,
 )
@@ -161,7 +161,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     """
     opened = open_store(store)
     directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)
-    card, sample = read_current_card(directory), _read_sample(directory, sample_id)
+    card, sample = read_intact_card(directory), _read_sample(directory, sample_id)
     run = _run(opened, directory, card, sample)
     streams = opened.read_streams(run.run_id, key=run.streams_key)
     source = open_map(*opened.map_files(sample["map"]))

@@ -22,9 +22,6 @@ from tcpipe.tables.findings import Finding, StageReport
 DATA_MODEL_VERSION = "3.0"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
 
-READ_VERSIONS = (DATA_MODEL_VERSION,)
-"""Versions whose documents are read as they are."""
-
 EARLIER_VERSIONS = ("2.0", "2.1")
 """Versions that `tcpipe migrate` brings to the current one."""
 

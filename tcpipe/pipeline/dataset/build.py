@@ -35,7 +35,7 @@ from tcpipe.formats.dataset_files import (
     SAMPLES,
     SHARDS,
     read_card,
-    read_current_card,
+    read_intact_card,
 )
 from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
@@ -80,7 +80,6 @@ from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_o
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
-from tcpipe.tables.levels import READ_VERSIONS
 from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
@@ -133,8 +132,7 @@ class BuildResult:
         ledger = f"{sum(card.distance_by_reason_m.values()):.0f} m driven: {card.distance_by_reason_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {-metres:.0f} m {name.replace('_', ' ')}" for metres, name in sorted(lost))
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
-        verdict = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
-        return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
+        return [head, ledger, *map(str, card.exclusions), *floor, f"verdict: {format_verdict(card.verdict)}"]
 
     def _closing(self) -> list[str]:
         if self.card is None or self.card.redaction is None:
@@ -282,7 +280,7 @@ def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
         return None, False
     directory, fetched = fetch_directory_by_range(url, by_range=lambda _: True)
     card = read_card(directory)
-    return card, fetched is not None and fetched.is_complete() and card.data_model_version in READ_VERSIONS
+    return card, fetched is not None and fetched.is_complete()
 
 
 def _make_result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
@@ -322,7 +320,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
         left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
         raise DatasetError(*error.problems, left) from None
     try:
-        read_current_card(place)
+        read_intact_card(place)
     except DatasetError as error:
         proved = False
         logger.warning("%s; it is built again", error.problems[0])

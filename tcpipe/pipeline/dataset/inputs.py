@@ -23,7 +23,7 @@ from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_range
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
-from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
+from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
 from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
@@ -182,17 +182,13 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 
 
 def read_earlier_splits(dataset: str | Path) -> pa.Table:
-    """Return ``sample_id``, ``split`` and, if it has one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
+    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` if it is none."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     if read_card(directory).redaction is not None:
         raise DatasetError(
             f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"
         )
-    there = sample_columns(directory)
-    missing = [name for name in ("sample_id", "split") if name not in there]
-    if missing:
-        raise DatasetError(f"{directory}: its samples have no column {missing[0]}; its split cannot be kept")
-    return read_samples(directory, [name for name in ("sample_id", "split", "fold") if name in there])
+    return read_samples(directory, ["sample_id", "split", "fold"])
 
 
 def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:

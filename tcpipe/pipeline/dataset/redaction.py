@@ -302,8 +302,7 @@ def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     if abs(ratio - 1.0) > max(most, _SCALE_VARIES):
         yield f"distances are {ratio:.6f} of chord_m: the scale of the maps' plane reveals the place; build it again"
     yield from (f"tells {text!r}" for text in (*card.label.includes, *card.added_columns.values()) if text)
-    reasons = card.verdict.reasons if card.verdict else ()
-    every = (card.findings, reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
+    every = (card.findings, card.verdict.reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
     others = (
         finding for findings in every for finding in findings if not _is_cut_sentence(finding, card.tcpipe_version)
     )
