@@ -12,12 +12,11 @@ from operator import attrgetter
 from pathlib import PurePosixPath
 from typing import Literal, TypeAlias
 
-import msgspec
 import pyarrow as pa
 from pyarrow.json import ParseOptions, ReadOptions, read_json
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import convert_record
+from tcpipe.formats.json_files import convert_record, to_compact_json
 from tcpipe.formats.parquet import write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
@@ -165,12 +164,9 @@ def write_index(place: Place, rows: Rows) -> None:
 
 
 def _make_line(row: RunFacts) -> bytes:
-    """Return a row as a line of JSON; names of files that are no text with escapes."""
     cells = {name: _CELLS.get(name, attrgetter(name))(row) for name in _SCHEMA.names}
-    try:
-        return msgspec.json.encode(cells)
-    except UnicodeEncodeError:
-        return msgspec.json.encode(_to_text(cells))
+    line = to_compact_json(cells)
+    return to_compact_json(_to_text(cells)) if b"\\ud" in line else line  # a name that is no text
 
 
 def _parse_lines(lines: Sequence[bytes]) -> pa.Table:
@@ -183,6 +179,7 @@ def _parse_lines(lines: Sequence[bytes]) -> pa.Table:
 
 
 def _to_text(value: object) -> object:
+    """Return a value with names of files that are no text as text with escapes."""
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, Mapping):
