@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,9 +79,9 @@ def available_features(features: ExtraFeatures) -> tuple[ExtraFeature, ...]:
 
 def fill_unknown(inputs: Sequence[ExtraFeature], features: ExtraFeatures) -> ExtraFeatures:
     """Return the features with a model's usual values where one that it takes is unknown."""
-    known = dict[str, Floats]()
+    known = dict[str, Any]()
     for feature in inputs:
-        values: Floats = getattr(features, feature.name)
+        values = getattr(features, feature.name)
         known[feature.name] = np.where(np.isfinite(values), values, feature.usual)
     return replace(features, **known)
 

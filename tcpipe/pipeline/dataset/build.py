@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 import shutil
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,7 +41,7 @@ from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
-from tcpipe.formats.json_files import digest, write_json
+from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import ROWS_PER_GROUP, map_table, return_freed_memory, write_parquet_rows, write_pieces
@@ -59,7 +59,7 @@ from tcpipe.pipeline.calls import (
     start_stopwatch,
 )
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
+from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, make_dataset_card
 from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
@@ -150,42 +150,18 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
     measure, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
-    out, store, tags, dry_run = options.out, options.store, options.tags or {}, options.dry_run
+    out, store, dry_run = options.out, options.store, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
     opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
     log = open_log(opened)
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
-    known, proved = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
-    regions = None if options.split is None else read_regions(Path(options.split))
-    region = None if options.split is None else Path(options.split).read_bytes()
-    robot = options.robot or ruling.robot
-    covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
-    tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
-    earlier = None if keep_split is None else read_earlier_splits(keep_split)
-    keeps_own = keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place)
-    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
-    inputs = choose_inputs(
-        opened,
-        marks,
-        state=log.state,
-        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
-        robot=robot,
-        region=region,
-        covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
-        exclusions=read_exclusions(options.exclude, options.reason),
-    )
-    inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
-    left_out = _find_left_out(
-        inputs,
-        None if known is not None and known.redaction else known,
-        robot=robot,
-        tags=tags,
-        min_runs=options.min_runs,
-    )
+    known, is_intact = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
+    marks = _read_options(options, ruling, place)
+    inputs = choose_inputs(opened, marks, log.state)
+    left_out = _find_left_out(inputs, known, marks, options.min_runs)
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
-    is_same = proved and known is not None and known.inputs == inputs.digest
-    if is_same and known is not None and (isinstance(place, str) or is_whole(place, known)):
+    if is_intact and known is not None and known.inputs == inputs.digest:
         result = _make_result(place, "unchanged", known, left_out)
         _commit_references(log, _describe_dataset(result, inputs))
         return result
@@ -215,6 +191,26 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         call.kind = "built"
         call.end = Entries(datasets=(dataset,), forgotten=replaced, calls=(measure(took),))
     return result
+
+
+def _read_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | str) -> BuildOptions:
+    """Return a user's choices for the dataset at ``place``."""
+    split, map_name, keep_split = options.split, options.map_name, options.keep_split
+    tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
+    return BuildOptions(
+        recipe=recipe,
+        robot=options.robot or recipe.robot,
+        tags=options.tags or {},
+        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
+        regions=None if split is None else read_regions(Path(split)),
+        region=None if split is None else Path(split).read_bytes().decode("utf-8", "replace"),
+        covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
+        exclusions=read_exclusions(options.exclude, options.reason),
+        file_format=options.file_format,
+        redact=options.redact,
+        earlier=None if keep_split is None else read_earlier_splits(keep_split),
+        keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
+    )
 
 
 build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
@@ -259,11 +255,12 @@ def _commit_references(log: LogWriter, dataset: Dataset) -> None:
 
 
 def _find_left_out(
-    inputs: Inputs, known: DatasetCard | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
+    inputs: Inputs, known: DatasetCard | None, options: BuildOptions, min_runs: int | None
 ) -> tuple[Finding, ...]:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
-    fewer = (*chosen.missing, *(() if known is None else find_gone_runs(known.runs, chosen, robot=robot, tags=tags)))
+    before = () if known is None or known.redaction else known.runs
+    fewer = (*chosen.missing, *find_gone_runs(before, chosen, robot=options.robot, tags=options.tags))
     if min_runs is None:
         return (*chosen.damaged, *fewer)
     if len(inputs.runs) < min_runs:
@@ -274,7 +271,7 @@ def _find_left_out(
 
 
 def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
-    """Return the card of the dataset at a URL, if there is one, and whether all of it can be read."""
+    """Return the card of the dataset at a URL, if there is one, and whether it is intact."""
     open_place(url).check()
     if find_newest(url, [CARD]) is None:
         return None, False
@@ -329,7 +326,9 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise UsageError(f"{place}: contains {others[0]}{more}, not of the dataset; move it or give another OUT")
-    return card, proved
+    files = ((place / name, entry.size_bytes) for name, entry in card.checksums.items())
+    is_whole = all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
+    return card, proved and is_whole
 
 
 @contextmanager

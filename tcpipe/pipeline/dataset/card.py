@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -142,12 +141,6 @@ def _fold_counts(samples: pa.Table) -> tuple[int, ...]:
 
 def _count(samples: pa.Table, column: str, value: str) -> int:
     return int(pc.sum(pc.equal(samples.column(column), value)).as_py() or 0)
-
-
-def is_whole(directory: Path, card: DatasetCard) -> bool:
-    """Return whether every file that the card lists is there with its size."""
-    files = ((directory / name, entry.size_bytes) for name, entry in card.checksums.items())
-    return all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
 
 
 def _count_terrain(samples: pa.Table) -> dict[str, dict[str, int]]:

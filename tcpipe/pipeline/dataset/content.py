@@ -277,7 +277,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
     tags = read_tags(pc.unique(segments.column("run_id")).to_pylist(), inputs.sources, recipe.split)
-    excluded = find_excluded(inputs.exclusions, segments.column("segment_id"), sampled.kept)
+    excluded = find_excluded(options.exclusions, segments.column("segment_id"), sampled.kept)
     assigned, result = draw_splits(
         segments,
         sampled,
@@ -291,7 +291,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     unused = {
         Loss.SPLIT_BUFFER: assigned.is_in("buffer"),
         Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED) & ~excluded.mask,
-        **({Loss.EXCLUDED: excluded.mask} if inputs.exclusions else {}),
+        **({Loss.EXCLUDED: excluded.mask} if options.exclusions else {}),
     }
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
@@ -301,7 +301,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
-        segments, sampled.kept[order], inputs.sources, inputs.covariates, recipe.covariates, layers=tuple(spool.layers)
+        segments, sampled.kept[order], inputs.sources, options.covariates, recipe.covariates, layers=tuple(spool.layers)
     )
     robots = [run.robot for run in inputs.sources]
     narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m)

@@ -44,11 +44,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class BuildOptions:
-    """A user's choices for a dataset besides its runs, maps and tables; ``recipe`` includes holdout and seed of the call."""
+    """A user's choices for a dataset, read and checked; ``recipe`` includes holdout and seed of the call."""
 
     recipe: Recipe
-    regions: Regions | None
+    robot: str | None
     tags: Mapping[str, str]
+    map_names: tuple[str, ...]
+    """In order of priority where maps overlap; none: the only one."""
+    region: str | None
+    """The file of the regions, as text."""
+    regions: Regions | None
+    covariates: tuple[CovariateTable, ...]
+    exclusions: tuple[ExcludedIds, ...]
     file_format: FileFormat
     redact: bool
     earlier: pa.Table | None
@@ -75,30 +82,18 @@ class Inputs:
     chosen: SelectedRuns
     findings: tuple[Finding, ...]
     """On the choice of runs."""
-    covariates: tuple[CovariateTable, ...] = ()
-    exclusions: tuple[ExcludedIds, ...] = ()
 
 
-def choose_inputs(
-    store: Store,
-    options: BuildOptions,
-    *,
-    state: State,
-    map_names: Sequence[str],
-    robot: str | None,
-    region: bytes | None,
-    covariates: tuple[CovariateTable, ...],
-    exclusions: tuple[ExcludedIds, ...],
-) -> Inputs:
+def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
     """Return the runs of one robot ingested with this recipe, and the maps; `DatasetError` lists the candidates."""
     problems = list[str]()
     try:
-        chosen = choose_runs(store, options.recipe, state=state, robot=robot, tags=options.tags)
+        chosen = choose_runs(store, options.recipe, state=state, robot=options.robot, tags=options.tags)
         _refuse_without_segments(chosen.runs)
     except DatasetError as error:
         problems += error.problems
     try:
-        names = choose_maps(store, map_names)
+        names = choose_maps(store, options.map_names)
     except DatasetError as error:
         problems += error.problems
     if problems:
@@ -118,19 +113,24 @@ def choose_inputs(
             "recipe": options.recipe,
             "runs": [{key: value for key, value in to_plain(run).items() if key != "samples"} for run in sources],
             "maps": list(zip(names, map_sha256, strict=True)),
-            "region": None if region is None else region.decode("utf-8", "replace"),
+            "region": options.region,
             "format": options.file_format,
-            **({"covariates": [(table.name, table.checksum) for table in covariates]} if covariates else {}),
             **(
-                {"excluded": [(table.name, table.checksum, table.reason) for table in exclusions]} if exclusions else {}
+                {"covariates": [(table.name, table.checksum) for table in options.covariates]}
+                if options.covariates
+                else {}
+            ),
+            **(
+                {"excluded": [(ids.name, ids.checksum, ids.reason) for ids in options.exclusions]}
+                if options.exclusions
+                else {}
             ),
             **({} if options.earlier is None else {"kept_split": _hash_table(options.earlier)}),
         }
     )
+    fingerprint = digest(("redacted", fingerprint)) if options.redact else fingerprint
     findings = (*chosen.findings, *once.findings)
-    return Inputs(
-        runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings, covariates, exclusions
-    )
+    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings)
 
 
 def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
@@ -248,9 +248,9 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
     yield (
         "--covariates",
         tuple(table.name for table in card.covariates),
-        tuple(table.name for table in inputs.covariates),
+        tuple(table.name for table in options.covariates),
     )
-    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in inputs.exclusions)
+    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in options.exclusions)
     yield "--format", card.format, options.file_format
     if not options.keeps_own_split:
         yield "--keep-split", card.split.kept is not None, options.earlier is not None
