@@ -31,7 +31,7 @@ from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
 from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
-from tcpipe.formats.parquet import read_column_names, read_row_group, read_table, write_parquet_bytes
+from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
@@ -362,9 +362,8 @@ class PatchFiles:
                 else:
                     name, group = self.groups[piece]
                     path = self.directory / name
-                    table = read_row_group(
-                        path if self.fetched is None else self.fetched.fetch_file(path), group, list(layers)
-                    )
+                    path = path if self.fetched is None else self.fetched.fetch_file(path)
+                    table = read_table(path, list(layers), group=group)
                     for layer in layers:
                         flat = table.column(layer).combine_chunks().flatten().to_numpy()
                         into[layer][:rows] = flat.reshape(rows, *into[layer].shape[1:])
@@ -380,12 +379,10 @@ def is_shard(name: str) -> bool:
     return name.startswith(f"{SHARDS}/") or (name.startswith(f"{PATCHES}/") and "/c/" in name)
 
 
-def open_patches(
-    directory: Path, card: DatasetCard, fetched: FetchedShards | None = None, *, proved: bool = True
-) -> PatchFiles:
+def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | None = None) -> PatchFiles:
     """Return where the patches of a dataset lie, here or ``fetched``.
 
-    Where that is to be ``proved``, shards are held against the card: on this machine at once, in a bucket each before it is first read.
+    Shards are held against the card: on this machine at once, in a bucket each before it is first read.
     A digest is found once and remembered, so that to open the dataset again costs a look at each file.
     """
     px, samples = card.patch_px, card.samples
@@ -399,25 +396,20 @@ def open_patches(
         )
     if "terrain" in layers and not card.classes:
         raise DatasetError(f"{directory / CARD}: a layer terrain, but no classes; build the dataset again")
-    fetched = fetched and replace(fetched, proves=proved)
-    if proved and fetched is None:
+    fetched = fetched and replace(fetched, proves=True)
+    if fetched is None:
         shards = [name for name in card.checksums if is_shard(name)]
-        _refuse_others(find_changed_files(Place(directory), card.checksums, shards), directory)
+        if wrong := find_changed_files(Place(directory), card.checksums, shards):
+            more = f", and {len(wrong) - 1} more shards" if len(wrong) > 1 else ""
+            raise DatasetError(
+                f"{wrong[0]}{more}: not of the build of {directory / CARD}; copy the whole dataset again, or build it again"
+            )
     if card.format == "parquet":
         return replace(_open_sharded_patches(directory, layers, px, card), fetched=fetched)
     with _convert_errors(_AGAIN):
         arrays = {name: _open_layer_array(directory, layer, samples, px, fetched) for name, layer in layers.items()}
     starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
     return PatchFiles(directory, layers, px, starts, arrays, fetched=fetched)
-
-
-def _refuse_others(wrong: Sequence[str], directory: Path) -> None:
-    """Raise one `DatasetError` for shards that are not the card's."""
-    if wrong:
-        more = f", and {len(wrong) - 1} more shards" if len(wrong) > 1 else ""
-        raise DatasetError(
-            f"{wrong[0]}{more}: not of the build of {directory / CARD}; copy the whole dataset again, or build it again"
-        )
 
 
 def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:

@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -17,7 +16,6 @@ from pyarrow.csv import write_csv
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
-from tcpipe.execution import Executor
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
@@ -44,7 +42,7 @@ from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_p
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
-from tcpipe.formats.parquet import ROWS_PER_GROUP, map_table, return_freed_memory, write_parquet_rows, write_pieces
+from tcpipe.formats.parquet import map_table, return_freed_memory, write_parquet_rows, write_pieces
 from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
@@ -165,7 +163,10 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         result = _make_result(place, "unchanged", known, left_out)
         _commit_references(log, _describe_dataset(result, inputs))
         return result
-    _refuse_other_options(place, known, marks, inputs, force=options.force)
+    others = [] if known is None or known.inputs == inputs.digest else find_other_options(known, marks, inputs)
+    if others and not options.force:
+        what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
+        raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
     if dry_run:
         if isinstance(place, str):
             read_generations(open_place(place), CARD)
@@ -176,8 +177,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
     with commit_call(log, BUILD, [make_absolute(place)]) as call:
-        start_workers = partial(_start_workers, jobs=options.jobs, cluster=options.cluster)
-        with output as directory, start_workers(directory, opened, inputs.digest) as workers:
+        with output as directory, _start_workers(directory, opened, inputs.digest, options) as workers:
             card = _build(directory, inputs, marks, workers)
             _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
         for entry in workers.waiting.entries():
@@ -215,17 +215,6 @@ def _read_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | st
 
 build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
 """`tcpipe.build_dataset`: its keywords are the fields of `BuildDatasetOptions`."""
-
-
-def _refuse_other_options(
-    place: Path | str, known: DatasetCard | None, options: BuildOptions, inputs: Inputs, *, force: bool
-) -> None:
-    """Raise `UsageError`, a line for each difference, unless a dataset with other options may be replaced."""
-    if known is None or known.inputs == inputs.digest or force:
-        return
-    if others := find_other_options(known, options, inputs):
-        what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
-        raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
 
 
 def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> None:
@@ -332,16 +321,14 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 
 @contextmanager
-def _start_workers(
-    directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | Executor | None
-) -> Iterator[Workers]:
+def _start_workers(directory: Path, store: Store, inputs: str, options: BuildDatasetOptions) -> Iterator[Workers]:
     """Yield the workers; their spool is in the new directory, or in the store, which a cluster's workers see."""
-    if cluster is None:
-        yield Workers(jobs, None, Place(directory / SPOOL), Place(directory))
+    if options.cluster is None:
+        yield Workers(options.jobs, None, Place(directory / SPOOL), Place(directory))
         return
     waiting = store.place.below(f"{SPOOL}/{inputs}")
     try:
-        yield Workers(1, cluster, waiting, waiting.below("files"))
+        yield Workers(1, options.cluster, waiting, waiting.below("files"))
     except MissingFileError as error:
         if not error.where.startswith(waiting.where()):
             raise
@@ -394,7 +381,7 @@ def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *BALANCE_COLUMNS, *SAMPLE_COLUMNS)))
 
     def write_both() -> Iterator[pa.Table]:
-        for piece in samples.pieces(ROWS_PER_GROUP):
+        for piece in samples.pieces():
             write(piece)
             few = piece.select(names).replace_schema_metadata(None)
             del piece  # else it is in memory beside the next one

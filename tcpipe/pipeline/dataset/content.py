@@ -44,6 +44,7 @@ from tcpipe.formats.dataset_files import (
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import (
+    ROWS_PER_GROUP,
     add_geo_metadata,
     map_table,
     move_to_file,
@@ -74,9 +75,6 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
 from tcpipe.terrain.projection import compute_area, parse_crs
 
 logger = logging.getLogger("tcpipe")
-
-_ROWS = 1 << 17
-"""Rows whose centres are computed together."""
 
 
 def _pool_segments(
@@ -173,7 +171,10 @@ class SampleTable:
     def schema(self) -> pa.Schema:
         """The samples' columns, with the extent of their places."""
         bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
-        pieces = (self._centres_deg(self.patch[first : first + _ROWS]) for first in range(0, len(self), _ROWS))
+        pieces = (
+            self._centres_deg(self.patch[first : first + ROWS_PER_GROUP])
+            for first in range(0, len(self), ROWS_PER_GROUP)
+        )
         corners = [corner for piece in pieces for corner in (piece.min(axis=0), piece.max(axis=0))]
         return add_geo_metadata(bare, "Point", np.array(corners).reshape(-1, 2)).schema
 
@@ -215,17 +216,17 @@ class SampleTable:
             table = table.append_column(field, added.column(field.name))
         return add_geo_metadata(table if self.redact is None else self.redact(table), "Point", centres)
 
-    def pieces(self, rows: int) -> Iterator[pa.Table]:
-        """Yield the table in pieces of so many rows; at least one, which may be empty."""
-        for first in range(0, max(len(self), 1), rows):
-            yield self.take(np.arange(first, min(first + rows, len(self))))
+    def pieces(self) -> Iterator[pa.Table]:
+        """Yield the table in pieces of `ROWS_PER_GROUP`; at least one, which may be empty."""
+        for first in range(0, max(len(self), 1), ROWS_PER_GROUP):
+            yield self.take(np.arange(first, min(first + ROWS_PER_GROUP, len(self))))
 
     def centres_xy_m(self) -> NDArray[np.float64]:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
         centres = np.empty((len(self), 2))
-        for first in range(0, len(self), _ROWS):
-            corners = self.sampled.footprint_xy_m[self.patch[first : first + _ROWS]]
-            centres[first : first + _ROWS] = corners.mean(axis=1)
+        for first in range(0, len(self), ROWS_PER_GROUP):
+            corners = self.sampled.footprint_xy_m[self.patch[first : first + ROWS_PER_GROUP]]
+            centres[first : first + ROWS_PER_GROUP] = corners.mean(axis=1)
         return centres
 
 

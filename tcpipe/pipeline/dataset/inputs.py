@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
+from tcpipe.pipeline.dataset.sampling import MapPlaces
 from tcpipe.pipeline.dataset.splitting import ExcludedIds, regions_to_json
 from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.recipe import Recipe
@@ -72,8 +73,7 @@ class Inputs:
     sources: tuple[RunSource, ...]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap."""
-    maps: Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
-    """Returns arguments of `open_map`, on any machine."""
+    maps: MapPlaces
     map_sha256: tuple[str, ...]
     """Over the checksums of each map's files."""
     again: Mapping[str, NDArray[np.bool_]]

@@ -18,7 +18,6 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, Redacted, judge_dataset
 from tcpipe.formats.geojson import FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_facts import RasterOrigin
-from tcpipe.formats.parquet import ROWS_PER_GROUP
 from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
@@ -123,7 +122,7 @@ def _estimate_scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
     `DatasetError` if it is so far from 1 that the extent of the maps in pixels would reveal it.
     """
     plane_chord = chord_chord = 0.0
-    for piece in samples.pieces(ROWS_PER_GROUP):
+    for piece in samples.pieces():
         start, end = (_project_to_map(read_lonlat_deg(piece, end), gnss_crs, map_crs) for end in _ENDS)
         chord_m = to_floats(piece, "chord_m")
         plane_chord += float(np.hypot(*(end - start).T) @ chord_m)
