@@ -151,7 +151,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
     if card.redaction is not None:
         table = SAMPLES_SCHEMA.add_missing_columns(read_table(samples))
-        yield from (f"{where}: {problem}" for problem in find_leaks(card, table))
+        yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:

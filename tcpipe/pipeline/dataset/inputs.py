@@ -24,6 +24,7 @@ from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
 from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
 from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
@@ -106,7 +107,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
         _map_digest(name, path) if fetched is None else _digest_of(document.checksums, document.zarr)
         for name, document, (path, fetched) in zip(names, documents, maps(), strict=True)
     )
-    sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
+    sources = tuple(_make_source(run, chosen.logs[run.run_id]) for run in runs)
     fingerprint = digest(
         {
             "versions": [__version__, TABLES_VERSION],
@@ -207,7 +208,7 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names)) or (maps[0],)
 
 
-def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
+def _make_source(run: RunDirectory, log: LogOrigin) -> RunSource:
     """Return the card's entry of a run."""
     named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
     return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
@@ -319,26 +320,6 @@ class UniqueRuns:
 
 
 @dataclass(frozen=True, slots=True)
-class _Spans:
-    """From when to when the runs' segments are [ns] and whose they are, (N,); a run of which that is not known is there at any time."""
-
-    start_ns: NDArray[np.int64]
-    end_ns: NDArray[np.int64]
-    robot: NDArray[np.str_]
-
-    def find_overlapping(self, index: int) -> list[int]:
-        """Return which earlier runs of the same robot have segments at the time of one."""
-        early = slice(0, index)
-        apart_ns = np.maximum(self.start_ns[early], self.start_ns[index]) - np.minimum(
-            self.end_ns[early], self.end_ns[index]
-        )
-        found: list[int] = np.flatnonzero(
-            (apart_ns <= _SAME_TIME_NS) & (self.robot[early] == self.robot[index])
-        ).tolist()
-        return found
-
-
-@dataclass(frozen=True, slots=True)
 class _SegmentPositions:
     """When and where a run's segments lie, in the order of its file, which is that of time: [ns], (N,), and lon, lat [deg], (N, 2)."""
 
@@ -356,7 +337,8 @@ def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, 
     sha256_by_run : hash of each run's log.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
-    spans, kept = _read_spans(runs), dict[int, RunDirectory]()
+    start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T
+    robot, kept = np.array([run.facts.robot for run in runs]), dict[int, RunDirectory]()
 
     @lru_cache(maxsize=_WAYS)
     def way(index: int) -> _SegmentPositions:
@@ -371,7 +353,8 @@ def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, 
             findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
         twice, others = np.zeros(run.facts.segments, np.bool_), []
-        for earlier in spans.find_overlapping(index):
+        apart_ns = np.maximum(start_ns[:index], start_ns[index]) - np.minimum(end_ns[:index], end_ns[index])
+        for earlier in np.flatnonzero((apart_ns <= _SAME_TIME_NS) & (robot[:index] == run.facts.robot)).tolist():
             if earlier in kept:
                 shared = _find_shared(way(index), way(earlier))
                 twice |= shared
@@ -395,18 +378,13 @@ def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Fi
     )
 
 
-def _read_spans(runs: Sequence[RunDirectory]) -> _Spans:
-    """Return when the runs have segments; one without segments is nowhere."""
-    start_ns, end_ns = np.empty(len(runs), np.int64), np.empty(len(runs), np.int64)
-    for index, run in enumerate(runs):
-        facts = run.facts
-        if not facts.segments:
-            start_ns[index], end_ns[index] = _NEVER_NS, -_NEVER_NS
-        elif facts.start_ns is None or facts.end_ns is None:
-            start_ns[index], end_ns[index] = -_NEVER_NS, _NEVER_NS
-        else:
-            start_ns[index], end_ns[index] = facts.start_ns, facts.end_ns
-    return _Spans(start_ns, end_ns, np.array([run.facts.robot for run in runs], np.str_))
+def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
+    """Return from when to when a run has segments: without any never, where it is not known at any time."""
+    if not facts.segments:
+        return _NEVER_NS, -_NEVER_NS
+    if facts.start_ns is None or facts.end_ns is None:
+        return -_NEVER_NS, _NEVER_NS
+    return facts.start_ns, facts.end_ns
 
 
 def _read_positions(run: RunDirectory) -> _SegmentPositions:

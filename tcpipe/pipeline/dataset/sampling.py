@@ -207,9 +207,10 @@ def sample_all_segments(
                 meter.add(len(rows[batch]))
                 kept = rows[batch][part.kept]
                 lost_by[rows[batch]] = part.lost_by
-                slots[kept[_sort_rows(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
+                slots[kept[np.argsort(ranks[kept], kind="stable")]] = (batch << _ROW_BITS) + np.arange(len(kept))
                 counts[batch], findings[batch] = len(kept), part.findings
-                for name, values in _make_columns(part).items():
+                placing = {name: getattr(part, name) for name in _PLACING}
+                for name, values in (part.patches.columns() | placing).items():
                     if name not in columns:
                         columns[name] = make_mapped_array(directory, (len(lost_by), *values.shape[1:]), values.dtype)
                     columns[name][kept] = values
@@ -238,16 +239,6 @@ def _read_sampled(data: bytes) -> Sampled:
     return Sampled(patches=Patches({}, **columns), findings=findings, **rest)
 
 
-def _sort_rows(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
-    """Return the rows of a batch in the order of the dataset."""
-    return np.argsort(ranks, kind="stable")
-
-
-def _make_columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
-    """Return the columns of the patches by name."""
-    return {**sampled.patches.columns(), **{name: getattr(sampled, name) for name in _PLACING}}
-
-
 def _iterate_batches(segments: pa.Table, size: int) -> Iterator[NDArray[np.int64]]:
     """Yield the rows of each batch, rising."""
     places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
@@ -265,7 +256,8 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
         sampled = sample_on_maps(
             batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools, shifts=batch.shifts
         )
-        return batch.spool.write(batch.number, _sort_rows(batch.ranks[sampled.kept]), sampled)
+        order = np.argsort(batch.ranks[sampled.kept], kind="stable")  # that of the dataset
+        return batch.spool.write(batch.number, order, sampled)
     except TcpipeError as error:
         return error
 
