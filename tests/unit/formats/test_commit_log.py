@@ -69,6 +69,7 @@ EVERYTHING = (
     Entries(generations=(Generation("generations/0000000009-0", "model.json", "2026-11-01T00:00:00+00:00"),)),
     Entries(generations=(Generation("generations/0000000010-1", "model.json", "2026-11-30T00:00:00+00:00"),)),
     Entries(ended=(1,), calls=(CallRecord("ingest", "1", 3, {"failed": 1}, failed={"/logs/c.bag": "full"}),)),
+    Entries(removed=(("a", "r"), ("c", "r"))),
 )
 
 
@@ -77,13 +78,16 @@ def test_a_state_is_the_fold_of_commits_and_of_the_one_commit_that_it_is_compact
     for number, entries in enumerate(EVERYTHING, 1):
         state = fold([Commit(number, digest, "seen", STAMP.who, STAMP.at, entries)], state)
         snapshot = Commit(number, digest, "snapshot", STAMP.who, STAMP.at, compact_state(state))
-        assert fold([snapshot]) == state, entries
+        compacted = fold([snapshot])
+        assert replace(compacted, pruned=state.pruned) == state, entries
+        assert compacted.pruned.keys() == state.pruned.keys(), "the number of its commit is that of the snapshot"
     commits = [Commit(number, "", "seen", STAMP.who, STAMP.at, of) for number, of in enumerate(EVERYTHING, 1)]
     assert fold(commits) == state
     assert state.superseded == {"a": "b"}
     assert state.parties == {"a", "b", "c"}
     assert list(state.datasets) == [("/out", "2")]
     assert state.begun == {}
+    assert state.pruned == {("a", "r"): len(EVERYTHING), ("c", "r"): len(EVERYTHING)}
     assert [call.command for call in state.calls] == ["ingest", "build-dataset"]
 
 
