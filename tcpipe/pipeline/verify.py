@@ -37,7 +37,7 @@ from tcpipe.formats.run_documents import (
 from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.store import Store, find_store_above, is_store
 from tcpipe.tables.facts import LEFT_OUT
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 
 
@@ -145,12 +145,6 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     if kind == "dataset":
         yield find_broken_seal(place.read(REPORT), place.where(REPORT)) or ("files", 1)
         card = parse_card(found.data, where, proved=False)
-        if card.data_model_version not in READ_VERSIONS:
-            yield (
-                f"{where}: of data model {card.data_model_version}, this version knows {DATA_MODEL_VERSION}; "
-                "run 'tcpipe migrate' on it, verify it with the version that wrote it, or build it again"
-            )
-            return
     checksums = parse_typed(parse_json(found.data, where), Checksums, where).checksums
     wrong = list(find_wrong_files(place, checksums))
     yield from _repair_by(repair, wrong)
@@ -174,7 +168,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
     if card.redaction is not None:
         table = SAMPLES_SCHEMA.add_missing_columns(read_table(samples))
-        yield from (f"{where}: {problem}" for problem in find_leaks(card, table))
+        yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:
@@ -345,7 +339,7 @@ def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Ch
     place = runs.below(f"{run_id}/{recipe_name}")
     last = name_document("manifest", find_highest_numbers(place.files())["manifest"])
     document, where = read_sealed_at(place, last), place.where(last)
-    if document["data_model_version"] not in READ_VERSIONS:
+    if document["data_model_version"] != DATA_MODEL_VERSION:
         yield (
             f"{where}: of data model {document['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
             "ingest the log again, then remove this directory"
