@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
-from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_STEP_M, STACKS, group_stacks
-from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
+from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
+from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
 
