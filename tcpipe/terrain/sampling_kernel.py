@@ -144,7 +144,7 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
         else:
             along, left = _fit_good_slopes(rise, good, side)
             _clear(out, n, good)
-        entry, share = np.int64(0), 0.0
+        entry, share = 0, 0.0
         if ground.classed >= 0:
             under = near.classes[ground.classed * most :]
             entry, share = _find_class_under(under, width, box, ground.chords[n], ground.chord_points, votes)
@@ -462,14 +462,14 @@ def _find_class_under(
     chord: NDArray[np.float64],
     points: int,
     votes: NDArray[np.int64],
-) -> tuple[np.int64, float]:
+) -> tuple[int, float]:
     """Return the commonest class at points on the chord and its share of those that have one; ties go low."""
     votes[:] = 0
     for k in range(points):
         col = np.int64(np.floor(chord[0] + chord[2] * k + 0.5)) - box[1]
         row = np.int64(np.floor(chord[1] + chord[3] * k + 0.5)) - box[0]
         votes[near[row * width + col]] += 1
-    best = np.argmax(votes[1:]) + 1
+    best = int(np.argmax(votes[1:])) + 1
     return (best, votes[best] / (points - votes[0])) if votes[best] > 0 else (0, 0.0)
 
 

@@ -21,6 +21,7 @@ from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_problems, shorten_value
 from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
+from tcpipe.splits.regions import project_near
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import ClassScheme, name_key
 from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
@@ -33,8 +34,8 @@ PROPERTY = "class"
 SUFFIXES = (".geojson", ".json")
 """A terrain file that ends so is polygons."""
 
-_EDGE_STEP_DEG = 0.001
-"""Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
+_MARGIN_DEG = 0.001
+"""Polygons are cut no nearer than this to a map."""
 
 _TERRAIN = Subject("layer", "terrain")
 
@@ -161,10 +162,9 @@ def _project_polygons(
 ) -> NDArray[np.object_]:
     """Return the polygons in the map's CRS, empty where they are not on the map; `MapError` if none is."""
     west, south, east, north = projection.area_deg
-    margin_deg = max(east - west, north - south, _EDGE_STEP_DEG)
-    near = shapely.box(west - margin_deg, south - margin_deg, east + margin_deg, north + margin_deg)
-    cut = shapely.segmentize(shapely.intersection(polygons, near), _EDGE_STEP_DEG)
-    placed = shapely.transform(cut, projection.forward)
+    margin_deg = max(east - west, north - south, _MARGIN_DEG)
+    window_deg = (west - margin_deg, south - margin_deg, east + margin_deg, north + margin_deg)
+    placed = project_near(polygons, projection.forward, window_deg)
     on_map = shapely.intersects(placed, shapely.box(*bounds_m))
     if on_map.any():
         return np.asarray(np.where(on_map, placed, shapely.Polygon()))
