@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
@@ -25,8 +24,6 @@ Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
 
 _CONVERTING = Lock()
 """msgspec (0.22) ends the process where two threads meet a dataclass for the first time at once."""
-
-_ABSENT = object()
 
 MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
@@ -52,13 +49,8 @@ def to_plain(value: Any) -> Any:
 
 def convert_record(record: object, cls: Callable[..., T], **more: object) -> T:
     """Return a record of another dataclass: with the fields that ``record`` has too, and ``more``, which goes before."""
-    found = ((name, getattr(record, name, _ABSENT)) for name in _field_names(cls) if name not in more)
-    return cls(**{name: value for name, value in found if value is not _ABSENT}, **more)
-
-
-@cache
-def _field_names(cls: Callable[..., object]) -> tuple[str, ...]:
-    return tuple(entry.name for entry in fields(cls))  # type: ignore[arg-type]
+    names = (entry.name for entry in fields(cls) if entry.name not in more)  # type: ignore[arg-type]
+    return cls(**{name: getattr(record, name) for name in names if hasattr(record, name)}, **more)
 
 
 def to_compact_json(value: object) -> bytes:

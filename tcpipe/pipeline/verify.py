@@ -36,7 +36,7 @@ from tcpipe.formats.run_documents import (
 from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.store import Store, find_store_above, is_store
 from tcpipe.tables.facts import LEFT_OUT
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 
 CheckResult = tuple[str, int] | str
@@ -50,6 +50,7 @@ _KNOWN = "dataset, run, store, map (.zarr), model or cost map"
 _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
 """What a directory is, by the document that proves all files beside it."""
 
+_KILLED = "was left by a killed command; 'tcpipe prune' removes it"
 _BESIDE = ".aux.xml"
 """Ending of the statistics that GDAL and QGIS put beside a raster that they look at."""
 
@@ -128,12 +129,6 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     if kind == "dataset":
         yield find_broken_seal(place.read(REPORT), place.where(REPORT)) or ("files", 1)
         card = parse_card(found.data, where, proved=False)
-        if card.data_model_version not in READ_VERSIONS:
-            yield (
-                f"{where}: of data model {card.data_model_version}, this version knows {DATA_MODEL_VERSION}; "
-                "run 'tcpipe migrate' on it, verify it with the version that wrote it, or build it again"
-            )
-            return
     checksums = parse_typed(parse_json(found.data, where), Checksums, where).checksums
     wrong = list(find_wrong_files(place, checksums))
     yield from wrong
@@ -157,7 +152,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
     if card.redaction is not None:
         table = SAMPLES_SCHEMA.add_missing_columns(read_table(samples))
-        yield from (f"{where}: {problem}" for problem in find_leaks(card, table))
+        yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:
@@ -201,13 +196,18 @@ def _verify_snapshot(log: Place, name: str) -> Iterator[CheckResult]:
 def _verify_runs(store: Store) -> Iterator[CheckResult]:
     """Yield the same of all runs, of those that the log names and of which files are gone, and of ingestions that no commit names."""
     wrong, found = set[str](), store.ingestions()
+    pruned = found.superseded.keys() - {run_id for run_id, _ in found.rows}
     for run_id in store.run_ids():
+        if run_id in pruned:
+            yield f"{store.runs_place.where(run_id)}: {_KILLED}"
+            continue
         for finding in _verify_run(store, run_id):
             wrong |= {run_id} if isinstance(finding, str) else set()
             yield finding
         for under in store.read_rows(run_id):
             if (run_id, under) not in found.rows:
-                yield f"{store.runs_place.below(run_id).where(under)}: no commit names it; ingest its log again"
+                how = _KILLED if (run_id, under) in found.state.pruned else "no commit names it; ingest its log again"
+                yield f"{store.runs_place.below(run_id).where(under)}: {how}"
     yield from (line for (run_id, _), line in found.damaged.items() if run_id not in wrong)
 
 
@@ -271,7 +271,7 @@ def _find_strangers(place: Place, known: Collection[str]) -> Iterator[str]:
 def _describe_stranger(place: Place, name: str) -> str:
     """Return a line about what no document knows."""
     if any(_DIGEST.fullmatch(part) for part in name.split("/")):
-        return f"{place.where(name)}: was left by a killed command; 'tcpipe prune' removes it"
+        return f"{place.where(name)}: {_KILLED}"
     return f"{place.where(name)}: is no file of this store"
 
 
@@ -303,7 +303,7 @@ def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Ch
     place = runs.below(f"{run_id}/{recipe_name}")
     last = name_document("manifest", find_highest_numbers(place.files())["manifest"])
     document, where = read_sealed_at(place, last), place.where(last)
-    if document["data_model_version"] not in READ_VERSIONS:
+    if document["data_model_version"] != DATA_MODEL_VERSION:
         yield (
             f"{where}: of data model {document['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
             "ingest the log again, then remove this directory"
