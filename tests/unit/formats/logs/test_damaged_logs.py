@@ -189,7 +189,7 @@ def test_a_cut_db3_gives_the_rows_before_the_cut(tmp_path):
 def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
     messages = random_messages(7, count=10, types=("std_msgs/msg/String",))
     payload = b"\x00\x01\x00\x00\x03\x00\x00\x00a\xff\x00"
-    odd = [type(m)(m.topic, m.type_name, m.log_time_ns, payload, m.value) for m in messages]
+    odd = [replace(message, payload=payload) for message in messages]
     tables, damage = read(write_mcap(tmp_path / "run.mcap", odd))
     assert tables["/String"]["data"].to_pylist() == ["a\ufffd"] * 10
     assert [(finding.code, finding.subject.name) for finding in damage] == [("text-not-utf8", "/String")]
