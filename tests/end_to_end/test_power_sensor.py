@@ -116,7 +116,7 @@ def test_labels_of_many_sensors_are_as_wrong_as_they_say(drive):
     """Gain and zero drawn once a run, as the prior has them: pooled over runs, σ is right."""
     rng = np.random.default_rng(5)
     drawn = [partial(lambda amp, _, gain, zero: amp * (1.0 + gain) + zero, gain=rng.normal(0, 0.02), zero=rng.normal(0, 0.2))
-             for _ in range(40)]  # fmt: skip
+             for _ in range(20)]  # fmt: skip
     runs = [label(drive, change) for change in drawn]
     for name in ("power_watt", "energy_joule"):
         off = np.abs(np.concatenate([normalized(drive, run, name) for run in runs]))
