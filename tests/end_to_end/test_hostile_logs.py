@@ -37,6 +37,8 @@ for path in sys.argv[1:]:
         raw = "" if error is None or isinstance(error, TcpipeError) else f"raw: {type(error).__name__}: "
         said = f"{done.output}{raw}{error}"
         print(json.dumps([path, command, said, time.process_time() - start, most_bytes()]), flush=True)
+        if error is not None:
+            break  # `ingest` opens it in the same way
 """
 
 

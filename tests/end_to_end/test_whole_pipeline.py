@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 
@@ -184,27 +183,6 @@ def test_patches_show_the_terrain_at_their_own_pixel_centres(demo: Demo) -> None
             checked += truth.size
     assert checked > 50_000
     assert wrong <= 0.005 * checked
-
-
-def _demo_logs(demo_directory: Path) -> list[Path]:
-    return sorted((demo_directory / "site" / "logs").iterdir())
-
-
-def _hashes(directory: Path, pattern: str) -> dict[str, str]:
-    return {
-        str(path.relative_to(directory)): sha256(path.read_bytes()).hexdigest()
-        for path in sorted(directory.rglob(pattern))
-        if path.is_file()
-    }
-
-
-def test_two_runs_and_any_number_of_workers_give_the_same_bytes(demo: Demo, tmp_path: Path) -> None:
-    """What the demo made alone is made again by two workers."""
-    here, _ = demo
-    _run("ingest", *_demo_logs(here), "--jobs", "2", "--quiet", cwd=tmp_path)
-    assert (
-        _hashes(tmp_path / "tcpipe-store" / "runs", "*.parquet") == _hashes(here / "store" / "runs", "*.parquet") != {}
-    )
 
 
 def test_no_dropped_row_inside_a_segment(drives: Drives) -> None:
