@@ -561,7 +561,7 @@ def time_offsets(labelled: LabelledSegments) -> list[Finding]:
     return select_findings(labelled.info.report.findings, "time-offset")
 
 
-@pytest.mark.parametrize("sensor", ["gnss", "power", "pose"])
+@pytest.mark.parametrize("sensor", ["gnss", "pose"])
 def test_a_late_clock_is_corrected_by_the_lines_as_they_are_printed(drive, tmp_path, sensor):
     config = {"read": {"topics": {"pose": [POSE_TOPIC]}}} if sensor == "pose" else {}
     other = with_pose(drive) if sensor == "pose" else drive
