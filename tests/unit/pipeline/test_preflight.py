@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.pipeline.preflight import (
-    ExpectedYield,
-    RoleTopic,
-    _compute_hourly_std,
-    find_missing,
-    find_slow,
-)
+from tcpipe.pipeline.preflight import ExpectedYield, RoleTopic, _compute_hourly_std, find_missing, find_slow
 from tcpipe.recipe import ReadConfig
 from tcpipe.tables.facts import EnergyBudget
 

@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from stored_files import manifest, run_document, table
+from stored_files import flip, manifest, run_document, table
 from synthetic_store import add_run, box, commit_run, lanes, open_world, region_file, segments, supersede
 
 from tcpipe.dataset import open_dataset
@@ -67,12 +67,6 @@ def ledger(found):
 
 def sha256(found):
     found["source"]["sha256"] = "0" * 64
-
-
-def flip(path):
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
 
 
 DAMAGE = {

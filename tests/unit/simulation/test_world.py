@@ -29,10 +29,7 @@ SITE = Site()
 
 def places(count=400, seed=0):
     rng = np.random.default_rng(seed)
-    return (
-        SITE.west_m + rng.uniform(0, SITE.width_m, count),
-        SITE.south_m + rng.uniform(0, SITE.height_m, count),
-    )
+    return (SITE.west_m + rng.uniform(0, SITE.width_m, count), SITE.south_m + rng.uniform(0, SITE.height_m, count))
 
 
 def test_gradient_is_the_slope_of_the_height():
