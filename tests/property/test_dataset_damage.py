@@ -105,7 +105,7 @@ def test_a_card_of_any_other_content_with_a_whole_seal_is_told_or_changes_nothin
     directory = dataset(name)
     card, whole = json.loads((directory / "dataset.json").read_text()), read(directory)
     for number, key in enumerate(card):
-        for value in OTHER:
+        for value in OTHER[number % 2 :: 2]:
             seal(directory, {**card, key: value})
             read_or_refused(directory, whole)
         for at, inner in enumerate(card[key] if key in {"label", "layers", "splits", "tensor"} else ()):
