@@ -207,8 +207,8 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
     )
     header = ("claim", "split", "", "here", "between trainings (1σ)", "the paper")
     ratios = [(f"{claim.split}: {claim.says.rpartition(' beats ')[2]}", astuple(claim.ratio)) for claim in claims]
-    plot = draw_ratios("claims", "RMSE of E: network over baseline", ratios)
-    return Section("Claims of the paper", text, header=header, rows=rows, figures_from=3, plots=[plot])
+    plot = draw_ratios("claims", "RMSE ratio of E", ratios)
+    return Section("Claims of the paper", text, header=header, rows=rows, plots=[plot])
 
 
 def _make_errors_section(runs: Sequence[Evaluation]) -> Section:
@@ -225,4 +225,4 @@ def _make_errors_section(runs: Sequence[Evaluation]) -> Section:
             rows.append((split, quantity, *figures))
     text = "The floor knows the simulator, map, path and turn without error; hidden variation and the noise of the labels remain."
     header = ("", "", "floor", *(f"seed {number}" for number in range(len(runs))))
-    return Section("RMSE and MAPE of every training", text, header=header, rows=rows, figures_from=2)
+    return Section("RMSE and MAPE of every training", text, header=header, rows=rows)

@@ -178,7 +178,7 @@ class Entries:
     """Datasets that are gone: overwritten by a build, or given up by a person."""
     generations: tuple[Generation, ...] = field(default=(), metadata=LEFT_OUT)
     removed: tuple[tuple[str, str], ...] = field(default=(), metadata=LEFT_OUT)
-    """Runs and recipes that were pruned."""
+    """Runs and recipes that were pruned, or whose files were lost."""
     begun: tuple[Begun, ...] = field(default=(), metadata=LEFT_OUT)
     ended: tuple[int, ...] = field(default=(), metadata=LEFT_OUT)
     """Numbers of the commits of calls that ended, or whose work another call has done."""
@@ -228,6 +228,8 @@ class State:
     datasets: Mapping[tuple[str, str], Dataset] = field(default_factory=dict)
     """By place and digest."""
     forgotten: frozenset[tuple[str, str]] = frozenset()
+    pruned: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    """Ingestions that a prune took from the log, and when (number of a commit): their files are gone, or go with the next prune."""
     generations: tuple[Generation, ...] = ()
     """Those that are kept, the newest last."""
     begun: Mapping[int, Begun] = field(default_factory=dict)
@@ -271,6 +273,7 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
     state = State() if state is None else state
     runs, seen, failed, acknowledged = dict(state.runs), dict(state.seen), dict(state.failed), dict(state.acknowledged)
     datasets, begun, forgotten = dict(state.datasets), dict(state.begun), set(state.forgotten)
+    pruned = dict(state.pruned)
     calls, supersessions, number = state.calls, state.supersessions, state.number
     generations = state.generations
     gone = state.superseded
@@ -279,6 +282,7 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
         supersessions += entries.superseded
         _supersede(runs, gone, entries.superseded)
         _add_runs(runs, gone, commit)
+        _add_pruned(pruned, commit)
         for sighting in entries.seen:
             lineage = find_lineage(sighting.log)
             seen[lineage] = (*(old for old in seen.get(lineage, ()) if old != sighting), sighting)
@@ -291,7 +295,7 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
         calls = (*reversed(entries.calls), *calls)[:LATEST_CALLS]
     return replace(
         state, number=number, runs=runs, seen=seen, failed=failed, acknowledged=acknowledged, supersessions=supersessions,
-        datasets=datasets, forgotten=frozenset(forgotten), generations=generations, begun=begun, calls=calls,
+        datasets=datasets, forgotten=frozenset(forgotten), pruned=pruned, generations=generations, begun=begun, calls=calls,
     )  # fmt: skip
 
 
@@ -312,6 +316,13 @@ def _add_runs(runs: dict[tuple[str, str], RunFacts], gone: Mapping[str, str], co
         runs[key] = row if is_settled else replace(row, superseded_by=by, commit=number)
     for key in commit.entries.removed:
         runs.pop(key, None)
+
+
+def _add_pruned(pruned: dict[tuple[str, str], int], commit: Commit) -> None:
+    for row in commit.entries.runs:
+        pruned.pop((row.run_id, row.recipe_id), None)
+    if commit.kind != "excluded":  # its files were gone before
+        pruned.update(dict.fromkeys(commit.entries.removed, commit.number))
 
 
 def _is_same(known: RunFacts, row: RunFacts) -> bool:
@@ -355,6 +366,7 @@ def compact_state(state: State) -> Entries:
         superseded=state.supersessions,
         datasets=tuple(state.datasets.values()),
         forgotten=tuple(Dataset(out, inputs) for out, inputs in sorted(state.forgotten)),
+        removed=tuple(state.pruned),
         generations=state.generations,
         begun=tuple(state.begun.values()),
         calls=tuple(reversed(state.calls)),

@@ -46,7 +46,7 @@ def render_evaluation_page(
     has_samples = bool(samples.table.num_rows)
     parts = [*_make_class_sections(found), *_make_other_sections(found)]
     paper = Section(
-        "Beside the paper",
+        "Comparison with the paper",
         "The paper's five tables with the figures of this model.\n" + COUNTED,
         parts=[part for part in parts if part.rows],
     )
@@ -86,10 +86,6 @@ def _format_figure(error: Errors | None, measure: str, quantity: str) -> str:
     return f"{value:.{_DIGITS[quantity]}f}"
 
 
-def _format_figures(error: Errors | None, quantity: str) -> list[str]:
-    return [_format_figure(error, measure, quantity) for measure in MEASURES]
-
-
 def _format_paper_figure(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
@@ -120,11 +116,11 @@ def _make_baselines_section(found: Evaluation) -> Section:
         "All are centred by class with the same rule, from their own held-out predictions (evaluation.json has all ratios). "
         "Intervals: paired bootstrap over runs or blocks, ten at least. Physics and boosting also know the turn of each segment."
     )
-    table = Section("RMSE", header=header, rows=rows, figures_from=2)
+    table = Section("RMSE", header=header, rows=rows)
     plots = [
         draw_ratios(
             f"ratio {quantity}",
-            f"RMSE of {quantity}: model over baseline",
+            f"RMSE ratio of {quantity}",
             [
                 (f"{split}: {name}", astuple(row.rmse_ratio))
                 for (name, split, row_quantity), row in by_cell.items()
@@ -166,7 +162,7 @@ def _make_coverage_section(found: Evaluation, samples: EvaluatedSamples) -> Sect
     )
     header = ("", "", "inside the 90 % interval", "NLL [nat]", "CRPS")
     plots = draw_calibration(samples.table) if samples.table.num_rows else []
-    return Section("Uncertainty", text, header=header, rows=rows, figures_from=2, plots=plots)
+    return Section("Uncertainty", text, header=header, rows=rows, plots=plots)
 
 
 def _format_coverage(coverage: Coverage) -> str:
@@ -187,9 +183,7 @@ def _make_class_sections(found: Evaluation) -> list[Section]:
         part = found.splits[split]
         rows = [row for quantity in "ET" for row in _iterate_class_rows(found, split, quantity)]
         header = ("", "", *(f"{name} ({part.classes[name]})" for name in part.class_order), f"all ({part.samples})")
-        sections.append(
-            Section(f"Table {number}: {_CALLED[split]}", _TEXT[split], header=header, rows=rows, figures_from=2)
-        )
+        sections.append(Section(f"Table {number}: {_CALLED[split]}", _TEXT[split], header=header, rows=rows))
     return sections
 
 
@@ -267,13 +261,13 @@ def _make_other_section(
     splits = found.ordered_splits
     rows: list[tuple[str, ...]] = []
     for name, by_split in errors.items():
-        figures = [_format_figures(by_split.get(split), quantity) for split in splits]
-        rows.append((name, "", *(figure for pair in figures for figure in pair)))
+        figures = (_format_figure(by_split.get(split), measure, quantity) for split in splits for measure in MEASURES)
+        rows.append((name, "", *figures))
         if name in PAPER:
-            pairs = [PAPER[name][SPLITS.index(split)] for split in splits]
-            rows.append(("", "paper", *(_format_paper_figure(value) for pair in pairs for value in pair)))
+            values = (value for split in splits for value in PAPER[name][SPLITS.index(split)])
+            rows.append(("", "paper", *map(_format_paper_figure, values)))
     header = ("", "", *(f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in MEASURES))
-    return Section(title, text, header=header, rows=rows, figures_from=2)
+    return Section(title, text, header=header, rows=rows)
 
 
 CLASSES = ("grass", "mud", "unpaved road", "paved road", "all")

@@ -251,6 +251,7 @@ def _iterate_results(
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
     keep_state_here(log.store.place, log.state)
+    begun = log.state.number
     for turn in queue.iterate_rounds():
         taken, waiting, last_s = list[Item](), list[tuple[int, IngestTask, Ingested]](), 0.0
         with closing(run_all(ingest_one, _take_tasks(turn, taken), jobs=jobs, cluster=cluster)) as outcomes:
@@ -258,9 +259,9 @@ def _iterate_results(
                 index, task = taken[outcome.index]
                 waiting.append((index, task, outcome.result or Ingested(task.source, make_died_result(task.source))))
                 if time.monotonic() - last_s >= _TOGETHER_S:
-                    yield from _commit(log, queue, waiting)
+                    yield from _commit(log, queue, waiting, begun)
                     waiting, last_s = [], time.monotonic()
-        yield from _commit(log, queue, waiting)
+        yield from _commit(log, queue, waiting, begun)
 
 
 def _take_tasks(turn: Iterable[Item], taken: list[Item]) -> Iterator[IngestTask]:
@@ -270,22 +271,30 @@ def _take_tasks(turn: Iterable[Item], taken: list[Item]) -> Iterator[IngestTask]
 
 
 def _commit(
-    log: LogWriter, queue: LogQueue, ended: Sequence[tuple[int, IngestTask, Ingested]]
+    log: LogWriter, queue: LogQueue, ended: Sequence[tuple[int, IngestTask, Ingested]], begun: int
 ) -> Iterator[tuple[int, IngestResult]]:
-    """Commit what became of logs, and yield it with what the log says of it; a run that cannot be committed has failed for now."""
+    """Commit what became of logs, and yield it with what the log says of it; a run that cannot be committed has failed for now.
+
+    Nor are ingestions committed that were pruned after commit ``begun``: their files may be about to go.
+    """
     before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
     for index, task, ingested in ended:
         more, notes[index] = _make_entries(log, task, ingested)
         entries = Entries(*((*getattr(entries, name.name), *getattr(more, name.name)) for name in fields(Entries)))
-    others = dict[str, str]()
+    others, pruned = dict[str, str](), set[tuple[str, str]]()
 
     def make(state: State) -> Entries:
         """Return what is to be added; of two calls that gave one recording two names the first wins."""
         others.clear()
+        pruned.clear()
+        pruned.update(key for key, number in state.pruned.items() if number > begun)
+        gone = {run_id for run_id, _ in pruned if not state.find_rows(run_id)}  # with all that lay in their directories
+        pruned.update((row.run_id, row.recipe_id) for row in entries.runs if row.run_id in gone)
         for row in entries.runs:
             named = state.find_run(row.log.source.sha256) if row.log else None
             others.update({} if named in (None, row.run_id) else {row.run_id: named})
-        return replace(entries, runs=tuple(row for row in entries.runs if row.run_id not in others))
+        kept = (row for row in entries.runs if row.run_id not in others and (row.run_id, row.recipe_id) not in pruned)
+        return replace(entries, runs=tuple(kept))
 
     try:
         kind: Kind = "ingested" if entries.runs else "failed" if entries.failed else "seen"
@@ -302,6 +311,8 @@ def _commit(
         result = replace(ingested.result, notes=(*ingested.result.notes, *notes[index]))
         if result.run and (by := others.get(result.run.run_id)):
             result = _adopt_committed_run(log.state.runs.get((by, result.run.recipe_id)), by, result, ingested.source)
+        elif result.run and ingested.rows and (result.run.run_id, result.run.recipe_id) in pruned:
+            result = _fail_for_now(result, f"'tcpipe prune' removed run {result.run.run_id} at the same time")
         queue.release_claim(index, result)
         yield index, _judge_result(log.state, result, ingested.source, before=before)
 
@@ -322,10 +333,12 @@ def _adopt_committed_run(made: RunFacts | None, run_id: str, result: IngestResul
     if made is not None and made.log is not None:
         same_as = " + ".join(made.log.source.paths)
         return make_result(source, "unchanged", made, str(result.sha256), same_as=same_as)
-    problem = (
-        f"{result.log}: another call ingested the same log as run {run_id} at the same time; run the command again"
-    )
-    findings = find_failure(result.log, "StoreError")
+    return _fail_for_now(result, f"another call ingested the same log as run {run_id} at the same time")
+
+
+def _fail_for_now(result: IngestResult, reason: str) -> IngestResult:
+    """Return that a log has failed by what another call did meanwhile."""
+    problem, findings = f"{result.log}: {reason}; run the command again", find_failure(result.log, "StoreError")
     return IngestResult(
         result.log, "failed", causes=findings, problems=(problem,), sha256=result.sha256, transient=True
     )

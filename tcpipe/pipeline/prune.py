@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,17 +90,14 @@ def prune(
     if unknown:
         raise UsageError(f"{opened.root}: no run or recipe is called {min(unknown)}; nothing is removed")
     referred, unread = _find_references(log.state)
-    removed, kept = list[Leftover](), list[Leftover]()
-    for what, place, parts in (
-        *_iterate_old_recipes(opened, found, ingest_key(ruling)),
-        *_iterate_superseded(opened, found),
-    ):
-        why = unread or _find_reason_to_stay(place, parts, referred, keep)
-        (removed if why is None else kept).append(Leftover(what, place.where(), _measure_size(place), why))
-        if why is None and not dry_run:  # the commit first: nobody looks for what is about to go
-            log.commit("pruned", Entries(removed=tuple(parts)))
-            for entry in sorted(place.entries(), key=lambda entry: split_number(entry.name) is None):
-                place.delete(entry.name)  # its documents first, so that no reader looks for the rest
+    removed, kept, decided = list[Leftover](), list[Leftover](), set[str]()
+    for what, place, run_id, parts in _iterate_ingestions(opened, log.state, found, ingest_key(ruling), min_age_s):
+        why, size_bytes = unread or _find_reason_to_stay(place, parts, referred, keep), _measure_size(place)
+        if why is None and not dry_run and not _remove(log, found, place, run_id, parts):
+            why = "another call has changed its run meanwhile"
+        (removed if why is None else kept).append(Leftover(what, place.where(), size_bytes, why))
+        if why is None or what == BEGUN:
+            decided.add(place.where())
     left = [
         Leftover("left by a killed call", str(path), _measure_size(Place(path)))
         for path in _iterate_temporaries(opened, min_age_s)
@@ -110,7 +107,7 @@ def prune(
         clear(Path(opened.root))
     for what, place, entries, why in (
         *_iterate_spooled(opened, min_age_s),
-        *_iterate_replaced(opened, log.state, min_age_s, unread),
+        *_iterate_replaced(opened, log.state, min_age_s, unread, decided),
     ):
         (removed if why is None else kept).extend(
             Leftover(what, place.where(entry.name), entry.size_bytes, why) for entry in entries
@@ -125,11 +122,66 @@ def prune(
     return Pruned(str(opened.root), dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
 
 
-Parts = Sequence[tuple[str, str]]
-"""Ingestions: runs and their recipes."""
+BEGUN = "left by a killed prune"
+
+_Target = tuple[str, str, str]
+"""What something is, its run, and its recipe: "" where all of the run is to go."""
 
 
-def _iterate_old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[str, Place, Parts]]:
+def _iterate_ingestions(
+    store: Store, state: State, found: Ingestions, key: str, min_age_s: float
+) -> Iterator[tuple[str, Place, str, list[tuple[str, str]]]]:
+    """Yield what may go of runs that the log knows: what it is, where it lies, its run, and the ingestions in it."""
+    superseded = list(_iterate_superseded(store, found))
+    begun = _iterate_begun(store, state, min_age_s, but={run_id for _, run_id, _ in superseded})
+    for what, run_id, recipe_id in (*begun, *_iterate_old_recipes(found, key), *superseded):
+        if recipe_id:
+            yield what, store.runs_place.below(f"{run_id}/{recipe_id}"), run_id, [(run_id, recipe_id)]
+        else:
+            parts = [part for part in {**found.rows, **state.pruned} if part[0] == run_id]
+            yield what, store.runs_place.below(run_id), run_id, parts
+
+
+def _remove(log: LogWriter, found: Ingestions, place: Place, run_id: str, parts: Sequence[tuple[str, str]]) -> bool:
+    """Remove ingestions, unless another call changed their run, or built a dataset of them, since they were ``found``.
+
+    The commit comes first, so that nobody looks for what is about to go; the next prune completes one that is killed after it.
+    """
+    is_as_found = True
+
+    def make(state: State) -> Entries:
+        nonlocal is_as_found
+        is_used = any(part in made.runs for made in state.datasets.values() for part in parts)
+        is_changed = any(found.rows.get((run_id, row.recipe_id)) != row for row in state.find_rows(run_id))
+        is_as_found = not (is_used or is_changed)
+        return Entries(removed=tuple(parts) if is_as_found else ())
+
+    log.commit("pruned", make)
+    for entry in sorted(place.entries() if is_as_found else (), key=_find_turn):
+        place.delete(entry.name)
+    return is_as_found
+
+
+def _find_turn(entry: Entry) -> tuple[bool, bool]:
+    """Return when a file goes: pages first, then documents, so that no reader looks for the rest."""
+    return entry.name.endswith(".parquet"), split_number(entry.name) is not None
+
+
+def _iterate_begun(store: Store, state: State, min_age_s: float, *, but: Collection[str]) -> Iterator[_Target]:
+    """Yield the ingestions that a prune took from the log and was killed before it had removed their files, if these are old enough.
+
+    Those of the runs ``but`` go with their runs.
+    """
+    before_ns, modified_ns = time.time_ns() - int(min_age_s * 1e9), dict[tuple[str, str], int]()
+    for entry in store.runs_place.entries() if state.pruned else ():
+        run_id, recipe_id, *_ = (*entry.name.split("/", 2), "")
+        modified_ns[run_id, recipe_id] = max(entry.modified_ns, modified_ns.get((run_id, recipe_id), 0))
+    for key in sorted(state.pruned.keys() & modified_ns.keys()):
+        if modified_ns[key] < before_ns and key[0] not in but:
+            yield BEGUN, *key
+
+
+def _iterate_old_recipes(found: Ingestions, key: str) -> Iterator[_Target]:
     """Yield the ingestions that are older than one of the same run under the ruling recipe."""
     by_run: dict[str, list[RunFacts]] = {}
     for row in found.rows.values():
@@ -141,19 +193,19 @@ def _iterate_old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[
         latest = max(row.commit for row in ruling)
         for row in rows:
             if row.ingest_key != key and row.commit < latest:
-                yield "old recipe", store.runs_place.below(f"{run_id}/{row.recipe_id}"), [(run_id, row.recipe_id)]
+                yield "old recipe", run_id, row.recipe_id
 
 
-def _iterate_superseded(store: Store, found: Ingestions) -> Iterator[tuple[str, Place, Parts]]:
+def _iterate_superseded(store: Store, found: Ingestions) -> Iterator[_Target]:
     """Yield the runs whose place another has taken that is there."""
     there = {run.run_id for run in found.finished}
     for run_id, by in found.superseded.items():
         if by in there and store.runs_place.folders(run_id):
-            yield "superseded run", store.runs_place.below(run_id), [key for key in found.rows if key[0] == run_id]
+            yield "superseded run", run_id, ""
 
 
 def _find_reason_to_stay(
-    place: Place, parts: Parts, referred: Mapping[tuple[str, str], str], keep: Sequence[str]
+    place: Place, parts: Sequence[tuple[str, str]], referred: Mapping[tuple[str, str], str], keep: Sequence[str]
 ) -> str | None:
     if any(name in keep for part in parts for name in part):
         return "--keep names it"
@@ -228,11 +280,13 @@ def _iterate_spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
             yield "left by a killed call", place, entries, None
 
 
-def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str | None) -> Iterator[_Unnamed]:
+def _iterate_replaced(
+    store: Store, state: State, min_age_s: float, unread: str | None, decided: Collection[str]
+) -> Iterator[_Unnamed]:
     """Yield, by run and for the maps, documents and files that nothing names any more, if they are old enough.
 
     Files of one directory go together: its content is put there together. Where a document cannot be read they stay; so do ingestions
-    that are whole and that no commit names, since ingesting the log again finds them.
+    that are whole and that no commit names, since ingesting the log again finds them. What is ``decided`` already is not looked at.
     """
     before_ns = time.time_ns() - int(min_age_s * 1e9)
     by_run: dict[str, list[RunFacts]] = {}
@@ -241,7 +295,9 @@ def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str 
     found: dict[str | None, list[Entry]] = {None: store.place.below("maps").entries()}
     for entry in store.runs_place.entries():  # of all runs at once: in a bucket each listing is a request
         run, _, name = entry.name.partition("/")
-        found.setdefault(run, []).append(entry._replace(name=name))
+        folders = run, f"{run}/{name.partition('/')[0]}"
+        if not any(store.runs_place.where(folder) in decided for folder in folders):
+            found.setdefault(run, []).append(entry._replace(name=name))
     for run_id, entries in found.items():
         place = store.place.below("maps") if run_id is None else store.runs_place.below(run_id)
         rows = by_run.get(run_id or "", [])

@@ -50,6 +50,7 @@ _KNOWN = "dataset, run, store, map (.zarr), model or cost map"
 _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
 """What a directory is, by the document that proves all files beside it."""
 
+_KILLED = "was left by a killed command; 'tcpipe prune' removes it"
 _BESIDE = ".aux.xml"
 """Ending of the statistics that GDAL and QGIS put beside a raster that they look at."""
 
@@ -201,13 +202,18 @@ def _verify_snapshot(log: Place, name: str) -> Iterator[CheckResult]:
 def _verify_runs(store: Store) -> Iterator[CheckResult]:
     """Yield the same of all runs, of those that the log names and of which files are gone, and of ingestions that no commit names."""
     wrong, found = set[str](), store.ingestions()
+    pruned = found.superseded.keys() - {run_id for run_id, _ in found.rows}
     for run_id in store.run_ids():
+        if run_id in pruned:
+            yield f"{store.runs_place.where(run_id)}: {_KILLED}"
+            continue
         for finding in _verify_run(store, run_id):
             wrong |= {run_id} if isinstance(finding, str) else set()
             yield finding
         for under in store.read_rows(run_id):
             if (run_id, under) not in found.rows:
-                yield f"{store.runs_place.below(run_id).where(under)}: no commit names it; ingest its log again"
+                how = _KILLED if (run_id, under) in found.state.pruned else "no commit names it; ingest its log again"
+                yield f"{store.runs_place.below(run_id).where(under)}: {how}"
     yield from (line for (run_id, _), line in found.damaged.items() if run_id not in wrong)
 
 
@@ -271,7 +277,7 @@ def _find_strangers(place: Place, known: Collection[str]) -> Iterator[str]:
 def _describe_stranger(place: Place, name: str) -> str:
     """Return a line about what no document knows."""
     if any(_DIGEST.fullmatch(part) for part in name.split("/")):
-        return f"{place.where(name)}: was left by a killed command; 'tcpipe prune' removes it"
+        return f"{place.where(name)}: {_KILLED}"
     return f"{place.where(name)}: is no file of this store"
 
 

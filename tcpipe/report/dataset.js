@@ -10,52 +10,37 @@ page.start(async () => {
   const source = page.model("samples").data_source;
   const kinds = {
     split: ["split"], class: ["terrain class"], quality: ["quality"], run: ["run"],
-    power: ["power w", "W", 0], velocity: ["velocity v", "m/s", 2], duration: ["time T", "s", 2], energy: ["energy E", "J", 0],
+    power: ["power w", "W", 0], velocity: ["velocity v", "m/s", 3], duration: ["time T", "s", 3], energy: ["energy E", "J", 0],
     slope: ["slope along travel", "°", 1], turn: ["turn", "°", 1], residual: ["w beyond physics", "W", 0], power_std: ["σ of w", "W", 1],
     apart: ["way to the nearest train metre", "m", 2],
   };
   const label = (name) => kinds[name][0] + (kinds[name][1] ? ` [${kinds[name][1]}]` : "");
   const classes = new Map(facts.classes.map((one) => [one.id, one]));
-  const className = (i) => classes.get(c.class[i])?.name ?? "unknown";
+  const nameOf = (id) => classes.get(id)?.name ?? "unknown", className = (i) => nameOf(c.class[i]);
   const splitName = (i) => facts.splits[c.split[i]].name;
   const shades = Array.from({ length: 64 }, (_, i) => {
     const place = (i / 63) * (ramp.length - 1), low = Math.min(Math.floor(place), ramp.length - 2), share = place - low;
     const part = (k) => Math.round(parseInt(ramp[low].slice(k, k + 2), 16) * (1 - share) + parseInt(ramp[low + 1].slice(k, k + 2), 16) * share);
     return `rgb(${part(1)},${part(3)},${part(5)})`;
   });
-  const digits = (value, name) => Number.isFinite(value) ? `${page.fixed(value, kinds[name][2])}\u00a0${kinds[name][1]}` : "none";
+  const digits = (value, name) => page.quantity(value, ...kinds[name].slice(1));
 
+  // The colours of all samples by a quantity; the legend says what they mean.
   function coloured(name) {
-    const legend = [];
-    let fill;
-    if (name === "split") {
-      fill = Array.from(c.split, (s) => facts.splits[s].colour);
-      facts.splits.forEach((s) => s.count && legend.push([`${s.name} (${s.count})`, s.colour]));
-    } else if (name === "class") {
-      const colour = (id) => classes.get(id)?.colour ?? facts.unknown;
-      fill = Array.from(c.class, colour);
-      [...new Set(c.class)].sort((a, b) => a - b).forEach((id) => legend.push([classes.get(id)?.name ?? "unknown", colour(id)]));
-    } else if (name === "quality") {
-      fill = Array.from(c.quality, (q) => (q & facts.flags ? facts.flagged : facts.clean));
-      legend.push(["clean", facts.clean], ["carries a flag", facts.flagged]);
-    } else if (name === "run") {
-      fill = Array.from(c.run, (r) => facts.colours[r % facts.colours.length]);
-      facts.runs.slice(0, 12).forEach((r, i) => legend.push([r.id, facts.colours[i % facts.colours.length]]));
-    } else {
-      const [low, high] = page.ends(c[name]);
-      fill = Array.from(c[name], (v) => Number.isFinite(v)
-        ? shades[Math.max(0, Math.min(63, Math.floor(63 * (v - low) / ((high - low) || 1))))] : facts.unknown);
-      legend.push([low, high]);
+    const entryOf = {
+      split: (s) => [`${facts.splits[s].name} (${facts.splits[s].count})`, facts.splits[s].colour],
+      class: (id) => [nameOf(id), classes.get(id)?.colour ?? facts.unknown],
+      quality: (q) => (q & facts.flags ? ["carries a flag", facts.flagged] : ["clean", facts.clean]),
+      run: (r) => [facts.runs[r].id, facts.colours[r % facts.colours.length]],
+    }[name];
+    if (entryOf) {
+      const entries = new Map([...new Set(c[name])].sort((a, b) => a - b).map((value) => [value, entryOf(value)]));
+      at("scale").replaceChildren(...page.legend([...new Map(entries.values())].slice(0, 12)));
+      return Array.from(c[name], (value) => entries.get(value)[1]);
     }
-    const scale = at("scale");
-    scale.replaceChildren();
-    scale.className = "controls legend";
-    if (typeof legend[0]?.[0] === "number") {
-      scale.append(...page.scale(`${label(name)}: ${digits(legend[0][0], name)}`, digits(legend[0][1], name)));
-    } else {
-      scale.append(...page.legend(legend));
-    }
-    return fill;
+    const [low, high] = page.ends(c[name]), span = high - low || 1;
+    at("scale").replaceChildren(...page.scale(`${label(name)}: ${digits(low, name)}`, digits(high, name)));
+    return Array.from(c[name], (v) => Number.isFinite(v) ? shades[Math.max(0, Math.min(63, Math.floor((63 * (v - low)) / span)))] : facts.unknown);
   }
 
   const there = (names) => names.filter((name) => c[name]?.some(Number.isFinite));
@@ -113,7 +98,7 @@ page.start(async () => {
   }
   const choices = {
     run: [[...facts.runs.keys()], (k) => facts.runs[k].id, (k) => (i) => c.run[i] === k],
-    class: [[...new Set(c.class)].sort((a, b) => a - b), (k) => classes.get(k)?.name ?? "unknown", (k) => (i) => c.class[i] === k],
+    class: [[...new Set(c.class)].sort((a, b) => a - b), nameOf, (k) => (i) => c.class[i] === k],
     split: [[...facts.splits.keys()].filter((k) => facts.splits[k].count), (k) => facts.splits[k].name, (k) => (i) => c.split[i] === k],
     flag: [facts.quality.map(([bit]) => bit).filter((bit) => c.quality.some((q) => q & bit)), (k) => facts.quality.find(([bit]) => bit === k)[1],
       (k) => (i) => (k ? c.quality[i] & k : !(c.quality[i] & facts.flags))],
@@ -192,10 +177,7 @@ page.start(async () => {
   const start = (i) => BigInt(facts.runs[c.run[i]].first_ns) + BigInt(c.after_s[i]) * 1000000000n + BigInt(c.after_ns[i]);
   const idOf = (i) => facts.samples.ids ? facts.samples.ids[i] : `${facts.runs[c.run[i]].id}-${start(i)}`;
   const flagsOf = (i) => facts.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words).join("; ") || "clean";
-  function withStd(i, name) {
-    const std = c[`${name}_std`]?.[i];
-    return Number.isFinite(std) ? `${c[name][i].toFixed(kinds[name][2] + 1)} ± ${std.toPrecision(2)} ${kinds[name][1]}` : digits(c[name][i], name);
-  }
+  const withStd = (i, name) => page.quantity(c[name][i], kinds[name][1], kinds[name][2] + 1, c[`${name}_std`]?.[i]);
   // Sheets with a sample's patch, and its number in them: inside the page, or beside it.
   function pictureOf(i) {
     if (cell.has(i)) return [sheets, cell.get(i)];
@@ -204,15 +186,17 @@ page.start(async () => {
     return [{ ...sheets, layers }, i % facts.per_sheet];
   }
   const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${facts.count} patches; 'tcpipe report --patches' puts all beside it.` : "";
-  function inWords(i) {
+  const labelsOf = (i) => [
+    ...["power", "velocity", "duration", "energy"].map((name) => [kinds[name][0], withStd(i, name)]),
+    ["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")], ...(c.residual ? [["beyond physics", digits(c.residual[i], "residual")]] : []),
+    ["ground", className(i)],
+  ];
+  function originOf(i) {
     const run = facts.runs[c.run[i]];
-    const rows = ["power", "velocity", "duration", "energy"].map((name) => [kinds[name][0], withStd(i, name)]);
-    rows.push(["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")]);
-    if (c.residual) rows.push(["beyond physics", digits(c.residual[i], "residual")]);
-    rows.push(["ground", className(i)], ["split", splitName(i)]);
-    if (Number.isFinite(c.apart[i])) rows.push(["nearest train", digits(c.apart[i], "apart")]);
-    rows.push(["quality", flagsOf(i)], ["run", run.href ? make("a", run.id, { href: run.href }) : run.id]);
-    return [...rows, ["time", page.clock(Number(start(i) / 1000000n))], ["where from", page.explain(idOf(i))]];
+    return [
+      ["split", splitName(i)], ...(Number.isFinite(c.apart[i]) ? [["nearest train", digits(c.apart[i], "apart")]] : []), ["quality", flagsOf(i)],
+      ["run", run.href ? make("a", run.id, { href: run.href }) : run.id], ["time", page.clock(Number(start(i) / 1000000n))], ["where from", page.explain(idOf(i))],
+    ];
   }
   function drawWords() {
     const box = at("chosen");
@@ -224,7 +208,7 @@ page.start(async () => {
     }
     at("row").max = selected.length > 1 ? selected.length : n;
     at("row").value = selected.length > 1 ? selected.indexOf(current) + 1 : current + 1;
-    const left = make("div"), right = make("div");
+    const [left, middle, right] = [make("div"), make("div"), make("div")];
     if (selected.length > 1) {
       const mean = (name) => page.mean(selected.map((k) => c[name][k]).filter(Number.isFinite));
       const by = facts.splits.map((s, k) => [s.name, selected.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
@@ -233,16 +217,17 @@ page.start(async () => {
         ["splits", by.map(([name, count]) => `${name} ${count}`).join(", ")],
         ["flagged", `${selected.filter((j) => c.quality[j] & facts.flags).length}`]]), make("p", `Number ${selected.indexOf(current) + 1} of them:`));
     }
-    left.append(pairs(inWords(current)));
+    left.append(pairs(labelsOf(current)));
+    right.append(pairs(originOf(current)));
     const picture = pictureOf(current);
     if (picture) {
-      right.append(...page.patches(...picture));
-      const lost = () => right.replaceChildren(make("p", `${facts.folder} is not beside this page.`, { className: "note" }));
+      middle.append(...page.patches(...picture));
+      const lost = () => middle.replaceChildren(make("p", `${facts.folder} is not beside this page.`, { className: "note" }));
       if (picture[0] !== sheets) Object.assign(new Image(), { src: picture[0].layers[0].uri, onerror: lost });
     } else {
-      right.append(make("p", noPicture, { className: "note" }));
+      middle.append(make("p", noPicture, { className: "note" }));
     }
-    box.append(left, right);
+    box.append(left, middle, right);
   }
 
   // A page of the selection as patches and rows; without a selection, patches that are inside the page.

@@ -279,7 +279,7 @@ def _make_run_section(card: DatasetCard, hrefs: Mapping[str, str]) -> Section:
     if hrefs:
         text = "Links lead to the pages of the runs, once 'tcpipe report STORE' has written them."
     header = ("run", "robot", "log", "samples", "noise floor of E")
-    return Section("Runs", text, header=header, rows=runs, figures_from=3, parts=_make_finding_sections(card))
+    return Section("Runs", text, header=header, rows=runs, parts=_make_finding_sections(card))
 
 
 def _make_provenance_section(card: DatasetCard) -> Section:

@@ -42,14 +42,12 @@ page.start(async () => {
   const cell = new Map((facts.patches?.rows ?? []).map((row, i) => [row, i]));
   function inWords(i) {
     const rows = facts.quantities.map(({ key, called, unit, digits }) => {
-      const [label, said, std] = [c[key][i], c[`${key} predicted`][i], c[`${key} std`][i]];
-      const sure = Number.isFinite(std) ? ` ± ${std.toPrecision(2)}` : "";
-      const ends = ["low", "high"].map((end) => (said + c[`${key} ${end}`][i]).toFixed(digits));
+      const said = c[`${key} predicted`][i], ends = ["low", "high"].map((end) => page.fixed(said + c[`${key} ${end}`][i], digits));
       const interval = Number.isFinite(c[`${key} low`][i]) ? ` (90 %: ${ends[0]} to ${ends[1]})` : "";
-      return [called, `measured ${label.toFixed(digits)}${sure}, predicted ${page.fixed(said, digits)}${interval} ${unit}`];
+      return [called, `measured ${page.quantity(c[key][i], "", digits, c[`${key} std`][i])}, predicted ${page.fixed(said, digits)}${interval} ${unit}`];
     });
     return [
-      ...rows, ["slope", Number.isFinite(c.slope[i]) ? `${page.fixed(c.slope[i], 1)}°` : "none"], ["ground", classOf(i).name], ["split", splitOf(i).name],
+      ...rows, ["slope", page.quantity(c.slope[i], "°", 1)], ["ground", classOf(i).name], ["split", splitOf(i).name],
       ["where from", page.explain(c.id[i])],
     ];
   }
@@ -67,7 +65,7 @@ page.start(async () => {
       const errors = places.map((place) => off(shown[place], key)), { mean } = page;
       const kind = facts.classes.map((one) => [one.name, places.filter((place) => c.class[shown[place]] === one.id).length]).filter(([, count]) => count);
       left.append(make("b", `${places.length} chosen`), pairs([
-        ["mean error", `${page.fixed(mean(errors), digits)} ${unit}`], ["RMSE", `${Math.sqrt(mean(errors.map((e) => e * e))).toFixed(digits)} ${unit}`],
+        ["mean error", page.quantity(mean(errors), unit, digits)], ["RMSE", page.quantity(Math.sqrt(mean(errors.map((e) => e * e))), unit, digits)],
         ["ground", kind.map((pair) => pair.join(" ")).join(", ")]]), make("p", "The worst of them:"));
     }
     left.append(pairs(inWords(i)));
@@ -82,7 +80,7 @@ page.start(async () => {
   if (facts.patches) {
     page.gallery(facts.patches, (i) => ({
       kind: classOf(i).name, split: splitOf(i).name,
-      words: `${classOf(i).name} ${page.fixed(c.slope[i], 1)}°, ${page.fixed(c.E[i], 0)} J, predicted ${page.fixed(c["E predicted"][i], 0)} J, ${splitOf(i).name}`,
+      words: `${classOf(i).name} ${page.quantity(c.slope[i], "°", 1)}, ${page.quantity(c.E[i], "J", 0)}, predicted ${page.quantity(c["E predicted"][i], "J", 0)}, ${splitOf(i).name}`,
     }), (i) => {
       at("split").value = "";
       draw();

@@ -20,8 +20,8 @@ from tcpipe.tables.facts import EnergyBudget, PhysicsFit, PhysicsTerm
 
 LABELS = {
     "power": ("power_watt", "power_std_watt", 1),
-    "velocity": ("velocity_mps", "velocity_std_mps", 3),
-    "duration": ("duration_s", "duration_std_s", 3),
+    "velocity": ("velocity_mps", "velocity_std_mps", 4),
+    "duration": ("duration_s", "duration_std_s", 4),
     "energy": ("energy_joule", "energy_std_joule", 1),
 }
 """Column, column of the standard deviation and decimals of each label on a page."""
@@ -98,7 +98,7 @@ def make_budget_sections(budget: EnergyBudget | None) -> list[Section]:
     shares = {text: getattr(budget, name) for name, text in _BUDGET_ROWS.items()}
     rows = [(text, f"{100 * share:.2f} %") for text, share in shares.items() if share is not None]
     title = "Uncertainty of labels"
-    return [Section(title, format_budget(budget), header=("from", "of E"), rows=rows, figures_from=1)]
+    return [Section(title, format_budget(budget), header=("from", "of E"), rows=rows)]
 
 
 _ASIDE = {"grade": "weight over efficiency"}

@@ -49,7 +49,7 @@ def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> t
     plot = make_map_plot(
         alt=f"Map of {sample_count} points, coloured by the quantity chosen above; the tables below list the counts.",
         axes=("easting [m]", "northing [m]"),
-        height_px=110 + 500 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
+        height_px=110 + 330 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
         tools=f"pan,wheel_zoom,{tools},reset,save",
     )
     lost = _lay_dataset_pictures(plot, directory, card, bounds)

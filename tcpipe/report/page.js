@@ -172,11 +172,13 @@ const page = (() => {
     at("gallery-more").onclick = () => { most += 120; draw(); };
     draw();
   }
-  // What is chosen, beside the first figures or below them, and the buttons that go through `count()` rows; `current(by)` is the row from which a step goes.
+  // What is chosen, below a short summary or the first row of figures, and buttons that go through `count()` rows from row `current(by)`.
   function stepThrough(count, current, choose) {
-    const summary = document.querySelector(".summary"), section = at("chosen").closest("section");
-    const beside = matchMedia("(min-width: 64rem)").matches && section.closest(".first") && summary.offsetHeight < section.offsetHeight;
-    (beside ? summary : section).append(at("chosen"), at("stepping"));
+    const summary = document.querySelector(".summary"), room = make("div", "", { className: "selection" });
+    const figures = [...at("chosen").closest("section").querySelectorAll("figure")];
+    room.append(at("chosen"), at("stepping"));
+    if (matchMedia("(min-width: 64rem)").matches && summary.getBoundingClientRect().bottom < innerHeight / 2) summary.append(room);
+    else figures.findLast((one) => one.offsetTop === figures[0].offsetTop).after(room);
     const step = (by) => { const n = count(); if (n) choose((current(by) + by + n) % n); };
     at("before").onclick = () => step(-1);
     at("after").onclick = () => step(1);
@@ -205,6 +207,13 @@ const page = (() => {
     });
   }
   const fixed = (value, digits) => (Number(value.toFixed(digits)) + 0).toFixed(digits);  // no -0.0
+  // A value with its unit, to as many decimals as two digits of its σ have; to `digits` at most, and without a σ.
+  function quantity(value, unit, digits, std = NaN) {
+    if (!Number.isFinite(value)) return "none";
+    const places = std > 0 ? Math.max(0, Math.min(digits, 1 - Math.floor(Math.log10(std)))) : digits;
+    const sigma = Number.isFinite(std) ? ` ± ${places < digits ? fixed(std, places) : std.toPrecision(2)}` : "";
+    return `${fixed(value, places)}${sigma}${unit && unit !== "°" ? "\u00a0" : ""}${unit}`;
+  }
   const mean = (values) => values.reduce((a, b) => a + b, 0) / values.length;
   // Columns as `tcpipe.report.page` wrote them.
   async function unpack({ columns, data }) {
@@ -224,7 +233,7 @@ const page = (() => {
     }));
   }
   return {
-    at, copy, fixed, make, fillLayers, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, clickNearest, gallery, mean, stepThrough, unpack,
+    at, copy, fixed, make, fillLayers, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, clickNearest, gallery, mean, quantity, stepThrough, unpack,
     data: read("page-data"),
     // What a page's own script does when the figures that it asks for are drawn; what it returns is called with the view of each that follows.
     start: (of) => { work = of; },

@@ -53,6 +53,9 @@ from tcpipe.tables.findings import AFFECTED, Affected, Finding, Grade, Severity,
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Invisible characters and those that reverse the direction of text; a name may contain them."""
 
+_NUMBER = r"[-+±]?(?:\d+(?:\.\d+)?|nan)(?: ?(?:[%°]|[a-zA-Z/]{1,3}\b))?(?: \([^)]*\))?"
+_NUMBERS = re.compile(rf"{_NUMBER}(?:(?:, | to ){_NUMBER})*|(?:–|none)?")
+
 _SCRIPTS = "<!-- scripts -->"
 
 
@@ -147,8 +150,6 @@ class Section:
     """What follows a line break is folded."""
     header: Sequence[str] = field(default_factory=tuple)
     rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
-    figures_from: int | None = None
-    """First column of formatted figures, which are aligned to the right as numbers are."""
     plots: Sequence[Plot] = ()
     controls: str = ""
     """File beside this one with the HTML above the figures."""
@@ -158,6 +159,10 @@ class Section:
     """Whether the figures are one below the other on wide pages too, as those with one axis are."""
     parts: Sequence[Section] = ()
     """Sections below it, which have no parts; those without figures wait behind their titles."""
+
+    def list_number_columns(self) -> list[bool]:
+        """Return which columns of the table show only numbers, which are aligned to the right."""
+        return [all(_NUMBERS.fullmatch(str(cell)) for cell in column) for column in zip(*self.rows, strict=True)]
 
 
 def render_page(

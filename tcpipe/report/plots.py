@@ -20,7 +20,7 @@ import bokeh
 import numpy as np
 import pyarrow as pa
 from bokeh.document import Document
-from bokeh.models import HoverTool
+from bokeh.models import HoverTool, NoOverlap
 from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 
@@ -179,12 +179,15 @@ def draw_ratios(
     """
     known = [(text, value, low, high) for text, (value, low, high) in rows if value is not None]
     ends = [(value, value if low is None else low, value if high is None else high) for _, value, low, high in known]
-    is_open = [low is None or low <= 1.0 <= (high or 0.0) for _, _, low, high in known]
+    colours = [
+        FAINT if low is None or low <= 1.0 <= (high or 0.0) else KEPT if low < 1.0 else DROPPED
+        for _, _, low, high in known
+    ]
     plot = make_plot(
         name,
         alt=f"{label}, a point with its 95 % interval for each; the table lists the same.",
         axes=(label, ""),
-        legend={"below 1": KEPT, "open": FAINT, "above 1": DROPPED},
+        legend={"below 1": KEPT, "not significant": FAINT, "above 1": DROPPED},
         height_px=90 + 20 * len(known),
         tools="save",
         x_axis_type="log",
@@ -192,15 +195,13 @@ def draw_ratios(
         tooltips=[("", "@name"), ("ratio", "@value{0.00} (@low{0.00} to @high{0.00})")],
     )
     value, low, high = (list(column) for column in zip(*ends, strict=True)) if ends else ([], [], [])
-    colours = [
-        FAINT if at else KEPT if interval[0] < 1.0 else DROPPED for interval, at in zip(ends, is_open, strict=True)
-    ]
     plot.figure.line([1.0, 1.0], [0, max(len(known), 1)], color=FAINT, line_dash="dashed", line_width=2)
     source = {"name": [text for text, *_ in known], "value": value, "low": low, "high": high, "colour": colours}
     lines = plot.figure.segment("low", "name", "high", "name", color="colour", line_width=3, source=source)
     points = plot.figure.scatter("value", "name", size=9, color="colour", source=lines.data_source)
     plot.figure.hover.renderers = [points]
     plot.figure.xaxis.ticker.desired_num_ticks = 5
+    plot.figure.xaxis.major_label_policy = NoOverlap()
     plot.figure.ygrid.visible = False
     return plot
 

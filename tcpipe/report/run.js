@@ -10,8 +10,8 @@ page.start(async () => {
   const [track, n] = [series.track, s.start.length];
   const panels = [];
   const range = model("gates").x_range;
-  const names = { w: ["power w", "power", "W", 1], v: ["velocity v", "velocity", "m/s", 3], T: ["time T", "duration", "s", 3], E: ["energy E", "energy", "J", 1],
-    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 1], residual: ["w beyond physics", "residual", "W", 1], sigma: ["σ of position", "position_std", "m", 3] };
+  const names = { w: ["power w", "power", "W", 1], v: ["velocity v", "velocity", "m/s", 4], T: ["time T", "duration", "s", 4], E: ["energy E", "energy", "J", 1],
+    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 2], residual: ["w beyond physics", "residual", "W", 1], sigma: ["σ of position", "position_std", "m", 3] };
   const ofTrack = { w: "power", v: "speed", sigma: "position_std" };  // columns that colour the whole track, segments or not
   const there = Object.keys(names).filter((key) => s[names[key][1]]?.some(Number.isFinite));
   const finite = Number.isFinite;
@@ -117,10 +117,9 @@ page.start(async () => {
 
   // Segments on the map and in their own plot.
   const flagged = Array.from(s.quality, (bits) => (bits & facts.flags ? facts.doubted : facts.kept));
-  const number = (value, [, , unit, digits]) => (finite(value) ? `${page.fixed(value, digits)} ${unit}` : "none");
   function ramped(values, kind) {
     const [low, high] = page.ends(values);
-    at("scale").replaceChildren(...page.scale(number(low, kind), number(high, kind)));
+    at("scale").replaceChildren(...page.scale(...[low, high].map((end) => page.quantity(end, ...kind.slice(2)))));
     return Array.from(values, (value) => finite(value)
       ? ramp[Math.max(0, Math.min(ramp.length - 1, Math.floor((ramp.length * (value - low)) / ((high - low) || 1))))] : facts.unused);
   }
@@ -222,10 +221,7 @@ page.start(async () => {
       at("row").value = i + 1;
       const flags = facts.quality.filter(([bit]) => s.quality[i] & bit).map(([, words]) => words);
       left.append(make("b", `Segment ${i + 1} of ${n}`), pairs([
-        ...Object.values(names).filter(([, name]) => s[name] !== undefined).map((kind) => {
-          const std = s[`${kind[1]}_std`]?.[i];
-          return [kind[0], finite(std) && finite(s[kind[1]][i]) ? `${page.fixed(s[kind[1]][i], kind[3])} ± ${std.toPrecision(2)} ${kind[2]}` : number(s[kind[1]][i], kind)];
-        }),
+        ...Object.values(names).filter(([, name]) => s[name]).map(([called, name, ...kind]) => [called, page.quantity(s[name][i], ...kind, s[`${name}_std`]?.[i])]),
         ["quality", flags.length ? flags.join("; ") : "clean"],
         ["in a dataset", page.explain(`${facts.run}-${facts.starts[i]}`)]]));
     } else {

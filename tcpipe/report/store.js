@@ -5,7 +5,7 @@ page.start(() => {
   const runs = facts.rows.map((row, number) => Object.assign({ number }, ...facts.fields.map((name, i) => ({ [name]: row[i] }))));
   const state_of = (run) => run.superseded_by ? `superseded by ${run.superseded_by}` : run.state;
   const date = (ms) => ms === null ? "" : new Date(ms).toISOString().slice(0, 16).replace("T", " ");
-  const digits = (name, places) => (run) => run[name] === null ? "" : run[name].toFixed(places);
+  const digits = (name, places) => (run) => run[name] === null ? "" : page.fixed(run[name], places);
   const columns = [
     ["run", (run) => run.run], ["start_ms", (run) => date(run.start_ms), 1], ["robot", (run) => run.robot], ["state", state_of],
     ["datasets", (run) => run.datasets.map((n) => facts.datasets[n]).join(", ")], ["tags", (run) => run.tags],
@@ -47,14 +47,14 @@ page.start(() => {
       return row;
     }));
     more.hidden = sorted.length <= most;
-    at("count").textContent = `${Math.min(sorted.length, most)} of ${sorted.length} runs${chosen ? " chosen in a plot" : ""}, ${runs.length} in all`;
+    at("count").textContent = `${sorted.length} of ${runs.length} runs${chosen ? ", selected in a plot" : ""}`;
     heads.forEach((head, i) => { head.ariaSort = columns[i][0] === by ? (falls ? "descending" : "ascending") : null; });
   }
   heads.forEach((head, i) => {
     const [name, , number] = columns[i];
     const button = make("button", head.textContent, { type: "button", className: "sort" });
     button.onclick = () => { [by, falls] = [name, by === name ? !falls : Boolean(number)]; draw(); };
-    if (number) head.classList.add("number");
+    head.classList.toggle("number", Boolean(number));
     head.replaceChildren(button);
   });
   more.onclick = () => { most += 100; draw(); };

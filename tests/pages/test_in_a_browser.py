@@ -6,7 +6,7 @@ from time import monotonic
 
 import pytest
 from browser_page import quiet_page
-from synthetic_store import add_run, add_world, driven, lanes, make_noise_facts, segments
+from synthetic_store import add_run, driven, lanes, make_noise_facts, open_world, segments
 
 import tcpipe
 from tcpipe.learning.evaluation_facts import EvaluateConfig
@@ -15,7 +15,6 @@ from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
-from tcpipe.store import open_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 
 DRAWS_DATASET_PAGES = True
@@ -36,8 +35,7 @@ SOURCE = "Bokeh.documents[0].get_model_by_name('samples').data_source"
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     here = tmp_path_factory.mktemp("pages")
-    store = open_store(here / "store", create=True)
-    add_world(store, here)
+    store = open_world(here)
     for number, run in enumerate(("north", "south")):
         start, end = lanes((4.0 * number, 4.0 * number + 1.5, 4.0 * number - 9.0), -12.0, 12.0)
         table = segments(run, start, end, start_ns=int((number + 1) * 1e18))
@@ -377,8 +375,7 @@ def list_findings():
 @pytest.fixture(scope="module")
 def run_page(tmp_path_factory):
     here = tmp_path_factory.mktemp("driven")
-    store = open_store(here / "store", create=True)
-    add_world(store, here)
+    store = open_world(here)
     start, end = lanes((0.0,), -12.0, 12.0)
     table = segments("driven", start, end, start_ns=10**18)
     add_run(
@@ -469,7 +466,7 @@ def test_the_map_of_a_run_is_coloured_by_what_is_chosen(driving):
         assert seen[key]["segments"][0] == 0  # the whole track has the colour, standing robots too
         assert seen[key]["track"][0] > use["track"][0]
         driving.select_option("#colour", key)
-        assert f" {unit}" in driving.locator("#scale").inner_text()
+        assert f"\u00a0{unit}" in driving.locator("#scale").inner_text()
     assert len(seen["w"]["track"][1]) >= 2
     assert len(seen["E"]["segments"][1]) > 2
     assert driving.evaluate("page.fixed(-0.04, 1)") == "0.0"
@@ -507,6 +504,38 @@ FIRST_PLOT = """() => {
   const { top, height } = boxes.sort((a, b) => a.top - b.top)[0];
   return [top, (innerHeight - top) / height];
 }"""
+
+
+def test_a_click_shows_the_sample_without_scrolling(chromium, dataset):
+    with quiet_page(chromium, dataset / "report.html", (1400, "light")) as tab:
+        tab.mouse.click(*tab.evaluate(PLACE, ["map", column(tab, "x")[0], column(tab, "y")[0]]))
+        until(tab, f"{SELECTED}.length === 1")
+        shown = [tab.get_by_text(text).first for text in ("power w", "energy E", "where from")]
+        for part in (*shown, tab.locator("#chosen .patch").last):
+            box = part.bounding_box()
+            assert 0.0 < box["y"] < box["y"] + box["height"] < 900.0
+
+
+def test_a_value_has_as_many_decimals_as_its_uncertainty(chromium, dataset):
+    with quiet_page(chromium, dataset / "report.html", LOOKS[0]) as tab:
+        for call, text in {
+            "190.84, 'W', 1, 6.51": "190.8 ± 6.5\u00a0W",
+            "190.84, 'W', 1, 23.4": "191 ± 23\u00a0W",
+            "0.75529, 'm/s', 4, 0.0274": "0.755 ± 0.027\u00a0m/s",
+            "0.75529, 'm/s', 4, 0.00027": "0.7553 ± 0.00027\u00a0m/s",
+            "-0.04, '°', 1": "0.0°",
+            "-0.004, '°', 2, 0.31": "0.00 ± 0.31°",
+            "NaN, 'J', 1, 2": "none",
+        }.items():
+            assert tab.evaluate(f"page.quantity({call})") == text
+
+
+@pytest.mark.parametrize("kind", ["run", "dataset", "evaluation", "store"])
+def test_on_a_phone_the_first_plot_follows_the_verdict(request, chromium, dataset, kind):
+    with quiet_page(chromium, find_page(kind, request, dataset), LOOKS[2]) as tab:
+        plot, verdict = tab.evaluate(FIRST_PLOT)[0], tab.locator(".verdict").bounding_box()
+        assert plot < tab.locator(".numbers").bounding_box()["y"]
+        assert plot - verdict["y"] - verdict["height"] < 500.0
 
 
 @pytest.mark.parametrize("kind", ["run", "dataset", "evaluation", "store"])

@@ -1,6 +1,5 @@
 """The log of a store: commits add up to a state, and a snapshot says the same; what is missing is said; no writer loses anything."""
 
-import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,7 +7,6 @@ from dataclasses import replace
 import pytest
 from object_gateway import open_bucket
 
-from tcpipe.errors import StoreError
 from tcpipe.formats import commit_log
 from tcpipe.formats.commit_log import Stamp, put_commit, read_commit, read_state, refresh
 from tcpipe.formats.commits import (
@@ -69,6 +67,7 @@ EVERYTHING = (
     Entries(generations=(Generation("generations/0000000009-0", "model.json", "2026-11-01T00:00:00+00:00"),)),
     Entries(generations=(Generation("generations/0000000010-1", "model.json", "2026-11-30T00:00:00+00:00"),)),
     Entries(ended=(1,), calls=(CallRecord("ingest", "1", 3, {"failed": 1}, failed={"/logs/c.bag": "full"}),)),
+    Entries(removed=(("a", "r"), ("c", "r"))),
 )
 
 
@@ -77,13 +76,16 @@ def test_a_state_is_the_fold_of_commits_and_of_the_one_commit_that_it_is_compact
     for number, entries in enumerate(EVERYTHING, 1):
         state = fold([Commit(number, digest, "seen", STAMP.who, STAMP.at, entries)], state)
         snapshot = Commit(number, digest, "snapshot", STAMP.who, STAMP.at, compact_state(state))
-        assert fold([snapshot]) == state, entries
+        compacted = fold([snapshot])
+        assert replace(compacted, pruned=state.pruned) == state, entries
+        assert compacted.pruned.keys() == state.pruned.keys(), "the number of its commit is that of the snapshot"
     commits = [Commit(number, "", "seen", STAMP.who, STAMP.at, of) for number, of in enumerate(EVERYTHING, 1)]
     assert fold(commits) == state
     assert state.superseded == {"a": "b"}
     assert state.parties == {"a", "b", "c"}
     assert list(state.datasets) == [("/out", "2")]
     assert state.begun == {}
+    assert state.pruned == {("a", "r"): len(EVERYTHING), ("c", "r"): len(EVERYTHING)}
     assert [call.command for call in state.calls] == ["ingest", "build-dataset"]
 
 
@@ -217,18 +219,3 @@ def test_reading_a_log_in_a_bucket_takes_a_constant_number_of_requests(monkeypat
     served.requests = 0
     assert refresh(place, state) == state
     assert served.requests == 1
-
-
-def test_a_log_that_cannot_be_written_is_an_error(place, monkeypatch):
-    def refused(*_):
-        raise StoreError("read-only")
-
-    monkeypatch.setattr(type(place), "put_new", refused)
-    with pytest.raises(StoreError, match="read-only"):
-        write(place, 1)
-
-
-def test_a_commit_is_readable_json(tmp_path):
-    write(Place(tmp_path), 1)
-    document = json.loads((tmp_path / "log" / "0000000001.json").read_text())
-    assert (document["number"], document["kind"], document["parent"]) == (1, "seen", "")

@@ -5,7 +5,7 @@ import os
 import shutil
 
 import pytest
-from wheel_drives import START_NS, drive_at, wheel_drive
+from wheel_drives import START_NS, ask_status, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
@@ -219,7 +219,7 @@ def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost
     sha256 = run_id.rsplit("-", 1)[1].encode()
     contents = {"a digit": whole.replace(sha256, b"0" * 8), "half": whole[:40], "[]": b"[]", "nothing": b""}
     commit.write_bytes(contents[broken]) if broken in contents else commit.unlink()
-    found = find_status(IngestOptions([], store=store.root, recipe=Recipe(), min_age_s=0.0))
+    found = ask_status(store.root, min_age_s=0.0)
     assert (found.exit_code, [of.code for of in found.problems]) == (
         3,
         ["commit-missing" if broken == "gone" else "commit-damaged"],
@@ -227,11 +227,9 @@ def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost
     assert any(str(commit) in line for line in verify(store.root).problems)
     assert [night()[0]["other.mcap"].status for _ in range(2)] == ["done", "unchanged"], "its manifest is found"
     assert counted(tmp_path) == {run_id}
-    assert find_status(IngestOptions([], store=store.root, recipe=Recipe(), min_age_s=0.0)).exit_code == 3, (
-        "what else it held nobody knows"
-    )
+    assert ask_status(store.root, min_age_s=0.0).exit_code == 3, "what else it held nobody knows"
     acknowledge([str(commit)], store=store.root)
-    assert find_status(IngestOptions([], store=store.root, recipe=Recipe(), min_age_s=0.0)).exit_code == 0
+    assert ask_status(store.root, min_age_s=0.0).exit_code == 0
 
 
 def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, monkeypatch):
@@ -283,6 +281,57 @@ def test_what_an_ingest_under_another_recipe_replaces_can_be_pruned(tmp_path, ni
     (old,) = prune(store=tmp_path / "store", recipe=other).removed
     assert old.what == "old recipe"
     assert verify(tmp_path / "store").problems == ()
+
+
+def test_a_run_that_is_pruned_while_it_is_ingested_is_not_committed_but_made_by_the_next_call(
+    tmp_path, night, monkeypatch
+):
+    """Its files may be about to go; so may those of its other recipes, which a call commits again with their tags."""
+    store, other, real = tmp_path / "store", Recipe(label=LabelConfig(velocity="fused")), ingest_module._make_entries
+    night()
+    ingest([tmp_path / "logs"], store=store, recipe=other)
+
+    def meanwhile(log, task, of):
+        assert of.rows
+        monkeypatch.setattr(ingest_module, "_make_entries", real)
+        assert len(prune(store=store, recipe=other).removed) == 1
+        return real(log, task, of)
+
+    monkeypatch.setattr(ingest_module, "_make_entries", meanwhile)
+    (result,) = ingest([tmp_path / "logs" / "other.mcap"], store=store, recipe=Recipe(), force=True).results
+    assert result.status == "failed"
+    assert result.problems[0].startswith(f"{result.log}: 'tcpipe prune' removed run other-")
+    assert result.problems[0].endswith(" at the same time; run the command again")
+    assert len(Store(store).state().runs) == 1
+    assert night()[0]["other.mcap"].status == "done"
+    assert len(Store(store).runs()) == 2
+    assert verify(store).problems == ()
+
+
+def test_a_superseded_run_that_is_pruned_while_its_log_is_back_is_made_by_the_next_call(tmp_path, night, monkeypatch):
+    whole, log, store = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap", tmp_path / "store"
+    copy_part(whole, log, 0.6)
+    half = night()[0]["run.mcap"].run.run_id
+    shutil.copy(whole, log)
+    night()
+    copy_part(whole, tmp_path / "logs" / "back.mcap", 0.6)
+    real, other = ingest_module._make_entries, Recipe(label=LabelConfig(velocity="fused"))
+
+    def meanwhile(log, task, of):
+        monkeypatch.setattr(ingest_module, "_make_entries", real)
+        assert [each.what for each in prune(store=store).removed] == ["superseded run"]
+        return real(log, task, of)
+
+    def ingest_again():
+        (result,) = ingest([tmp_path / "logs" / "back.mcap"], store=store, recipe=other).results
+        return result
+
+    monkeypatch.setattr(ingest_module, "_make_entries", meanwhile)
+    result = ingest_again()
+    assert (result.status, Store(store).state().find_rows(half)) == ("failed", [])
+    result = ingest_again()
+    assert (result.status, result.run.run_id in counted(tmp_path)) == ("damaged", True)
+    assert verify(store).problems == ()
 
 
 def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit_wins(tmp_path, night, monkeypatch):

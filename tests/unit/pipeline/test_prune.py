@@ -1,23 +1,27 @@
 """What goes from a store and what stays: nothing of a dataset, nothing of somebody else, each thing whole or not at all."""
 
 import os
+import shutil
 import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, lanes, segments, supersede
+from synthetic_store import add_run, commit_run, lanes, segments, supersede
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.commits import Dataset, Entries
-from tcpipe.formats.place import Place
+from tcpipe.formats.integrity import seal_page
 from tcpipe.formats.run_documents import SPOOL
+from tcpipe.pipeline import prune as prune_module
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
 
+OLDER = replace(Recipe(), read=ReadConfig(ignore_topics=["/others"]))
 OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
 
 
@@ -146,24 +150,96 @@ def test_a_directory_that_a_killed_prune_left_empty_goes_when_it_is_old(store):
     assert len(there(store)) == 2
 
 
-def test_a_kill_in_the_midst_of_it_leaves_what_no_reader_sees_and_a_later_call_removes(store, monkeypatch):
-    delete, left = Place.delete, [1]
+def files(store):
+    """What lies in a store, besides the times and processes of calls."""
+    paths = (path.relative_to(store.root) for path in store.root.rglob("*"))
+    return {str(path): (store.root / path).is_dir() for path in paths if path.parts[0] not in ("log", "index")}
 
-    def killed(*args):
-        if not left[0]:
-            raise KeyboardInterrupt
-        left[0] -= 1
-        delete(*args)
 
+def kill_at(patch, step):
+    """Kill what follows before its removal of this number: of a file, or of a directory that has become empty."""
+    unlink, rmdir, left = Path.unlink, Path.rmdir, [step]
+
+    def make_killed(real):
+        def killed(path, *args, **kwargs):
+            if "runs" in path.parts:
+                if not left[0]:
+                    raise KeyboardInterrupt
+                left[0] -= 1
+            real(path, *args, **kwargs)
+
+        return killed
+
+    patch.setattr(Path, "unlink", make_killed(unlink))
+    patch.setattr(Path, "rmdir", make_killed(rmdir))
+
+
+def test_a_kill_at_any_step_leaves_what_no_reader_sees_and_the_next_call_completes(tmp_path, monkeypatch):
+    store, whole = open_store(tmp_path / "store", create=True), tmp_path / "whole"
+    for run_id, recipe in (("a", OLD), ("b", OLD), ("a", OLDER), ("a", Recipe()), ("b", Recipe())):
+        add_run(store, run_id, segments(run_id, *lanes(np.array([0.0]), -10.0, 10.0)), recipe=recipe)
+    supersede(store, "b", "a")
+    for manifest in store.root.glob("runs/*/*/manifest-1.json"):
+        manifest.with_name("report.html").write_text(seal_page("<html></html>"))
+    shutil.copytree(store.root, whole)
+    removed = prune(store=store.root, recipe=Recipe(), min_age_s=0.0).removed
+    assert len(removed) == 3
+    wanted, step, begun = files(store), 0, set[str]()
+    while True:
+        shutil.rmtree(store.root)
+        shutil.copytree(whole, store.root)
+        with monkeypatch.context() as patch:
+            kill_at(patch, step)
+            try:
+                prune(store=store.root, recipe=Recipe(), min_age_s=0.0)
+            except KeyboardInterrupt:
+                step += 1
+            else:
+                break
+        assert not store.ingestions().lost, step
+        problems = verify(store.root).problems
+        told = "was left by a killed command; 'tcpipe prune' removes it"
+        assert [line for line in problems if not line.endswith(told)] == [], step
+        planned = prune(store=store.root, recipe=Recipe(), min_age_s=0.0, dry_run=True)
+        done = prune(store=store.root, recipe=Recipe(), min_age_s=0.0)
+        assert (done.removed, done.kept) == (planned.removed, ()), step
+        assert files(store) == wanted, step
+        assert verify(store.root).problems == ()
+        begun |= {each.what for each in done.removed}
+    assert step > 20
+    assert begun >= {"left by a killed prune", "old recipe", "superseded run"}
+
+
+def test_what_a_killed_prune_left_stays_where_it_was_ingested_again_and_while_it_is_young(store, monkeypatch):
+    old = old_recipe(store)
     with monkeypatch.context() as patch:
-        patch.setattr(Place, "delete", killed)
+        kill_at(patch, 0)
         with pytest.raises(KeyboardInterrupt):
             prune(store=store.root, recipe=Recipe())
-    assert ("a", old := old_recipe(store)) not in there(store)
-    assert len(store.ingestions("a").finished) == 1
-    assert list(store.root.glob(f"runs/a/{old}/*/*.parquet"))
-    prune(store=store.root, recipe=Recipe(), min_age_s=0.0)
-    assert not list(store.root.glob(f"runs/a/{old}/*/*.parquet"))
+    assert [run.recipe_id for run in store.recipes_of("a")] != [old]
+    assert not [each for each in prune(store=store.root, recipe=Recipe()).removed if "/a/" in each.path]
+    commit_run(store, "a")
+    assert not [each for each in prune(store=store.root, recipe=Recipe(), min_age_s=0.0).removed if "/a/" in each.path]
+    assert old in {run.recipe_id for run in store.recipes_of("a")}
+    assert verify(store.root).problems == ()
+
+
+@pytest.mark.parametrize("change", ["built", "ingested"])
+def test_what_another_call_uses_or_makes_meanwhile_stays(store, monkeypatch, change):
+    """It commits between the moment at which prune looks and its own commit."""
+    log, old, real = open_log(store), old_recipe(store), prune_module._measure_size
+    row = replace(log.state.runs["a", old], tags={"weather": "wet"})
+    dataset = Dataset("/nowhere", "0" * 64, (("a", old),))
+
+    def meanwhile(place):
+        log.commit(change, Entries(datasets=(dataset,)) if change == "built" else Entries(runs=(row,)))
+        monkeypatch.setattr(prune_module, "_measure_size", real)
+        return real(place)
+
+    monkeypatch.setattr(prune_module, "_measure_size", meanwhile)
+    found = prune(store=store.root, recipe=Recipe())
+    assert [each.stays for each in found.kept] == ["another call has changed its run meanwhile"]
+    assert ("a", old) in store.state().runs
     assert verify(store.root).problems == ()
 
 

@@ -27,7 +27,7 @@ def made(tmp_path_factory):
     here = tmp_path_factory.mktemp("replacing")
     store = open_store(here / "store", create=True)
     for name in ("site", "yard"):
-        add_world(store, here / name, name=name)
+        add_world(store, name=name)
     for number, weather in enumerate(("dry", "wet")):
         add_run(store, weather, segments(weather, *lanes(3.0 * number, -10.0, 10.0)), tags={"weather": weather})
         store.tag_run(weather, {"weather": weather})
