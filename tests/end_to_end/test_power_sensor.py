@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from simulated_streams import streams_of
 
 from tcpipe.pipeline.ingest_run import run_stages
@@ -122,10 +123,10 @@ def test_a_right_sensor_gives_no_finding_and_only_its_prior(drive):
 
 
 def test_labels_of_many_sensors_are_as_wrong_as_they_say(drive):
-    """Gain and zero drawn once a run, as the prior has them: pooled over runs, σ is right."""
-    rng = np.random.default_rng(5)
-    drawn = [partial(lambda amp, _, gain, zero: amp * (1.0 + gain) + zero, gain=rng.normal(0, 0.02), zero=rng.normal(0, 0.2))
-             for _ in range(40)]  # fmt: skip
+    """Gain and zero of each run are quantiles of their priors: pooled over runs, σ is right."""
+    rng, quantiles = np.random.default_rng(5), norm.ppf((np.arange(20) + 0.5) / 20)
+    drawn = [partial(lambda amp, _, gain, zero: amp * (1.0 + gain) + zero, gain=gain, zero=zero)
+             for gain, zero in zip(0.02 * rng.permutation(quantiles), 0.2 * rng.permutation(quantiles), strict=True)]  # fmt: skip
     runs = [label(drive, change) for change in drawn]
     for name in ("power_watt", "energy_joule"):
         off = np.abs(np.concatenate([normalized(drive, run, name) for run in runs]))

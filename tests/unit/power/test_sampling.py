@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from tcpipe.power.rails import make_samples
 from tcpipe.power.sampling import estimate_smoothing_variance, find_readings, find_smoothing, is_stated_averaged
@@ -17,12 +18,7 @@ AT_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(COUNT, dtype=np.int64
 def wandering(count, rows, rng):
     """Return a signal of unit variance that is forgotten within so many rows."""
     kept = np.exp(-1.0 / rows)
-    white = rng.standard_normal(count) * np.sqrt(1.0 - kept**2)
-    value = np.empty(count)
-    value[0] = white[0]
-    for i in range(1, count):
-        value[i] = kept * value[i - 1] + white[i]
-    return value
+    return lfilter([np.sqrt(1.0 - kept**2)], [1.0, -kept], rng.standard_normal(count))
 
 
 def repeated(reading_hz, *, step, jitter=0.0, seed=1):
@@ -38,7 +34,7 @@ def repeated(reading_hz, *, step, jitter=0.0, seed=1):
 
 @pytest.mark.parametrize("step", [0.01, 0.1, 0.5])
 @pytest.mark.parametrize("jitter", [0.0, 0.1])
-@pytest.mark.parametrize("reading_hz", [0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
+@pytest.mark.parametrize("reading_hz", [0.5, 1.0, 3.0, 5.0, 8.0, 10.0])
 def test_readings_are_found_at_the_first_message_that_holds_them(reading_hz, jitter, step):
     value, arrivals = repeated(reading_hz, step=step, jitter=jitter)
     rows = find_readings(AT_NS, value[:, None])

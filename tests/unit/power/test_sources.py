@@ -93,24 +93,16 @@ def test_a_list_of_currents_must_reach_to_the_last_that_is_wanted_and_be_as_long
     columns = {"log_time_ns": np.arange(2), "v": np.full(2, 24.0), "i": np.array([[1.0, 2.0, 4.0]] * 2)}
     (found,) = read_rails(columns, [source(current="i[0] + i[2]", currents_listed=3)], "/b")
     assert found.current_amp.tolist() == [5.0, 5.0]
-    for said, reason, field, counts in (
-        ({"current": "i[3]"}, "values-count-differs", "i", {"values_count": 3.0, "expected_count": 4.0}),
-        (
-            {"current": "i[2]", "currents_listed": 4},
-            "values-count-differs",
-            "i",
-            {"values_count": 3.0, "expected_count": 4.0},
-        ),
-        (
-            {"current": "i[1]", "voltage": "v[0]"},
-            "values-count-differs",
-            "v",
-            {"values_count": 0.0, "expected_count": 1.0},
-        ),
-        ({"current": "j"}, "field-missing", "j", {}),
+    for said, field, counts in (
+        ({"current": "i[3]"}, "i", (3.0, 4.0)),
+        ({"current": "i[2]", "currents_listed": 4}, "i", (3.0, 4.0)),
+        ({"current": "i[1]", "voltage": "v[0]"}, "v", (0.0, 1.0)),
+        ({"current": "j"}, "j", ()),
     ):
         found = read_rails(columns, [source(**said)], "/b")
-        assert (found.names["reason"], found.names["field"], found.numbers) == (reason, field, counts)
+        reason = "values-count-differs" if counts else "field-missing"
+        numbers = dict(zip(("values_count", "expected_count"), counts, strict=False))
+        assert (found.names["reason"], found.names["field"], found.numbers) == (reason, field, numbers)
 
 
 def test_a_sign_is_clear_where_more_than_eight_tenths_flow_one_way():
