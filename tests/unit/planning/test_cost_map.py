@@ -28,16 +28,13 @@ MODEL = PhysicsModel()
 
 @dataclass(frozen=True)
 class CountingMap(ArrayMap):
-    """Counts what is read, and says what it is, as a map in a store does."""
+    """Counts what is read."""
 
     reads: Counter = None
 
     def read(self, layer, row0, row1, col0, col1):
         self.reads[layer, row0, col0] += 1
         return super().read(layer, row0, row1, col0, col1)
-
-    def summary(self):
-        return {"name": self.name}
 
 
 def _map(**options):
