@@ -1,6 +1,7 @@
 """Analytic worlds for map tests: closed-form height, grey and class, written as GeoTIFFs, and segments that lie in them."""
 
 from collections.abc import Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pyproj
 import rasterio
 from rasterio import Affine
 
+from tcpipe.formats.maps.geotiff import keep_open
+from tcpipe.formats.maps.layer_building import open_raster
 from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
@@ -118,6 +121,13 @@ def segment_table(
     whole = {c.name for c in LABELLED_SEGMENTS.columns if str(c.dtype).startswith(("int", "uint"))}
     rest = {name: values.astype(np.int64) if name in whole else values for name, values in rest.items()}
     return LABELLED_SEGMENTS.table(**given, **rest | {"geometry": make_lines(start, end)})
+
+
+@contextmanager
+def open_heights(paths):
+    """Yield heights in many files as `build_map` opens them."""
+    with keep_open() as open_file:
+        yield open_raster(paths, "height", "metres", open_file)
 
 
 @dataclass(frozen=True)
