@@ -170,9 +170,7 @@ def make_finding(
 ) -> Finding:
     """Return a finding that the catalogue knows, with the catalogue's severity and action unless they are given.
 
-    Raises
-    ------
-    ValueError : the catalogue lacks the code or a remedy, or the template needs a number or a name that is missing. This is a bug.
+    `ValueError` is a bug: the catalogue lacks the code or a remedy, or the template needs a number or a name that is missing.
     """
     entry = read_catalogue().get(code)
     if entry is None:

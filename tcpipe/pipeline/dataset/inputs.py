@@ -331,10 +331,7 @@ class _SegmentPositions:
 def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, str]) -> UniqueRuns:
     """Return the runs, by id, without second recordings, and a finding for each of those; of two, the first by id stays.
 
-    Parameters
-    ----------
-    runs : runs to choose from, all of one recipe.
-    sha256_by_run : hash of each run's log.
+    ``runs`` are all of one recipe; ``sha256_by_run`` is the hash of each run's log.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
     start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T
