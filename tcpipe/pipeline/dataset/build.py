@@ -31,7 +31,6 @@ from tcpipe.formats.dataset_files import (
     RELIEF,
     REPORT,
     SAMPLES,
-    SHARDS,
     read_card,
     read_intact_card,
 )
@@ -365,11 +364,9 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     card = make_dataset_card(figures, options, inputs, content, balance=balance, shards=shards)
     card = card if redaction is None else redact_card(card, redaction)
     shutil.rmtree(waiting)
-    write_text(directory / HUB_CARD, format_hub_card(card, samples_file=SAMPLES, picture=OVERVIEW))
+    write_text(directory / HUB_CARD, format_hub_card(card))
     files = compute_checksums(directory)
-    shards_pattern = f"{SHARDS}/*.parquet"
-    croissant = format_croissant(card, content.samples.schema, files, samples_file=SAMPLES, shards=shards_pattern)
-    write_text(directory / CROISSANT, croissant)
+    write_text(directory / CROISSANT, format_croissant(card, content.samples.schema, files))
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
     write_text(directory / REPORT, seal_page(render_dataset_report(directory, samples=figures)))
