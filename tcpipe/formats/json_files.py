@@ -100,16 +100,16 @@ def read_document(path: Path) -> bytes:
     return data
 
 
-def parse_json(data: bytes, path: Path | str) -> dict[str, Json]:
+def parse_json(
+    data: bytes, path: Path | str, *, remedy: str = "; remove it and run the command again"
+) -> dict[str, Json]:
     """Return the object in the bytes of a file; `StoreError` if it holds none."""
     try:
         found = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path}: not a readable JSON file ({error}); remove it and run the command again") from None
+        raise StoreError(f"{path}: not a readable JSON file ({error}){remedy}") from None
     if not isinstance(found, dict):
-        raise StoreError(
-            f"{path}: contains {type(found).__name__}, expected a JSON object; remove it and run the command again"
-        )
+        raise StoreError(f"{path}: contains {type(found).__name__}, expected a JSON object{remedy}")
     return found
 
 

@@ -277,5 +277,7 @@ def _read_stored(run: Path | str) -> tuple[Streams, FuseConfig] | None:
         raise UsageError(f"{run}: was ingested under several recipes; give one of them: {run}/… {names}")
     streams = store.read_streams(runs[0].run_id, key=runs[0].streams_key)
     if streams is None:
-        raise StoreError(f"{run}: its streams are gone or were read otherwise; audit its log, or ingest it again")
+        raise StoreError(
+            f"{run}: its streams are gone or were read otherwise; audit its log, or ingest it again with --force"
+        )
     return streams, runs[0].manifest.recipe.fuse

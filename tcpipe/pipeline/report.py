@@ -111,6 +111,8 @@ def _write(place: Place, html: str, physics: tuple[str, ...]) -> Page:
     changed = place.read(_PAGE) != data
     if changed:
         place.put(_PAGE, data)
+    else:  # a killed call may have left a temporary
+        place.clear()
     return Page(place.where(_PAGE), changed, physics)
 
 

@@ -59,7 +59,10 @@ def test_no_model_and_half_a_model(tmp_path, place):
     _refused(tmp_path, "not a model: it has no model.json")
     cut = made_model(tmp_path / "card")
     (cut / "model.json").write_text((cut / "model.json").read_text()[:200])
-    _refused(cut, r"model.json: not a readable JSON file \(.*\); remove the folder and train the model again")
+    _refused(
+        cut,
+        r"model.json: not a readable JSON file \(.*\); .* lists all changed files; remove the folder and train the model again",
+    )
     cut = made_model(tmp_path / "cut")
     (cut / WEIGHTS).write_bytes((cut / WEIGHTS).read_bytes()[:-100])
     _refused(cut, "weights.npz: has .* bytes, expected .*; train the model again")

@@ -82,21 +82,6 @@ def test_tiles_are_the_map_that_one_merged_raster_is(tmp_path, options, monkeypa
         assert 0.5 < present.mean() < 0.95, role
 
 
-def test_interpolation_knows_no_seam(tmp_path):
-    """A plane in tiles that only touch is a plane everywhere, half a pixel beside each seam too."""
-    paths = []
-    for j in range(3):
-        x = LEFT + PITCH_M * (SIDE * j + np.arange(SIDE) + 0.5)
-        values = np.tile(100.0 + 0.5 * (x - LEFT), (1, SIDE, 1)).astype(np.float32)
-        paths.append(write_tif(tmp_path / f"{j}.tif", values, "EPSG:32633", corner(SIDE * j, 0)))
-    build_map(tmp_path / "m.zarr", name="m", height=paths, pixel_size_m=0.1)
-    grid, layers = layers_of(tmp_path / "m.zarr")
-    x = grid.xy_from_px(np.stack([np.arange(grid.cols), np.zeros(grid.cols)], axis=1))[:, 0]
-    middle = layers["height"][grid.rows // 2] + open_map(tmp_path / "m.zarr").height_reference_m
-    inside = slice(2, -2)
-    np.testing.assert_allclose(middle[inside], 100.0 + 0.5 * (x - LEFT)[inside], atol=1e-4)
-
-
 def test_tiles_in_degrees_lie_side_by_side_also_across_the_antimeridian(tmp_path):
     """Steps of a third of an arc second are no round number; 60 columns west of 180°, 60 east of it."""
     pitch = 1.0 / 10_800.0
@@ -111,15 +96,6 @@ def test_tiles_in_degrees_lie_side_by_side_also_across_the_antimeridian(tmp_path
         values, valid = raster.read(10, 12, 50, 70)
     assert valid.all()
     assert values[0].tolist() == [7.0] * 10 + [9.0] * 10
-
-
-def test_the_order_given_rules_where_tiles_overlap(tmp_path):
-    low, high = (
-        write_tif(tmp_path / f"{v}.tif", np.full((1, 9, 9), v, np.float32), "EPSG:32633", corner(0, 0)) for v in (1, 2)
-    )
-    for paths, wanted in (([low, high], 2.0), ([high, low], 1.0)):
-        with open_raster(paths, "height") as raster:
-            assert (raster.read(0, 9, 0, 9)[0] == wanted).all()
 
 
 def test_few_files_are_open_however_many_there_are(tmp_path):
