@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from tcpipe.cli import cli
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
+from tcpipe.simulation.route import Wander
 
 ESC = "std_msgs/Header header\nfloat32 voltage\nfloat32 current\nint32 rpm\nfloat32 temperature\n"
 SOLUTION = "std_msgs/Header header\nfloat64 lat\nfloat64 lon\nfloat32 height\nuint8 quality\n"
@@ -24,7 +25,7 @@ HUSKY = {"gnss": "[0.1, 0.0, 0.9]", "imu": "[0.05, -0.1, 0.3], rpy_rad = [3.1416
 
 @pytest.fixture(scope="module")
 def drive():
-    return make()
+    return make(Wander(35.0, (110.0, 30.0)))
 
 
 def run(*words):

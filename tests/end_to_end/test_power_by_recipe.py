@@ -10,13 +10,14 @@ from click.testing import CliRunner
 
 from tcpipe.cli import cli
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
+from tcpipe.simulation.route import Wander
 
 FLOAT = "std_msgs/msg/Float32"
 
 
 @pytest.fixture(scope="module")
 def drive():
-    return make()
+    return make(Wander(35.0, (110.0, 30.0)))
 
 
 def bare(stamp_ns, name, values):
