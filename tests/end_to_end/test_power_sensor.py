@@ -21,7 +21,7 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import MASKED_TRACK, STREAMS
 
 NOISY = Faults.only("gnss_noise", "imu_noise", "wheel_noise", "visual_noise", "power_noise")
-CODES = {"current-offset", "current-gain-changes", "current-sign-lost"}
+CODES = {"current-offset", "current-gain-changes", "current-sign-lost", "power-smoothed"}
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +67,12 @@ def find_codes(labelled):
     return {found.code: found for found in labelled.info.report.findings if found.code in CODES}
 
 
+def average(amp, seconds):
+    """Return the mean of the samples at 20 Hz so far back."""
+    total = np.cumsum(np.concatenate((np.full(20 * seconds, amp[0]), amp)))
+    return (total[20 * seconds :] - total[: -20 * seconds]) / (20 * seconds)
+
+
 FAULTS = {
     "offset of 1 A": (lambda amp, _: amp + 1.0, "current-offset"),
     "offset of 0.5 A": (lambda amp, _: amp + 0.5, "current-offset"),
@@ -75,6 +81,9 @@ FAULTS = {
     "unsigned": (lambda amp, _: np.abs(amp), "current-sign-lost"),
     "gain + 10 %": (lambda amp, share: amp * np.where(share > 0.5, 1.1, 1.0), "current-gain-changes"),
     "gain - 10 %": (lambda amp, share: amp * np.where(share > 0.4, 0.9, 1.0), "current-gain-changes"),
+    "mean of 2 s": (lambda amp, _: average(amp, 2), "power-smoothed"),
+    "mean of 6 s": (lambda amp, _: average(amp, 6), "power-smoothed"),
+    "two means of 1 s": (lambda amp, _: average(average(amp, 1), 1), "power-smoothed"),
 }
 
 
