@@ -15,6 +15,7 @@ from pyproj import CRS
 
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
+from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
 from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
@@ -74,10 +75,6 @@ class MoreLayers:
     """Those of them whose values are classes, and their class tables; None: the raster's own names say what its values mean."""
     ortho_bands: OrthoBands = "grey"
     """rgb: the orthophoto's colours, too."""
-
-    def uses(self) -> dict[str, Use]:
-        """Return what is taken of each layer's rasters."""
-        return {name: "classes" if name in self.categorical else "numbers" for name in self.files}
 
 
 def build_map(
@@ -243,7 +240,7 @@ def _open_all(
 ) -> dict[str, Raster]:
     rasters: dict[str, Raster] = {}
     problems: list[str] = []
-    uses = {**USES, **more.uses()}
+    uses = USES | {name: "classes" if name in more.categorical else "numbers" for name in more.files}
     if more.ortho_bands == "rgb":
         paths = {**paths, **dict.fromkeys(COLOURS, paths["ortho"])}
         uses |= dict(zip(COLOURS, _RGB, strict=True))
@@ -356,9 +353,7 @@ def read_class_scheme(path: Path) -> ClassScheme:
     if not classes and not problems:
         problems.append(f"{path}: the class table has no classes (expected columns {','.join(_COLUMNS)})")
     if problems:
-        raise MapError(
-            *problems[:_SHOWN], *([f"{path}: … and {len(problems) - _SHOWN} more"] if len(problems) > _SHOWN else [])
-        )
+        raise MapError(*shorten_problems(problems, _SHOWN))
     return ClassScheme(ClassTable(tuple(classes[key] for key in sorted(classes))), dict(sorted(id_by_value.items())))
 
 
