@@ -167,7 +167,7 @@ def iterate_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iter
     means = np.where(values == 0, np.float32(np.nan), values.astype(np.float32)) if grey else values
     for factor in factors[1:]:
         means = _halve(means)
-        yield factor, _to_grey(means) if grey else means
+        yield factor, np.where(np.isfinite(means), np.rint(means), 0.0).astype(np.uint8) if grey else means
 
 
 def _halve(values: Pixels) -> Pixels:
@@ -175,7 +175,3 @@ def _halve(values: Pixels) -> Pixels:
     even = values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2]
     rows = even[0::2] + even[1::2]
     return np.asarray((rows[:, 0::2] + rows[:, 1::2]) * rows.dtype.type(0.25))
-
-
-def _to_grey(means: Pixels) -> NDArray[np.uint8]:
-    return np.where(np.isfinite(means), np.rint(means), 0.0).astype(np.uint8)

@@ -40,7 +40,7 @@ class Raster:
 
     role: str
     unit: str
-    place: Georeference
+    georeference: Georeference
     """Where it lies; its name, for messages, is the path, and how many more there are."""
     findings: tuple[Finding, ...]
     """One a code, of the first tile that has it."""
@@ -107,7 +107,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
     return Raster(
         role=role,
         unit=tiles[0].unit,
-        place=Georeference(found, affine, int(corners[:, 1].max()), int(corners[:, 3].max()), label),
+        georeference=Georeference(found, affine, int(corners[:, 1].max()), int(corners[:, 3].max()), label),
         findings=tuple(findings.values()),
         names=_join_value_names(tiles),
         tiles=tuple(tiles),
@@ -255,7 +255,7 @@ class RasterLayer:
     @property
     def label(self) -> str:
         """The raster's files, for messages."""
-        return self.raster.place.name
+        return self.raster.georeference.name
 
     @property
     def name(self) -> str:
@@ -302,7 +302,7 @@ class RasterLayer:
         return (*self.raster.findings, *rough, finding)
 
     def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
-        return compute_source_lattice(self.grid, self.raster.place, self.projection, row0, rows, col0, cols)
+        return compute_source_lattice(self.grid, self.raster.georeference, self.projection, row0, rows, col0, cols)
 
     def _fill(self, part: Pixels, row0: int, col0: int) -> None:
         """Resample one block of the grid from the raster."""
@@ -313,7 +313,8 @@ class RasterLayer:
             return
         low = np.maximum(np.floor(flat.min(axis=0)).astype(np.int64) - 1, 0)
         high = np.minimum(
-            np.ceil(flat.max(axis=0)).astype(np.int64) + 2, (self.raster.place.cols, self.raster.place.rows)
+            np.ceil(flat.max(axis=0)).astype(np.int64) + 2,
+            (self.raster.georeference.cols, self.raster.georeference.rows),
         )
         if (low >= high).any():
             return
