@@ -73,7 +73,6 @@ from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     EARLIER_VERSIONS,
     READ_TABLES,
-    READ_VERSIONS,
     LabelledSegments,
     MaskedTrack,
     Streams,
@@ -187,7 +186,7 @@ class Store:
                 continue
             if gone is not None:
                 lost[row.run_id, row.recipe_id] = gone
-            elif row.data_model_version not in READ_VERSIONS:
+            elif row.data_model_version != DATA_MODEL_VERSION:
                 outdated[row.run_id] = row
             else:
                 finished.append(RunDirectory(row.run_id, row.recipe_id, runs, row, files_state))
@@ -234,10 +233,9 @@ class Store:
         """Where tables for other tools lie."""
         return self.place.below("index")
 
-    def write_index(self, state: State, *, before: State | None = None) -> None:
-        """Write the table of all runs for other tools; one that was written at the state ``before`` is brought up to date."""
-        before = before or State()
-        write_index(self.index_place, state.runs, state.digest, before=before.runs, digest_before=before.digest or None)
+    def write_index(self, state: State) -> None:
+        """Write the table of all runs for other tools."""
+        write_index(self.index_place, state.runs)
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.
@@ -464,8 +462,8 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     found = version is not None or is_store(root)
     if not found and not create and not (store.place.path and store.place.path.exists()):
         raise UsageError(f"{root}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
-    if version not in (None, *READ_VERSIONS):
-        raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
+    if version not in (None, DATA_MODEL_VERSION):
+        raise StoreError(f"{root}: is of data model {version}, this version knows {DATA_MODEL_VERSION}")
     if create:
         if not found:
             mark_store(store.place)

@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -23,10 +24,11 @@ RATCHETS = Path(__file__).parent / "architecture/ratchets.toml"
 
 @pytest.fixture(scope="module", autouse=True)
 def dataset_page(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Leave out the page of each dataset, two thirds of a small build, but in modules that say ``DRAWS_DATASET_PAGES = True``."""
+    """Leave out page and pictures of each dataset, most of a small build, but in modules that say ``DRAWS_DATASET_PAGES = True``."""
     with pytest.MonkeyPatch.context() as patch:
         if not getattr(request.module, "DRAWS_DATASET_PAGES", False):
             patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_, **__: "<!doctype html>")
+            patch.setattr("tcpipe.pipeline.dataset.build.draw_maps", lambda *_: np.zeros((2, 2), np.uint8))
         yield
 
 

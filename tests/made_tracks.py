@@ -1,6 +1,7 @@
 """Tracks written down by formula: the stages' input without any log or filter."""
 
 import numpy as np
+import pyarrow as pa
 
 from tcpipe.tables.levels import POWER, REJECTIONS, TRACK, Datum, Streams, Track, TrackInfo
 
@@ -58,6 +59,14 @@ def make_track(
     )
     info = TrackInfo("run-0123abcd", "husky", datum, 20.0, estimator)
     return Track(table, REJECTIONS.empty(), info)
+
+
+def with_columns(table, **values):
+    """Return a table with other values in some of its columns."""
+    for name, of in values.items():
+        field = table.schema.field(name)
+        table = table.set_column(table.schema.get_field_index(name), field, pa.array(np.asarray(of), field.type))
+    return table
 
 
 def straight_track(speed_mps, *, course_rad=0.0, slope_rad=0.0, **options):

@@ -1,6 +1,9 @@
 """A small store for tests of datasets: an analytic map and runs whose segments are laid out on it, without any log."""
 
+import shutil
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow as pa
@@ -192,12 +195,30 @@ def supersede(store, run_id, by):
     open_log(store).commit("superseded", Entries(superseded=(Superseded(run_id, by),)))
 
 
-def add_world(store, directory: Path, *, name="site", layers=("ortho", "terrain")):
+_BUILT = TemporaryDirectory(prefix="tcpipe-test-")
+
+
+@cache
+def _build_world(name, layers):
+    """Build the analytic map, once for all stores of a process."""
+    here = Path(_BUILT.name, "-".join((name, *layers)))
+    here.mkdir()
+    rasters = WORLD.write(here, pixel_size_m=0.1)
+    build_map(here / "map.zarr", name=name, **{layer: rasters[layer] for layer in ("height", *layers)})
+    return here / "map.zarr"
+
+
+def add_world(store, *, name="site", layers=("ortho", "terrain")):
     """Put the analytic map into the store."""
-    directory.mkdir(parents=True, exist_ok=True)
-    rasters = WORLD.write(directory, pixel_size_m=0.1)
-    optional = {layer: rasters[layer] for layer in layers}
-    put_map(store, name, height=rasters["height"], **optional)
+    with store.new_map(name, after=store.map_number(name)) as path:
+        shutil.copytree(_build_world(name, layers), path)
+
+
+def open_world(directory: Path, **how) -> Store:
+    """Make a store that has the analytic map."""
+    store = open_store(directory / "store", create=True)
+    add_world(store, **how)
+    return store
 
 
 def put_map(store, name, **how):
@@ -208,8 +229,7 @@ def put_map(store, name, **how):
 
 def small_store(directory: Path) -> Store:
     """Two runs of 8 lanes each, 448 segments, on the 40 m world."""
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory / "rasters")
+    store = open_world(directory)
     for run_id, first in (("north", 1.0), ("south", -15.5)):
         start, end = lanes(first + 2.0 * np.arange(8), -14.0, 14.0)
         add_run(store, run_id, segments(run_id, start, end, start_ns=int(1e18 + first * 1e12)))

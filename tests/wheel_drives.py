@@ -5,6 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
+from tcpipe.pipeline.options import IngestOptions
+from tcpipe.pipeline.status import find_status
+from tcpipe.recipe import Recipe
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -30,3 +33,8 @@ def drive_at(path: Path, **how) -> Path:
     path.unlink(missing_ok=True)
     write_mcap(path, wheel_drive(**how))
     return path
+
+
+def ask_status(store, *logs, **how):
+    """Return the status of logs, or of those that were ingested before."""
+    return find_status(IngestOptions(logs, store=store, **{"recipe": Recipe(), "min_age_s": 600.0, **how}))

@@ -17,7 +17,6 @@ Bootstrap*, 1993, chapter 11). The offset between two footprints makes the figur
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,10 +64,10 @@ def compute_slope_residuals(values: Floats, terrain_class: NDArray[np.integer], 
     return left
 
 
-def estimate_correlations(
-    residual_by_label: Mapping[str, Floats], xy_m: Floats, run: NDArray[np.integer], start_ns: Ints, *, chord_m: float
-) -> dict[str, Correlation | None]:
-    """Return the correlation of each label's residuals, shape (N,), over distance; None where too few samples are near each other.
+def fit_correlation(
+    residual: Floats, xy_m: Floats, run: NDArray[np.integer], start_ns: Ints, *, chord_m: float
+) -> Correlation | None:
+    """Return the correlation of a label's residuals, shape (N,), over distance; None where too few samples are near each other.
 
     ``xy_m`` are centres of the footprints [m], shape (N, 2); ``run`` and ``start_ns`` [ns] order the samples, shape (N,).
     """
@@ -78,16 +77,14 @@ def estimate_correlations(
     pairs = np.bincount(bins, minlength=size)[: size - 1]
     enough = pairs >= _FEWEST_PAIRS
     if enough.sum() < 3:
-        return dict.fromkeys(residual_by_label)
+        return None
     lag = np.bincount(bins, apart, size)[: size - 1][enough] / pairs[enough]
-    found: dict[str, Correlation | None] = {}
-    for label, residual in residual_by_label.items():
-        half_squares = pdist(residual[rows, None], "sqeuclidean") / 2.0
-        gamma = np.bincount(bins, half_squares, size)[: size - 1][enough] / pairs[enough]
-        length, nugget, sill = _fit(lag, gamma, pairs[enough]) if gamma.any() else (0.0, 0.0, 0.0)
-        known = nugget + sill > 0.0
-        found[label] = Correlation(length * chord_m, sill / (nugget + sill), int(pairs.sum())) if known else None
-    return found
+    half_squares = pdist(residual[rows, None], "sqeuclidean") / 2.0
+    gamma = np.bincount(bins, half_squares, size)[: size - 1][enough] / pairs[enough]
+    if not gamma.any():
+        return None
+    length, nugget, sill = _fit(lag, gamma, pairs[enough])
+    return Correlation(length * chord_m, sill / (nugget + sill), int(pairs.sum())) if nugget + sill > 0.0 else None
 
 
 def _draw_sections(run: NDArray[np.integer], start_ns: Ints) -> Ints:

@@ -177,8 +177,7 @@ def _print_dataset(found: InspectedDataset) -> None:
     print_line(
         f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}"
     )
-    if found.verdict is not None:
-        print_line(f"verdict: {format_verdict(found.verdict)}")
+    print_line(f"verdict: {format_verdict(found.verdict)}")
     for line in list_mixed_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
         print_line(line)
 

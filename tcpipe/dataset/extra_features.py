@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ COLUMNS = ("mean_abs_yaw_rate_radps", "duration_s", "arc_length_m", "commanded_v
 
 def read_extra_features(split: Split) -> ExtraFeatures:
     """Return the extra features of a split; columns that an older dataset lacks are NaN."""
-    turn, command = _form_values([split.column(name).astype(np.float64) for name in COLUMNS])
+    turn, command = _form_values(split.column(name).astype(np.float64) for name in COLUMNS)
     class_id = np.nan_to_num(split.column("terrain_class").astype(np.float64), nan=0.0).astype(np.int64)
     return ExtraFeatures(class_id, split.column("slope_rad").astype(np.float64), turn, command)
 
@@ -79,36 +79,23 @@ def available_features(features: ExtraFeatures) -> tuple[ExtraFeature, ...]:
 
 def fill_unknown(inputs: Sequence[ExtraFeature], features: ExtraFeatures) -> ExtraFeatures:
     """Return the features with a model's usual values where one that it takes is unknown."""
-    values = {feature.name: getattr(features, feature.name) for feature in inputs}
-    return replace(
-        features,
-        **{
-            feature.name: np.where(np.isfinite(values[feature.name]), values[feature.name], feature.usual)
-            for feature in inputs
-        },
-    )
+    known = dict[str, Any]()
+    for feature in inputs:
+        values = getattr(features, feature.name)
+        known[feature.name] = np.where(np.isfinite(values), values, feature.usual)
+    return replace(features, **known)
 
 
 def standardize_features(inputs: Sequence[ExtraFeature], features: ExtraFeatures) -> Floats:
     """Return a model's features of N segments as (value - mean) / deviation, shape (N, inputs)."""
-    return _scale_values(inputs, {"turn_radpm": features.turn_radpm, "command_mps": features.command_mps})
+    known = fill_unknown(inputs, features)
+    scaled = [(getattr(known, feature.name) - feature.mean) / feature.deviation for feature in inputs]
+    return np.column_stack(scaled) if scaled else np.empty((len(features.turn_radpm), 0))
 
 
-def standardize_columns(inputs: Sequence[ExtraFeature], columns: NDArray[np.floating]) -> Floats:
-    """Return the same from `COLUMNS`, shape (N, 4)."""
-    turn, command = _form_values(list(columns.T.astype(np.float64)))
-    return _scale_values(inputs, {"turn_radpm": turn, "command_mps": command})
-
-
-def _form_values(columns: Sequence[Floats]) -> tuple[Floats, Floats]:
+def _form_values(columns: Iterable[Floats]) -> tuple[Floats, Floats]:
     rate, duration, arc, command = columns
     return rate * duration / arc, command
-
-
-def _scale_values(inputs: Sequence[ExtraFeature], values: dict[str, Floats]) -> Floats:
-    columns = [np.where(np.isfinite(values[feature.name]), values[feature.name], feature.usual) for feature in inputs]
-    scaled = [(column - feature.mean) / feature.deviation for feature, column in zip(inputs, columns, strict=True)]
-    return np.column_stack(scaled) if scaled else np.empty((len(next(iter(values.values()))), 0))
 
 
 def append_planes(patches: NDArray[np.float32], numbers: Floats) -> NDArray[np.float32]:
@@ -123,4 +110,6 @@ def append_column_planes(
     inputs: Sequence[ExtraFeature], patches: NDArray[np.float32], columns: NDArray[np.floating]
 ) -> NDArray[np.float32]:
     """Return patches of a batch with a plane for each extra feature, from `COLUMNS` of the batch, shape (N, 4)."""
-    return append_planes(patches, standardize_columns(inputs, columns))
+    turn, command = _form_values(columns.T.astype(np.float64))
+    features = replace(empty_extra_features(len(columns)), turn_radpm=turn, command_mps=command)
+    return append_planes(patches, standardize_features(inputs, features))

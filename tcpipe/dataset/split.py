@@ -23,7 +23,7 @@ from tcpipe.formats.dataset_files import (
     find_places_in_files,
     is_shard,
     open_patches,
-    read_current_card,
+    read_intact_card,
     read_sample_ids,
     read_samples,
     sample_columns,
@@ -356,7 +356,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     """
     energy = find_energy(label)
     directory, fetched = fetch_directory_by_range(path, by_range=is_shard)
-    card = read_current_card(directory)
+    card = read_intact_card(directory)
     split = read_samples(directory, ["split"]).column("split").to_numpy()
     if len(split) != card.samples:
         raise DatasetError(

@@ -102,9 +102,9 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
         raise DatasetError(
             f"{path}: {rows.height} rows of {rows.width - 1} columns besides {column}; expected at least one of each"
         )
-    if twice := _find_first_repeated(rows[_STAMP]):
+    if len(twice := rows[_STAMP].filter(rows[_STAMP].is_duplicated())):
         raise DatasetError(
-            f"{path}: rows of {_format_utc(twice)} differ from one another; expected one row a stamp: one station, one depth a file"
+            f"{path}: rows of {_format_utc(twice[0])} differ from one another; expected one row a stamp: one station, one depth a file"
         )
     return CovariateTable(path.name, compute_checksum(path), column, rows, tuple(findings))
 
@@ -194,8 +194,3 @@ def _parse_values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], lis
             findings.append(finding)
         made.append(text)
     return made, findings
-
-
-def _find_first_repeated(stamps: pl.Series) -> int | None:
-    twice = stamps.filter(stamps.is_duplicated())
-    return int(twice[0]) if len(twice) else None

@@ -299,14 +299,14 @@ class DatasetCard:
     balance: Balance
     runs: tuple[RunSource, ...]
     run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
-    """The tags that a run had to carry; None in cards of before 0.9 and of a redacted dataset, which do not tell."""
+    """The tags that a run had to carry; None in cards of before 0.9, migrated, and of a redacted dataset."""
     maps: tuple[MapSource, ...]
-    flagged_samples: FlaggedSamples | None = None
-    """How many samples carry a quality flag; None in cards of before data model 1.2."""
+    flagged_samples: FlaggedSamples
+    """How many samples carry a quality flag."""
     findings: tuple[Finding, ...] = ()
     """Of the dataset itself: its choice of runs, sampling and splits. Runs and maps have their own."""
-    verdict: Verdict | None = None
-    """By all findings of the dataset, its maps and the runs that have samples; None in cards of before data model 3.0."""
+    verdict: Verdict
+    """By all findings of the dataset, its maps and the runs that have samples."""
     physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
     """By robot, the physics model: idle, drivetrain, rolling, grade and turning on each class; robots without a fit are omitted."""
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)

@@ -29,14 +29,14 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
-from tcpipe.formats.json_files import Json, parse_typed, read_document
+from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
-from tcpipe.formats.parquet import read_column_names, read_row_group, read_table, write_parquet_bytes
+from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place, find_changed_files, prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS, READ_VERSIONS
+from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
 
@@ -79,10 +79,10 @@ MOST_PX = 1024
 
 @contextmanager
 def _convert_errors(remedy: str = "") -> Iterator[None]:
-    """Raise a `StoreError` as `DatasetError`, ``remedy`` added to its lines."""
+    """Raise a `StoreError`, or that a recipe cannot be, as `DatasetError`, ``remedy`` added to its lines."""
     try:
         yield
-    except StoreError as error:
+    except (StoreError, RecipeError) as error:
         raise DatasetError(*(f"{problem}{remedy}" for problem in error.problems)) from None
 
 
@@ -147,14 +147,14 @@ def make_zarr_writers(
     directory: Path,
     out: Place,
     pixels: Pixels,
-    sample_ids: Callable[[int, int], Sequence[str]],
+    sample_ids: pa.ChunkedArray,
     *,
     compression: Compression,
     threads: int,
 ) -> list[Drawer]:
     """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written to ``out``.
 
-    ``sample_ids`` gives the ids of the rows from one up to another; ``threads`` does not change the bytes.
+    ``threads`` does not change the bytes.
     """
     n, px = len(pixels.slots), pixels.patch_px
     shard = _choose_shard_rows(n)
@@ -188,8 +188,8 @@ def make_zarr_writers(
         attributes={"long_name": "joins patches and samples"},
     )
     for first in range(0, n, SHARD_ROWS):
-        last = min(first + SHARD_ROWS, n)
-        ids[first:last] = np.array(sample_ids(first, last), dtype=object)
+        few = sample_ids.slice(first, SHARD_ROWS)
+        ids[first : first + len(few)] = np.array(few.to_pylist(), dtype=object)
     consolidate_metadata(group)
     arrays = {name: _open_layer_array(directory, layer, n, px) for name, layer in pixels.layers.items()}
     rows = (slice(first, first + shard) for first in range(0, n, shard))
@@ -249,10 +249,7 @@ def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array
 
 
 def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
-    """Return the card of the dataset in ``directory``, of any data model.
-
-    One of this data model is ``proved`` against its seal.
-    """
+    """Return the card of the dataset in ``directory``, ``proved`` against its seal."""
     if not directory.exists():
         raise UsageError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
     if not directory.is_dir():
@@ -266,37 +263,27 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
 
 def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> DatasetCard:
     """Return the card in the bytes of a file; as `read_card`."""
+
+    def is_current(card: Mapping[str, object]) -> bool:
+        return card.get("kind") == KIND and card.get("data_model_version") == DATA_MODEL_VERSION
+
     with _convert_errors():
-        found = verify_document(data, where, ours=lambda found: proved and _is_current(found))
+        found = verify_document(data, where, ours=lambda found: proved and is_current(found))
+        if is_current(found):
+            return parse_typed(found, DatasetCard, where)
     if found.get("kind") != KIND:
         raise DatasetError(f"{where}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
-    if not _is_current(found) or "verdict" not in found:  # before data model 3.0 its findings were sentences
-        found.pop("findings", None)
-    try:
-        return parse_typed(found, DatasetCard, where)
-    except (StoreError, RecipeError) as error:
-        directory, version = str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")
-        problems = error.problems if _is_current(found) else (_describe_outdated(directory, version),)
-        raise DatasetError(*problems) from None
-
-
-def _describe_outdated(directory: Path | str, version: Json) -> str:
+    directory, version = str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
-    return f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}"
+    raise DatasetError(f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}")
 
 
-def _is_current(card: Mapping[str, object]) -> bool:
-    return card.get("kind") == KIND and card.get("data_model_version") in READ_VERSIONS
-
-
-def read_current_card(directory: Path) -> DatasetCard:
-    """Return the card of a dataset of this data model, whose samples and descriptions of patches are as they were written.
+def read_intact_card(directory: Path) -> DatasetCard:
+    """Return the card of a dataset whose samples and descriptions of patches are as they were written.
 
     Patches carry checksums of their own, which are proved when they are read.
     """
     card = read_card(directory)
-    if card.data_model_version not in READ_VERSIONS:
-        raise DatasetError(_describe_outdated(directory, card.data_model_version))
     described = [name for name in card.checksums if Path(name).name == DESCRIPTION]
     with _convert_errors():
         prove_files(directory, card.checksums, [SAMPLES, *described])
@@ -375,9 +362,8 @@ class PatchFiles:
                 else:
                     name, group = self.groups[piece]
                     path = self.directory / name
-                    table = read_row_group(
-                        path if self.fetched is None else self.fetched.fetch_file(path), group, list(layers)
-                    )
+                    path = path if self.fetched is None else self.fetched.fetch_file(path)
+                    table = read_table(path, list(layers), group=group)
                     for layer in layers:
                         flat = table.column(layer).combine_chunks().flatten().to_numpy()
                         into[layer][:rows] = flat.reshape(rows, *into[layer].shape[1:])
@@ -393,12 +379,10 @@ def is_shard(name: str) -> bool:
     return name.startswith(f"{SHARDS}/") or (name.startswith(f"{PATCHES}/") and "/c/" in name)
 
 
-def open_patches(
-    directory: Path, card: DatasetCard, fetched: FetchedShards | None = None, *, proved: bool = True
-) -> PatchFiles:
+def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | None = None) -> PatchFiles:
     """Return where the patches of a dataset lie, here or ``fetched``.
 
-    Where that is to be ``proved``, shards are held against the card: on this machine at once, in a bucket each before it is first read.
+    Shards are held against the card: on this machine at once, in a bucket each before it is first read.
     A digest is found once and remembered, so that to open the dataset again costs a look at each file.
     """
     px, samples = card.patch_px, card.samples
@@ -412,25 +396,20 @@ def open_patches(
         )
     if "terrain" in layers and not card.classes:
         raise DatasetError(f"{directory / CARD}: a layer terrain, but no classes; build the dataset again")
-    fetched = fetched and replace(fetched, proves=proved)
-    if proved and fetched is None:
+    fetched = fetched and replace(fetched, proves=True)
+    if fetched is None:
         shards = [name for name in card.checksums if is_shard(name)]
-        _refuse_others(find_changed_files(Place(directory), card.checksums, shards), directory)
+        if wrong := find_changed_files(Place(directory), card.checksums, shards):
+            more = f", and {len(wrong) - 1} more shards" if len(wrong) > 1 else ""
+            raise DatasetError(
+                f"{wrong[0]}{more}: not of the build of {directory / CARD}; copy the whole dataset again, or build it again"
+            )
     if card.format == "parquet":
         return replace(_open_sharded_patches(directory, layers, px, card), fetched=fetched)
     with _convert_errors(_AGAIN):
         arrays = {name: _open_layer_array(directory, layer, samples, px, fetched) for name, layer in layers.items()}
     starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
     return PatchFiles(directory, layers, px, starts, arrays, fetched=fetched)
-
-
-def _refuse_others(wrong: Sequence[str], directory: Path) -> None:
-    """Raise one `DatasetError` for shards that are not the card's."""
-    if wrong:
-        more = f", and {len(wrong) - 1} more shards" if len(wrong) > 1 else ""
-        raise DatasetError(
-            f"{wrong[0]}{more}: not of the build of {directory / CARD}; copy the whole dataset again, or build it again"
-        )
 
 
 def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:

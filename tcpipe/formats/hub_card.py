@@ -95,8 +95,7 @@ def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
         "",
     )
     yield from ("## Splits", "", _format_splits(card), "")
-    if card.verdict is not None:
-        yield from ("## Verdict", "", f"Labels: {format_verdict(card.verdict)}. `dataset.json` has the findings.", "")
+    yield from ("## Verdict", "", f"Labels: {format_verdict(card.verdict)}. `dataset.json` has the findings.", "")
     if card.redaction is not None:
         yield from ("## Redacted", "", *map(_escape_markdown, card.redaction.lines()), "")
     yield from (

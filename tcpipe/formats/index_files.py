@@ -13,22 +13,17 @@ from pathlib import PurePosixPath
 from typing import Literal, TypeAlias
 
 import pyarrow as pa
-import pyarrow.compute as pc
+from pyarrow.json import ParseOptions, ReadOptions, read_json
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import convert_record
-from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
+from tcpipe.formats.json_files import convert_record, to_compact_json
+from tcpipe.formats.parquet import write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
-from tcpipe.tables.arrays import make_column
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit
 from tcpipe.tables.findings import AFFECTED, Finding, Verdict, judge, select_findings
 
 RUNS = "runs.parquet"
-
-_TOGETHER = 2_000
-"""So many rows are written at once."""
-_VERSION = b"7"
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +147,7 @@ def _pick(record: object, names: Iterable[str]) -> dict[str, object]:
 
 
 _CELLS: Mapping[str, Callable[[RunFacts], object]] = {
+    "tags": lambda row: [{"key": key, "value": row.tags[key]} for key in sorted(row.tags)],
     "findings": lambda row: [_pick(finding, ("code", "severity")) for finding in row.findings],
     "damage": lambda row: [finding.code for finding in row.damage],
     "verdict": lambda row: _pick(row.verdict, AFFECTED),
@@ -160,58 +156,30 @@ _CELLS: Mapping[str, Callable[[RunFacts], object]] = {
 """How a column is made that is no field of a row."""
 
 
-def write_index(
-    place: Place, rows: Rows, digest: str, *, before: Rows | None = None, digest_before: str | None = None
-) -> None:
-    """Write ``runs.parquet`` of a state of the log; where that cannot be, the next commit writes it.
-
-    ``before`` and ``digest_before`` are of an earlier state: of its table only the rows that have changed are made anew.
-    """
-    before = before or {}
-    table = None if digest_before is None else _read_index(place, digest_before)
-    changed = [key for key, row in rows.items() if table is None or before.get(key) is not row]
-    tables = [
-        _make_table([rows[key] for key in changed[at : at + _TOGETHER]]) for at in range(0, len(changed), _TOGETHER)
-    ]
-    if table is not None:
-        outdated = {*changed, *(before.keys() - rows.keys())}
-        keys = zip(*(table.column(name).to_pylist() for name in ("run_id", "recipe_id")), strict=True)
-        tables.append(table.filter(make_column([key not in outdated for key in keys], pa.bool_())))
-    table = pa.concat_tables(tables or [_SCHEMA.empty_table()])
-    table = table.take(pc.sort_indices(table, [("run_id", "ascending"), ("recipe_id", "ascending")]))
+def write_index(place: Place, rows: Rows) -> None:
+    """Write ``runs.parquet`` of a state of the log; where that cannot be, the next commit writes it."""
+    lines = [_make_line(rows[key]) for key in sorted(rows)]
     with suppress(StoreError):
-        place.put(RUNS, write_parquet_bytes(table.replace_schema_metadata(_describe_state(digest))))
+        place.put(RUNS, write_parquet_bytes(_parse_lines(lines) if lines else _SCHEMA.empty_table()))
 
 
-def _read_index(place: Place, digest: str) -> pa.Table | None:
-    """Return the table of the state of a digest; None where there is another, or none that can be read."""
-    with suppress(StoreError):
-        if (data := place.read(RUNS)) is not None:
-            table = read_parquet_bytes(data, place.where(RUNS))
-            return table.replace_schema_metadata(None) if table.schema.metadata == _describe_state(digest) else None
-    return None
+def _make_line(row: RunFacts) -> bytes:
+    cells = {name: _CELLS.get(name, attrgetter(name))(row) for name in _SCHEMA.names}
+    line = to_compact_json(cells)
+    return to_compact_json(_to_text(cells)) if b"\\ud" in line else line  # a name that is no text
 
 
-def _describe_state(digest: str) -> dict[bytes, bytes]:
-    return {b"tcpipe_index": _VERSION, b"log": digest.encode()}
-
-
-def _make_table(rows: Sequence[RunFacts]) -> pa.Table:
-    cells = (map(_CELLS.get(field.name, attrgetter(field.name)), rows) for field in _SCHEMA)
-    return pa.table(
-        [_to_column([*values], field.type) for values, field in zip(cells, _SCHEMA, strict=True)], schema=_SCHEMA
-    )
-
-
-def _to_column(values: list[object], kind: pa.DataType) -> pa.Array:
-    """Return values as Arrow takes them: names of files that are no text with escapes."""
-    try:
-        return make_column(values, kind)
-    except UnicodeEncodeError:
-        return make_column([_to_text(value) for value in values], kind)
+def _parse_lines(lines: Sequence[bytes]) -> pa.Table:
+    data = b"\n".join(lines)
+    at, field = _SCHEMA.get_field_index("tags"), _SCHEMA.field("tags")
+    schema = _SCHEMA.set(at, field.with_type(pa.list_(pa.struct({"key": _TEXT, "value": _TEXT}))))  # JSON has no maps
+    table = read_json(pa.BufferReader(data), ReadOptions(block_size=len(data)), ParseOptions(explicit_schema=schema))
+    tags = table.column(at).combine_chunks()
+    return table.set_column(at, field, pa.MapArray.from_arrays(tags.offsets, *tags.values.flatten()))
 
 
 def _to_text(value: object) -> object:
+    """Return a value with names of files that are no text as text with escapes."""
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, Mapping):

@@ -71,11 +71,12 @@ def verify_document(
     data: bytes, where: Path | str, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True
 ) -> dict[str, Json]:
     """Return the JSON object in the bytes of a document that lies at ``where``, proved; as `read_sealed`."""
-    found = parse_json(data, where)
+    remedy = ALL_CHANGES.format(str(where).rpartition("/")[0])
+    found = parse_json(data, where, remedy=remedy)
     if not ours(found):
         return found
     if not _is_whole_document(data):
-        raise StoreError(f"{describe_broken(where)}{ALL_CHANGES.format(str(where).rpartition('/')[0])}")
+        raise StoreError(f"{describe_broken(where)}{remedy}")
     return found
 
 

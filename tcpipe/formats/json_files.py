@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
@@ -25,8 +24,6 @@ Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
 
 _CONVERTING = Lock()
 """msgspec (0.22) ends the process where two threads meet a dataclass for the first time at once."""
-
-_ABSENT = object()
 
 MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
@@ -52,13 +49,8 @@ def to_plain(value: Any) -> Any:
 
 def convert_record(record: object, cls: Callable[..., T], **more: object) -> T:
     """Return a record of another dataclass: with the fields that ``record`` has too, and ``more``, which goes before."""
-    found = ((name, getattr(record, name, _ABSENT)) for name in _field_names(cls) if name not in more)
-    return cls(**{name: value for name, value in found if value is not _ABSENT}, **more)
-
-
-@cache
-def _field_names(cls: Callable[..., object]) -> tuple[str, ...]:
-    return tuple(entry.name for entry in fields(cls))  # type: ignore[arg-type]
+    names = (entry.name for entry in fields(cls) if entry.name not in more)  # type: ignore[arg-type]
+    return cls(**{name: getattr(record, name) for name in names if hasattr(record, name)}, **more)
 
 
 def to_compact_json(value: object) -> bytes:
@@ -108,16 +100,16 @@ def read_document(path: Path) -> bytes:
     return data
 
 
-def parse_json(data: bytes, path: Path | str) -> dict[str, Json]:
+def parse_json(
+    data: bytes, path: Path | str, *, remedy: str = "; remove it and run the command again"
+) -> dict[str, Json]:
     """Return the object in the bytes of a file; `StoreError` if it holds none."""
     try:
         found = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path}: not a readable JSON file ({error}); remove it and run the command again") from None
+        raise StoreError(f"{path}: not a readable JSON file ({error}){remedy}") from None
     if not isinstance(found, dict):
-        raise StoreError(
-            f"{path}: contains {type(found).__name__}, expected a JSON object; remove it and run the command again"
-        )
+        raise StoreError(f"{path}: contains {type(found).__name__}, expected a JSON object{remedy}")
     return found
 
 

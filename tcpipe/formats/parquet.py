@@ -105,25 +105,16 @@ def _convert_damage(where: Path | str) -> Iterator[None]:
         raise StoreError(f"{where}: not a readable Parquet file ({reason}); rebuild it") from None
 
 
-def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Read a Parquet file with its schema metadata, `EARLIER_COLUMNS` by their new names; `StoreError` names an unreadable file."""
+def read_table(path: Path, columns: list[str] | None = None, *, group: int | None = None) -> pa.Table:
+    """Read a Parquet file with its schema metadata, or one of its row groups, `EARLIER_COLUMNS` by their new names.
+
+    `StoreError` names a file that cannot be read.
+    """
     with _convert_damage(path), pa.memory_map(str(path)) as file:
-        return _check_text_sizes(file.read_buffer(), columns)
+        return _read_bounded(file.read_buffer(), columns, group)
 
 
-def read_parquet_bytes(data: bytes, where: str) -> pa.Table:
-    """Return the table in the bytes of a file that lies at ``where``, as `read_table`."""
-    with _convert_damage(where):
-        return _check_text_sizes(pa.py_buffer(data), None)
-
-
-def read_row_group(path: Path, group: int, columns: list[str]) -> pa.Table:
-    """Read columns of one row group of a Parquet file; `StoreError` names a file that cannot be read."""
-    with _convert_damage(path), pa.memory_map(str(path)) as file:
-        return _check_text_sizes(file.read_buffer(), columns, group)
-
-
-def _check_text_sizes(data: pa.Buffer, columns: list[str] | None, group: int | None = None) -> pa.Table:
+def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None) -> pa.Table:
     """Return columns of a file, or of one of its row groups, once they are known to be in proportion to it; `ValueError` if not."""
     about = pq.read_metadata(pa.BufferReader(data))
     most = max(MOST_BYTES, MOST_TIMES * data.size)

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.integrity import Checksum, seal_document, verify_document
-from tcpipe.formats.json_files import Json, digest, parse_typed, to_json
+from tcpipe.formats.integrity import Checksum, find_broken_seal, seal_document, verify_document
+from tcpipe.formats.json_files import Json, digest, parse_typed, parse_typed_json, to_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
 from tcpipe.motion.distance_breakdown import KEPT
@@ -234,6 +234,7 @@ def name_folder(checksums: Mapping[str, Checksum]) -> str:
 
 MARK = "store.json"
 """Is written first where a store is new, and last where one is brought over."""
+COPY_MARK = f"copy it from any store of data model {DATA_MODEL_VERSION}: it is the same in all of them"
 SPOOL = "spool"
 """Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store, and claims; they go in the end."""
 
@@ -252,7 +253,9 @@ def is_unmarked_store(place: Place) -> bool:
 def read_layout(place: Place) -> str | None:
     """Return the data model of a store, None where there is none; `StoreError` where its mark is not as it was written."""
     where, data = place.where(MARK), place.read(MARK)
-    return None if data is None else parse_typed(verify_document(data, where), StoreDocument, where).data_model_version
+    if broken := data is not None and find_broken_seal(data, where):
+        raise StoreError(f"{broken}; {COPY_MARK}")
+    return None if data is None else parse_typed_json(data, StoreDocument, where).data_model_version
 
 
 def mark_store(place: Place, *, found: bool = False) -> None:

@@ -14,11 +14,10 @@ from __future__ import annotations
 import math
 import os
 import reprlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -42,6 +41,19 @@ _ABSENT = 2**64 - 1
 """Offset of a chunk that is all fill value."""
 
 _BLOSC_SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
+
+
+class _LocalShards:
+    """Shards on this machine, as `FetchedShards` gives those in a bucket."""
+
+    @staticmethod
+    def size(path: Path) -> int:
+        return path.stat().st_size
+
+    @staticmethod
+    def read(path: Path, offset: int, size: int) -> bytes:
+        with path.open("rb", buffering=0) as file:
+            return os.pread(file.fileno(), size, offset)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,23 +80,11 @@ class ShardedArray:
         out = np.empty(self.chunk_shape, self.dtype) if out is None else out
         path = self._shard_path(shard)
         try:
-            if self.fetched is not None:
-                data = self._encoded_at(
-                    shard, place, partial(self.fetched.size, path), partial(self.fetched.read, path)
-                )
-            else:
-                with path.open("rb", buffering=0) as file:
-                    descriptor = file.fileno()
-                    data = self._encoded_at(
-                        shard,
-                        place,
-                        lambda: os.fstat(descriptor).st_size,
-                        lambda at, size: os.pread(descriptor, size, at),
-                    )
-            if data is None:
+            offset, size = self._index(shard)[place].tolist()
+            if offset == _ABSENT:
                 out[...] = self.fill
             else:
-                _decode(self.codec, data, out)
+                _decode(self.codec, self._read(path, offset, size), out)
         except FileNotFoundError:
             if not self.sparse:
                 raise StoreError(f"{path}: is missing") from None
@@ -107,8 +107,7 @@ class ShardedArray:
         for shard, place in wanted:
             path = paths[shard]
             with suppress(FileNotFoundError, ValueError):
-                table = self._index(shard, partial(self.fetched.size, path), partial(self.fetched.read, path))
-                offset, size = (int(value) for value in table[place])
+                offset, size = self._index(shard)[place].tolist()
                 pieces += [(path, offset, size)] if offset != _ABSENT else []
         self.fetched.prefetch(pieces)
 
@@ -174,26 +173,26 @@ class ShardedArray:
     def _shard_path(self, shard: tuple[int, ...]) -> Path:
         return self.path / self.shard_name(shard)
 
-    def _encoded_at(
-        self, shard: tuple[int, ...], place: tuple[int, ...], end: Callable[[], int], read: Callable[[int, int], bytes]
-    ) -> bytes | None:
-        """Return a chunk as it is stored, proved; None for one that is all fill value."""
-        offset, size = (int(value) for value in self._index(shard, end, read)[place])
-        return None if offset == _ABSENT else _read_checked(read, size, offset)
-
-    def _index(
-        self, shard: tuple[int, ...], end: Callable[[], int], read: Callable[[int, int], bytes]
-    ) -> NDArray[np.uint64]:
+    def _index(self, shard: tuple[int, ...]) -> NDArray[np.uint64]:
         """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
         if shard not in self._indices:
-            offset, size = self._index_span(end())
-            table = np.frombuffer(_read_checked(read, size, offset), "<u8").reshape(*self.per_shard, 2)
+            path = self._shard_path(shard)
+            offset, size = self._index_span((self.fetched or _LocalShards).size(path))
+            table = np.frombuffer(self._read(path, offset, size), "<u8").reshape(*self.per_shard, 2)
             start, length = table[..., 0], table[..., 1]
             lies_within = (start <= offset) & (length >= _CRC_BYTES) & (length <= offset - np.minimum(start, offset))
             if not (lies_within | (start == _ABSENT)).all():
                 raise ValueError("its index names bytes beyond it")
             self._indices[shard] = table
         return self._indices[shard]
+
+    def _read(self, path: Path, offset: int, size: int) -> bytes:
+        """Read so many bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
+        found = (self.fetched or _LocalShards).read(path, offset, size)
+        content = found[:-_CRC_BYTES]
+        if _compute_crc(content) != found[-_CRC_BYTES:]:
+            raise ValueError("its checksum does not agree")
+        return content
 
     def _index_span(self, shard_bytes: int) -> tuple[int, int]:
         """Return offset and size of the table in a shard of so many bytes."""
@@ -306,12 +305,3 @@ def _read_zstd_size(data: bytes) -> int:
 def _compute_crc(data: bytes) -> bytes:
     checksum: int = google_crc32c.value(data)
     return checksum.to_bytes(_CRC_BYTES, "little")
-
-
-def _read_checked(read: Callable[[int, int], bytes], size: int, offset: int) -> bytes:
-    """Read so many bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
-    found = read(offset, size)
-    content = found[:-_CRC_BYTES]
-    if _compute_crc(content) != found[-_CRC_BYTES:]:
-        raise ValueError("its checksum does not agree")
-    return content

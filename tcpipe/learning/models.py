@@ -252,8 +252,7 @@ def read_model_card(place: Path) -> ModelCard:
             )
         return parse_typed(found, ModelCard, where)
     except StoreError as error:
-        reason = error.problems[0].removesuffix("; remove it and run the command again")
-        raise ModelError(f"{reason}; remove the folder and train the model again") from None
+        raise ModelError(f"{error.problems[0]}; remove the folder and train the model again") from None
 
 
 def compute_card_checksum(card: ModelCard) -> str:

@@ -36,7 +36,7 @@ from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, name_pos
 from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.store import is_store, run_at
 from tcpipe.tables.arrays import number_column, select_rows
-from tcpipe.tables.columns import FloatColumns, to_integers
+from tcpipe.tables.columns import read_float_columns, to_integers
 from tcpipe.tables.levels import Streams, Track
 
 Ints = NDArray[np.int64]
@@ -174,7 +174,7 @@ def _compare_lengths(run: _Run) -> dict[str, float]:
 
 def _select_rows(track: Track, epoch: int) -> TrackRows:
     table = select_rows(track.table, "clock_epoch", epoch)
-    return TrackRows(to_integers(table, "stamp_ns"), FloatColumns(table), track.info.rate_hz)
+    return TrackRows(to_integers(table, "stamp_ns"), read_float_columns(table), track.info.rate_hz)
 
 
 _HEADER = (
@@ -277,5 +277,7 @@ def _read_stored(run: Path | str) -> tuple[Streams, FuseConfig] | None:
         raise UsageError(f"{run}: was ingested under several recipes; give one of them: {run}/… {names}")
     streams = store.read_streams(runs[0].run_id, key=runs[0].streams_key)
     if streams is None:
-        raise StoreError(f"{run}: its streams are gone or were read otherwise; audit its log, or ingest it again")
+        raise StoreError(
+            f"{run}: its streams are gone or were read otherwise; audit its log, or ingest it again with --force"
+        )
     return streams, runs[0].manifest.recipe.fuse

@@ -9,7 +9,7 @@ from pathlib import Path
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import read_current_card
+from tcpipe.formats.dataset_files import read_intact_card
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import IngestSummary, ingest
 from tcpipe.pipeline.maps import add_map
@@ -84,5 +84,5 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     statuses = {added.status, built.status, *(result.status for result in ingested.results)}
     unchanged = statuses == {"unchanged"} and not any(page.changed for page in pages)
     return DemoResult(
-        directory, ingested, read_current_card(dataset_path), tuple(Path(page.path) for page in pages), unchanged
+        directory, ingested, read_intact_card(dataset_path), tuple(Path(page.path) for page in pages), unchanged
     )

@@ -23,15 +23,15 @@ from tcpipe.formats.dataset_files import (
     find_places_in_files,
     is_shard,
     open_patches,
-    read_current_card,
     read_exclusion_reason,
+    read_intact_card,
     read_samples,
     sample_columns,
 )
 from tcpipe.formats.json_files import convert_record, to_plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
+from tcpipe.formats.parquet import ROWS_PER_GROUP, read_table
 from tcpipe.formats.run_documents import Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.ingest_run import run_stages
@@ -161,7 +161,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     """
     opened = open_store(store)
     directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)
-    card, sample = read_current_card(directory), _read_sample(directory, sample_id)
+    card, sample = read_intact_card(directory), _read_sample(directory, sample_id)
     run = _run(opened, directory, card, sample)
     streams = opened.read_streams(run.run_id, key=run.streams_key)
     source = open_map(*opened.map_files(sample["map"]))
@@ -213,7 +213,7 @@ def _read_sample(directory: Path, sample_id: str) -> Row:
         raise DatasetError(f"{directory}: no sample {sample_id!r}{hint}")
     try:
         names = [name for name in sample_columns(directory) if name != GEOMETRY]
-        group = read_row_group(directory / SAMPLES, row // ROWS_PER_GROUP, names)
+        group = read_table(directory / SAMPLES, names, group=row // ROWS_PER_GROUP)
     except StoreError as error:
         raise DatasetError(*error.problems) from None
     return {**group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0], "row": row}

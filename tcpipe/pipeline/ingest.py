@@ -141,7 +141,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
                     call.end = Entries(calls=(measure(record),))
             queue.remove_expired_claims()
         if log.state.number != before.number and log.state.runs:
-            opened.write_index(log.state, before=before)
+            opened.write_index(log.state)
         _warn_of_unmatched_windows(ruling.mask.windows, log.state)
         return summary
 

@@ -148,10 +148,10 @@ def _inspect_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspect
 
 
 def _inspect_dataset(directory: Path, name: str) -> InspectedDataset:
-    from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as above
+    from tcpipe.formats.dataset_files import read_intact_card  # noqa: PLC0415  as above
     from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
 
-    return convert_record(read_current_card(directory), InspectedDataset, kind="dataset", path=name)
+    return convert_record(read_intact_card(directory), InspectedDataset, kind="dataset", path=name)
 
 
 def _inspect_in_store(path: Path | str) -> InspectedStore | InspectedRun | None:

@@ -83,6 +83,7 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
     several logs; nothing was acknowledged then.
     """
     opened = open_store(store)
+    opened.place.clear()
     log = LogWriter(opened, state := opened.state())
     known = {problem.key: problem for problem in find_known_problems(state)}
     chosen, wrong = dict[str, Problem](), list[str]()

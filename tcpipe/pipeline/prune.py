@@ -83,7 +83,7 @@ def prune(
     """
     ruling = resolve_recipe(recipe)
     opened = open_store(store)
-    log = LogWriter(opened, before := opened.state())
+    log = LogWriter(opened, opened.state())
     _forget(log, forget, dry_run=dry_run)
     found = opened.ingestions(state=log.state)
     unknown = set(keep) - {name for key in found.rows for name in key}
@@ -118,7 +118,7 @@ def prune(
         clear_scratch()
         _remove_empty(opened, min_age_s)
     if removed and not dry_run:
-        opened.write_index(log.state, before=before)
+        opened.write_index(log.state)
     return Pruned(str(opened.root), dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.commits import Dataset, State
-from tcpipe.formats.dataset_files import CARD, REPORT, read_current_card
+from tcpipe.formats.dataset_files import CARD, REPORT, read_intact_card
 from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.integrity import seal_page
 from tcpipe.formats.object_storage import is_url
@@ -91,7 +91,7 @@ def _report_dataset(path: Path | str, *, patches: bool) -> Page:
     """Write a dataset's page, and, before it, pictures of all patches, which it shows from then on."""
     directory, fetched = fetch_directory_by_range(path, by_range=lambda _: False)
     place = open_place(path) if fetched is None else fetched.place
-    card = read_current_card(directory)
+    card = read_intact_card(directory)
     folder, count = find_picture_folder(card)
     for name, data in iterate_pictures(directory, card) if patches else ():
         place.put(f"{folder}/{name}", data, lasting=False)
@@ -111,6 +111,8 @@ def _write(place: Place, html: str, physics: tuple[str, ...]) -> Page:
     changed = place.read(_PAGE) != data
     if changed:
         place.put(_PAGE, data)
+    else:  # a killed call may have left a temporary
+        place.clear()
     return Page(place.where(_PAGE), changed, physics)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
 from tcpipe.formats.bucket_directories import CARDS, FoundCard, find_newest, find_unlisted_files
-from tcpipe.formats.commit_log import COMMIT, LOG, SNAPSHOT, read_snapshot, refresh
+from tcpipe.formats.commit_log import COMMIT, LOG, SNAPSHOT, make_snapshot_name, read_snapshot, refresh
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
@@ -22,6 +22,7 @@ from tcpipe.formats.parquet import read_row_count, read_table
 from tcpipe.formats.place import Place, find_wrong_files, open_place
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import (
+    COPY_MARK,
     MARK,
     SPOOL,
     Manifest,
@@ -36,10 +37,18 @@ from tcpipe.formats.run_documents import (
 from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.store import Store, find_store_above, is_store
 from tcpipe.tables.facts import LEFT_OUT
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 
-CheckResult = tuple[str, int] | str
+
+@dataclass(frozen=True, slots=True)
+class Repair:
+    """How the problems before it are made right."""
+
+    text: str
+
+
+CheckResult = tuple[str, int] | str | Repair
 
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
 _STREAMS = "streams"
@@ -49,6 +58,8 @@ _KNOWN = "dataset, run, store, map (.zarr), model or cost map"
 
 _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
 """What a directory is, by the document that proves all files beside it."""
+
+_HOW_MADE = {"dataset": "build", "model": "train", "cost map": "make"}
 
 _KILLED = "was left by a killed command; 'tcpipe prune' removes it"
 _BESIDE = ".aux.xml"
@@ -65,7 +76,7 @@ class Verified:
     read: Mapping[str, int]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    """What a redacted dataset does not tell."""
+    """How the problems are made right; what a redacted dataset does not tell."""
 
     def __str__(self) -> str:
         """Return a line of what was read, and one for each problem."""
@@ -84,11 +95,13 @@ def verify(path: Path | str) -> Verified:
         raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
     kind, findings, notes = _find_kind(path)
     read: dict[str, int] = {}
-    problems: list[str] = []
+    problems, repairs = list[str](), list[str]()
     try:
         for finding in findings:
             if isinstance(finding, str):
                 problems.append(finding)
+            elif isinstance(finding, Repair):
+                repairs.append(finding.text)
             else:
                 read[finding[0]] = read.get(finding[0], 0) + finding[1]
     except TcpipeError as error:
@@ -96,15 +109,17 @@ def verify(path: Path | str) -> Verified:
     if kind not in ("store", "run") and not is_url(path):
         again = "the next command that writes it removes it"
         problems += [f"{left}: was left by a killed command; {again}" for left in find_leftovers(Path(path))]
-    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), notes)
+    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), (*dict.fromkeys(repairs), *notes))
 
 
 def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str, ...]]:
     """Return what a path is, its findings, which are made as they are asked for, and notes."""
     if inside := find_store_above(path):
         return "run", _verify_run(*inside), ()
-    if is_store(path):
-        return "store", _verify_store(Store(path)), ()
+    above, _, last = str(path).rstrip("/").rpartition("/")
+    for root in (path, *([above] if above and last in (LOG, "maps") else [])):  # which lie in a store
+        if is_store(root):
+            return "store", _verify_store(Store(root if is_url(root) else Path(root))), ()
     place = open_place(path)
     if place.path and place.path.resolve().suffix == ".zarr" and not (place.path.resolve().parent / CARD).is_file():
         return "map", _verify_map(place.path), ()
@@ -122,22 +137,17 @@ def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str,
 def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     """Yield what was read of the files that a card lists, and a line for everything that is not as it says."""
     place, where, kind = found.place, found.place.where(found.name), _KINDS[found.name]
+    repair = Repair(f"{path}: copy it again, or {_HOW_MADE[kind]} it again with --force")
     if broken := find_broken_seal(found.data, where):
-        yield broken  # its checksums say nothing of the other files
+        yield from (broken, repair)  # its checksums say nothing of the other files
         return
     yield "files", 1
     if kind == "dataset":
         yield find_broken_seal(place.read(REPORT), place.where(REPORT)) or ("files", 1)
         card = parse_card(found.data, where, proved=False)
-        if card.data_model_version not in READ_VERSIONS:
-            yield (
-                f"{where}: of data model {card.data_model_version}, this version knows {DATA_MODEL_VERSION}; "
-                "run 'tcpipe migrate' on it, verify it with the version that wrote it, or build it again"
-            )
-            return
     checksums = parse_typed(parse_json(found.data, where), Checksums, where).checksums
     wrong = list(find_wrong_files(place, checksums))
-    yield from wrong
+    yield from _repair_by(repair, wrong)
     yield "files", len(checksums)
     yield from (
         f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)
@@ -158,16 +168,16 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
     if card.redaction is not None:
         table = SAMPLES_SCHEMA.add_missing_columns(read_table(samples))
-        yield from (f"{where}: {problem}" for problem in find_leaks(card, table))
+        yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:
     """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
     place = store.place
-    yield find_broken_seal(place.read(MARK), place.where(MARK)) or ("files", 1)
+    yield from _verify_seals(place, [MARK], Repair(f"{place.where(MARK)}: {COPY_MARK}"))
     for name in place.files():
         if name == REPORT:
-            yield from _verify_seals(place, [name])
+            yield from _verify_seals(place, [name], Repair(f"{place.where(name)}: 'tcpipe report' writes it again"))
         elif name != MARK:
             yield _describe_stranger(place, name)
     for name in place.folders():
@@ -187,11 +197,25 @@ def _verify_log(place: Place) -> Iterator[CheckResult]:
     yield "commits", state.number - len(state.problems)
     wrong = {"commit-missing": "is missing", "commit-damaged": "has changed, or does not follow the commit before"}
     yield from (f"{problem.log[0]}: {wrong[problem.finding.code]}" for problem in state.problems)
+    lost, snapshots = len(state.problems), [name for name in log.files() if name.startswith(SNAPSHOT)]
+    for name in snapshots:
+        if name > make_snapshot_name(state.number):  # the last commits are missing
+            yield f"{log.where(name.removeprefix(SNAPSHOT).removesuffix('.zst'))}: is missing"
+            lost += 1
+    if lost:
+        yield Repair(f"{log.where()}: copy its commits again; a snapshot with a higher number has what they say")
     for name in log.files():
-        if name.startswith(SNAPSHOT):
-            yield from _isolate_errors(_verify_snapshot(log, name))
+        if name in snapshots:
+            repair = Repair(f"{log.where(name)}: remove it; the commits say the same")
+            yield from _isolate_errors(_verify_snapshot(log, name), repair)
         elif not COMMIT.fullmatch(name):
             yield _describe_stranger(log, name)
+
+
+def _repair_by(repair: Repair, findings: Iterable[CheckResult]) -> Iterator[CheckResult]:
+    """Yield findings, and after each problem how it is made right."""
+    for finding in findings:
+        yield from (finding, repair) if isinstance(finding, str) else (finding,)
 
 
 def _verify_snapshot(log: Place, name: str) -> Iterator[CheckResult]:
@@ -222,18 +246,19 @@ def _verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterato
     place = store.runs_place.below(run_id)
     names = [entry.name for entry in place.entries()]
     there, last, folders = _list_documents(place), find_highest_numbers(names), place.folders()
-    yield from _verify_seals(place, sorted(there))
+    repair = _describe_ingesting(place)
+    yield from _verify_seals(place, sorted(there), repair)
     if "run" not in last:
-        yield f"{place.where(name_document('run', 1))}: is missing"
+        yield from (f"{place.where(name_document('run', 1))}: is missing", repair)
     known = None
     for number in range(1, last.get("run", 0) + 1):
         with suppress(StoreError):
             known = read_as_at(place, name_document("run", number), RunJson)
             there |= set(known.streams)
-    yield from _verify_files(place, known.streams if known else {})
+    yield from _verify_files(place, known.streams if known else {}, repair)
     recipes = [name for name in folders if name != _STREAMS and find_highest_numbers(place.files(name)).get("manifest")]
     for name in recipes if recipe is None else [recipe]:
-        yield from _isolate_errors(_verify_ingestion(store.runs_place, run_id, name))
+        yield from _isolate_errors(_verify_ingestion(store.runs_place, run_id, name), repair)
     if not recipes:
         yield f"{place.where()}: contains no finished run; ingest its log again"
     for name in names:
@@ -241,32 +266,37 @@ def _verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterato
             yield _describe_stranger(place, name)
 
 
+def _describe_ingesting(place: Place) -> Repair:
+    return Repair(f"{place.where()}: remove .json files that have changed, then ingest its log again with --force")
+
+
 def _list_documents(place: Place) -> set[str]:
     return {name for name in place.files() if split_number(name) or name == REPORT}
 
 
-def _verify_seals(place: Place, names: Iterable[str]) -> Iterator[CheckResult]:
-    for name in names:
-        yield find_broken_seal(place.read(name), place.where(name)) or ("files", 1)
+def _verify_seals(place: Place, names: Iterable[str], repair: Repair) -> Iterator[CheckResult]:
+    lines = (find_broken_seal(place.read(name), place.where(name)) or ("files", 1) for name in names)
+    yield from _repair_by(repair, lines)
 
 
 def _verify_maps(store: Store) -> Iterator[CheckResult]:
     place = store.place.below("maps")
     known = _list_documents(place)
-    yield from _verify_seals(place, sorted(known))
+    repair = Repair(f"{place.where()}: remove .json files that have changed, then add the map again with --force")
+    yield from _verify_seals(place, sorted(known), repair)
     for name, last in find_highest_numbers(known).items():
         yield "maps", 1
         for number in range(1, last + 1):
             with suppress(StoreError):
                 checksums = read_as_at(place, name_document(name, number), MapDocument).checksums
                 known |= set(checksums)
-                yield from _verify_files(place, checksums) if number == last else ()
+                yield from _verify_files(place, checksums, repair) if number == last else ()
     yield from _find_strangers(place, known)
 
 
-def _verify_files(place: Place, checksums: Mapping[str, Checksum]) -> Iterator[CheckResult]:
+def _verify_files(place: Place, checksums: Mapping[str, Checksum], repair: Repair) -> Iterator[CheckResult]:
     """Read files again and compare them with what a sealed document has of them."""
-    yield from find_wrong_files(place, checksums)
+    yield from _repair_by(repair, find_wrong_files(place, checksums))
     yield "files", len(checksums)
 
 
@@ -291,16 +321,16 @@ def _verify_map(path: Path) -> Iterator[CheckResult]:
     """Yield the same of one map."""
     yield "maps", 1
     place, checksums = Place(path), read_checksums(path)
-    yield from _verify_files(place, checksums)
+    yield from _verify_files(place, checksums, Repair(f"{path}: copy it again, or add the map again with --force"))
     yield from _find_strangers(place, {*checksums, CHECKSUMS})
 
 
-def _isolate_errors(findings: Iterator[CheckResult]) -> Iterator[CheckResult]:
+def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator[CheckResult]:
     """Turn an error into problems, so that one damaged run or map does not hide the others."""
     try:
         yield from findings
     except TcpipeError as error:
-        yield from error.problems
+        yield from _repair_by(repair, error.problems)
 
 
 def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[CheckResult]:
@@ -309,7 +339,7 @@ def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Ch
     place = runs.below(f"{run_id}/{recipe_name}")
     last = name_document("manifest", find_highest_numbers(place.files())["manifest"])
     document, where = read_sealed_at(place, last), place.where(last)
-    if document["data_model_version"] not in READ_VERSIONS:
+    if document["data_model_version"] != DATA_MODEL_VERSION:
         yield (
             f"{where}: of data model {document['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
             "ingest the log again, then remove this directory"
@@ -319,15 +349,15 @@ def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Ch
     keys = (ingest_key(recipe), make_recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
     if keys != (manifest.ingest_key, recipe_name):
         yield f"{where}: its recipe is not the one that the directory is named after"
-    documents = _list_documents(place)
-    yield from _verify_seals(place, sorted(documents))
+    documents, repair = _list_documents(place), _describe_ingesting(runs.below(run_id))
+    yield from _verify_seals(place, sorted(documents), repair)
     known = {*documents, *manifest.checksums}
     for name in documents - {REPORT}:
         with suppress(StoreError):
             known |= set(read_as_at(place, name, Manifest).checksums)
     yield from _find_strangers(place, known)
     wrong = list(find_wrong_files(place, manifest.checksums))
-    yield from wrong
+    yield from _repair_by(repair, wrong)
     yield "files", len(manifest.checksums)
     for name, checksum in manifest.checksums.items() if not wrong else ():
         table, rows = PurePosixPath(name).stem, read_row_count(place.local(name, checksum))

@@ -10,8 +10,8 @@ from math import isfinite
 from typing import Any, TypeAlias
 
 from tcpipe.errors import RecipeError, clean_line
+from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import as_toml, from_values, read_annotations
-from tcpipe.recipe.sections import Recipe
 from tcpipe.tables.findings import Remedy
 
 TomlValue: TypeAlias = "bool | float | str | Sequence[TomlValue] | Mapping[str, TomlValue]"

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings, judge_dataset
-from tcpipe.formats.dataset_files import read_current_card, read_samples
+from tcpipe.formats.dataset_files import read_intact_card, read_samples
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.run_documents import MARK
@@ -78,7 +78,7 @@ def render_dataset_report(
     `SAMPLE_COLUMNS` of the samples; None: they are read.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
-    card = read_current_card(directory)
+    card = read_intact_card(directory)
     samples = read_samples(directory, SAMPLE_COLUMNS) if samples is None else samples
     shown = select_samples(card, samples)
     plots, lost = draw_dataset_map(directory, card, len(shown.xy_m))
@@ -142,11 +142,7 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
         *(Number(f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
         Number(f"{len(card.runs)}", "runs"),
         Number(f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
-        *(
-            []
-            if card.flagged_samples is None
-            else [Number(f"{100 * card.flagged_samples.share:.1f} %", "flagged samples")]
-        ),
+        Number(f"{100 * card.flagged_samples.share:.1f} %", "flagged samples"),
     ]
 
 

@@ -21,7 +21,7 @@ from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.label_sections import make_losses_sections
 from tcpipe.report.page import Link, Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
-from tcpipe.tables.findings import Finding, Verdict, find_worst_grade, select_problems
+from tcpipe.tables.findings import Finding, Verdict, select_problems
 
 _PAGE = "report.html"
 MOST_ROWS = 200
@@ -120,7 +120,7 @@ class StoredRun:
             round(facts.driven_m, 1),
             _compute_percent(self.used_share),
             _compute_percent(self.floor),
-            find_worst_grade(facts.findings),
+            facts.verdict.worst,
             sum(finding.severity != "note" for finding in facts.findings),
             list(self.datasets),
             list(self.codes),

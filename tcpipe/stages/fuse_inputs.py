@@ -40,7 +40,7 @@ from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.arrays import select_rows
-from tcpipe.tables.columns import FloatColumns, to_floats, to_integers
+from tcpipe.tables.columns import read_float_columns, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
@@ -77,8 +77,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
     if GNSS in tables:
-        fixes = FloatColumns(tables[GNSS])
-        datum = preparation.find_datum(fixes["lon_deg"], fixes["lat_deg"], fixes["alt_m"])
+        datum = preparation.find_datum(*(to_floats(tables[GNSS], name) for name in ("lon_deg", "lat_deg", "alt_m")))
     inputs = FusionInputs(datum)
     if config.estimator == "ukf" and tables.pop(DOPPLER, None) is not None:
         names = {"estimator": config.estimator}
@@ -138,7 +137,7 @@ def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
 
 
 def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:
-    stamp_ns, columns = to_integers(table, "stamp_ns"), FloatColumns(table)
+    stamp_ns, columns = to_integers(table, "stamp_ns"), read_float_columns(table)
     place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
     made: Any
     if role == GNSS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -48,36 +48,6 @@ def make_text_column(values: Iterable[str]) -> pa.Array:
     ends = np.cumsum([0, *map(len, raw)], dtype=np.int64)
     buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(raw))]
     return pa.Array.from_buffers(pa.large_string(), len(raw), buffers).cast(pa.string())
-
-
-def make_column(values: Sequence[Any], dtype: pa.DataType) -> pa.Array:
-    """Return values as an Arrow array: numbers, truth values, texts, None; mappings as structs or maps, sequences as lists."""
-    known = np.array([value is not None for value in values], np.bool_)
-    valid = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
-    if pa.types.is_struct(dtype):
-        rows = [value or {} for value in values]
-        parts = [make_column([row.get(field.name) for row in rows], field.type) for field in dtype]
-        return pa.Array.from_buffers(dtype, len(values), [valid], children=parts)
-    if pa.types.is_string(dtype):
-        raw = [(value or "").encode() for value in values]
-        return pa.Array.from_buffers(dtype, len(raw), [valid, _make_offsets(raw), pa.py_buffer(b"".join(raw))])
-    if pa.types.is_map(dtype):
-        pairs = [[{"key": key, "value": row[key]} for key in sorted(row)] for row in (value or {} for value in values)]
-        entries = pa.struct([pa.field("key", dtype.key_type, nullable=False), pa.field("value", dtype.item_type)])
-        parts = [make_column([pair for row in pairs for pair in row], entries)]
-        return pa.Array.from_buffers(dtype, len(values), [valid, _make_offsets(pairs)], children=parts)
-    if pa.types.is_list(dtype):
-        lists = [value or () for value in values]
-        parts = [make_column([item for row in lists for item in row], dtype.value_type)]
-        return pa.Array.from_buffers(dtype, len(values), [valid, _make_offsets(lists)], children=parts)
-    made = np.array([value or 0 for value in values], dtype.to_pandas_dtype())
-    data = np.packbits(made, bitorder="little") if pa.types.is_boolean(dtype) else made
-    return pa.Array.from_buffers(dtype, len(values), [valid, pa.py_buffer(data)])
-
-
-def _make_offsets(rows: Sequence[Sequence[Any]]) -> pa.Buffer:
-    """Return where each row begins and ends when they lie one after another, as Arrow has it."""
-    return pa.py_buffer(np.cumsum([0, *map(len, rows)], dtype=np.int32))
 
 
 def select_rows(table: pa.Table, name: str, value: str | int) -> pa.Table:

@@ -6,7 +6,7 @@ Units, frames, flag bits and one-line meanings stand in the Arrow field metadata
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import IntFlag
 
@@ -138,23 +138,9 @@ def read_lonlat_deg(table: pa.Table, end: str) -> NDArray[np.float64]:
     return np.stack([to_floats(table, f"{end}_{axis}_deg") for axis in ("lon", "lat")], axis=1)
 
 
-class FloatColumns(Mapping[str, NDArray[np.float64]]):
-    """Floating-point columns of a table by name, as `to_floats`, converted on access."""
-
-    def __init__(self, table: pa.Table) -> None:
-        self._table = table
-
-    def __getitem__(self, name: str) -> NDArray[np.float64]:
-        """Return one column, null as NaN."""
-        return to_floats(self._table, name)
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        return (name for name in self._table.column_names if pa.types.is_floating(self._table[name].type))
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-        return sum(1 for _ in self)
+def read_float_columns(table: pa.Table) -> dict[str, NDArray[np.float64]]:
+    """Return the columns of floating-point numbers by name, as `to_floats`."""
+    return {field.name: to_floats(table, field.name) for field in table.schema if pa.types.is_floating(field.type)}
 
 
 def to_integers(table: pa.Table, name: str) -> NDArray[np.int64]:

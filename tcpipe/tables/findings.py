@@ -279,17 +279,6 @@ def judge(findings: Iterable[Finding]) -> Verdict:
     return Verdict(**grades, reasons=reasons)
 
 
-def find_worst_grade(findings: Iterable[Finding]) -> Grade:
-    """Return the worst grade of the verdict on findings."""
-    catalogue, grades = read_catalogue(), [GRADES[0]]
-    grades += [
-        _GRADE_OF[finding.severity]
-        for finding in findings
-        if finding.severity != "note" and finding.code in catalogue and catalogue[finding.code].affects
-    ]
-    return max(grades, key=GRADES.index)
-
-
 def judge_by_code(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict of many runs together: of each code the worst finding alone is a reason."""
     verdict, worst = judge(findings), dict[str, Finding]()

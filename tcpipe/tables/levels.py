@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import pyarrow as pa
 
@@ -21,9 +21,6 @@ from tcpipe.tables.findings import Finding, StageReport
 
 DATA_MODEL_VERSION = "3.0"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
-
-READ_VERSIONS = (DATA_MODEL_VERSION,)
-"""Versions whose documents are read as they are."""
 
 EARLIER_VERSIONS = ("2.0", "2.1")
 """Versions that `tcpipe migrate` brings to the current one."""
@@ -526,41 +523,38 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
-class MaskedTrack:
+class _Level:
+    """The table of a level, checked against its schema, and what belongs to the whole track."""
+
+    schema: ClassVar[TableSchema]
+    table: pa.Table
+    info: TrackInfo
+
+    def __post_init__(self) -> None:
+        """Check the table."""
+        self.schema.check(self.table)
+
+
+class MaskedTrack(_Level):
     """L3: the track with ``dropped_by``."""
 
-    table: pa.Table
-    info: TrackInfo
-
-    def __post_init__(self) -> None:
-        """Check the table."""
-        MASKED_TRACK.check(self.table)
+    __slots__ = ()
+    schema = MASKED_TRACK
 
 
 @dataclass(frozen=True, slots=True)
-class Segments:
+class Segments(_Level):
     """L4: cut segments and where every metre of the track went (``distance_by_reason_m``: kept, then each loss by name)."""
 
-    table: pa.Table
-    info: TrackInfo
+    schema: ClassVar[TableSchema] = SEGMENTS
     distance_by_reason_m: Mapping[str, float]
 
-    def __post_init__(self) -> None:
-        """Check the table."""
-        SEGMENTS.check(self.table)
 
-
-@dataclass(frozen=True, slots=True)
-class LabelledSegments:
+class LabelledSegments(Segments):
     """L5: segments with their labels."""
 
-    table: pa.Table
-    info: TrackInfo
-    distance_by_reason_m: Mapping[str, float]
-
-    def __post_init__(self) -> None:
-        """Check the table."""
-        LABELLED_SEGMENTS.check(self.table)
+    __slots__ = ()
+    schema = LABELLED_SEGMENTS
 
 
 def add_findings(info: TrackInfo, findings: Iterable[Finding], facts: StageFacts) -> TrackInfo:

@@ -1,11 +1,9 @@
 """Patches against closed-form worlds, at the patch's own pixel centres, computed here from the segment's ends alone."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pyproj
 import pytest
-from map_worlds import World, segment_table, segments_from, write_tif
+from map_worlds import World, segments_from, write_tif
 from rasterio import Affine
 
 from tcpipe.formats.maps.building import build_map
@@ -104,73 +102,6 @@ def test_the_zone_edge_site_has_a_convergence_that_would_be_noticed():
     world, _ = SITES["utm south, zone edge"]
     lon, lat = pyproj.Transformer.from_crs(world.crs, "EPSG:4326", always_xy=True).transform(world.x_m, world.y_m)
     assert abs(pyproj.Proj(world.crs).get_factors(lon, lat).meridian_convergence) > 1.5
-
-
-@dataclass(frozen=True)
-class Moved(World):
-    """A world carried over itself around its middle by an orthogonal matrix (its inverse is its transpose)."""
-
-    matrix: tuple = ((1.0, 0.0), (0.0, 1.0))
-
-    def _before(self, x, y):
-        (a, b), (c, d) = self.matrix
-        u, v = x - self.x_m, y - self.y_m
-        return self.x_m + a * u + c * v, self.y_m + b * u + d * v
-
-    def height(self, x, y):
-        return super().height(*self._before(x, y))
-
-    def grey(self, x, y):
-        return super().grey(*self._before(x, y))
-
-    def terrain(self, x, y):
-        return super().terrain(*self._before(x, y))
-
-
-def moved_segments(segments, world, gnss_crs, matrix):
-    """The same metres, their ends carried over in the map's plane."""
-    project = pyproj.Transformer.from_crs(gnss_crs, world.crs, always_xy=True)
-    ends = []
-    for name in ("start", "end"):
-        x, y = project.transform(segments[f"{name}_lon_deg"].to_numpy(), segments[f"{name}_lat_deg"].to_numpy())
-        offset = np.array(matrix) @ np.stack([x - world.x_m, y - world.y_m])
-        lonlat = project.transform(world.x_m + offset[0], world.y_m + offset[1], direction="INVERSE")
-        ends.append(np.stack(lonlat, 1))
-    azimuth, _, chord_m = pyproj.CRS(gnss_crs).get_geod().inv(*ends[0].T, *ends[1].T)
-    np.testing.assert_allclose(chord_m, 1.0, atol=2e-5)
-    return segment_table(*ends, azimuth)
-
-
-@pytest.mark.parametrize("name", ["utm north", "utm south, zone edge"])
-@pytest.mark.parametrize("kind", ["quarter turn", "half turn", "mirror"])
-def test_what_is_carried_over_with_its_ground_gives_the_same_patch(tmp_path, name, kind):
-    """A turn of world and course changes nothing; their mirror image is the patch with its rows reversed, and only cross slope changes."""
-    world, gnss_crs = SITES[name]
-    matrix = {
-        "quarter turn": ((0.0, -1.0), (1.0, 0.0)),
-        "half turn": ((-1.0, 0.0), (0.0, -1.0)),
-        "mirror": ((-1.0, 0.0), (0.0, 1.0)),
-    }[kind]
-    segments = courses(world, gnss_crs, count=160)
-    patches = []
-    carried = moved_segments(segments, world, gnss_crs, matrix)
-    for number, (ground, metres) in enumerate(
-        [(world, segments), (Moved(world.crs, world.x_m, world.y_m, matrix=matrix), carried)]
-    ):
-        (tmp_path / str(number)).mkdir()
-        build_map(tmp_path / f"{number}.zarr", name="m", **ground.write(tmp_path / str(number), 0.1))
-        sampled = sample_segments(metres, open_map(tmp_path / f"{number}.zarr"), CONFIG, gnss_crs=gnss_crs)
-        assert len(sampled.kept) == 160
-        patches.append(sampled.patches)
-    one, other = patches
-    side = -1 if kind == "mirror" else 1
-    assert np.abs(one.pixels["height"].astype(int) - other.pixels["height"][:, ::side]).max() <= 1
-    assert np.abs(one.pixels["ortho"].astype(int) - other.pixels["ortho"][:, ::side]).max() <= 1
-    assert (one.pixels["terrain"] == other.pixels["terrain"][:, ::side]).mean() > 0.998
-    np.testing.assert_allclose(other.height_min_m, one.height_min_m, atol=2e-4)
-    np.testing.assert_allclose(other.slope_rad, one.slope_rad, atol=2e-5)
-    np.testing.assert_allclose(other.cross_slope_rad, side * one.cross_slope_rad, atol=2e-5)
-    assert (one.terrain_class == other.terrain_class).mean() > 0.98
 
 
 def test_layers_of_three_resolutions_and_crss_show_one_world(tmp_path):

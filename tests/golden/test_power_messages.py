@@ -21,7 +21,6 @@ N = 60
 VOLT = 25.0 + 0.1 * np.arange(N) / N
 AMP = 5.0 + np.cos(np.arange(N))
 STEP_NS = 50_000_000
-FLAGS = {"error": False, "write_pdo_cmds_error": False}
 
 
 def filled(types, name: str, given: dict):

@@ -6,7 +6,7 @@ from time import monotonic
 
 import pytest
 from browser_page import quiet_page
-from synthetic_store import add_run, add_world, driven, lanes, make_noise_facts, segments
+from synthetic_store import add_run, driven, lanes, make_noise_facts, open_world, segments
 
 import tcpipe
 from tcpipe.learning.evaluation_facts import EvaluateConfig
@@ -15,7 +15,6 @@ from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
-from tcpipe.store import open_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 
 DRAWS_DATASET_PAGES = True
@@ -36,8 +35,7 @@ SOURCE = "Bokeh.documents[0].get_model_by_name('samples').data_source"
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     here = tmp_path_factory.mktemp("pages")
-    store = open_store(here / "store", create=True)
-    add_world(store, here)
+    store = open_world(here)
     for number, run in enumerate(("north", "south")):
         start, end = lanes((4.0 * number, 4.0 * number + 1.5, 4.0 * number - 9.0), -12.0, 12.0)
         table = segments(run, start, end, start_ns=int((number + 1) * 1e18))
@@ -377,8 +375,7 @@ def list_findings():
 @pytest.fixture(scope="module")
 def run_page(tmp_path_factory):
     here = tmp_path_factory.mktemp("driven")
-    store = open_store(here / "store", create=True)
-    add_world(store, here)
+    store = open_world(here)
     start, end = lanes((0.0,), -12.0, 12.0)
     table = segments("driven", start, end, start_ns=10**18)
     add_run(

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, TcpipeError
@@ -13,7 +13,6 @@ from tcpipe.formats.integrity import SEAL
 from tcpipe.formats.json_files import MOST_BYTES, digest, to_json
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
 
 FORMATS = ("zarr", "parquet")
 
@@ -22,8 +21,7 @@ FORMATS = ("zarr", "parquet")
 def made(tmp_path_factory):
     """Twelve samples in either format."""
     directory = tmp_path_factory.mktemp("damage")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory / "rasters")
+    store = open_world(directory)
     add_run(store, "a", segments("a", *lanes(0.0, -6.0, 6.0)))
     for name in FORMATS:
         build_dataset(directory / name, store=store.root, recipe=Recipe(), holdout="sample", file_format=name)
@@ -107,7 +105,7 @@ def test_a_card_of_any_other_content_with_a_whole_seal_is_told_or_changes_nothin
     directory = dataset(name)
     card, whole = json.loads((directory / "dataset.json").read_text()), read(directory)
     for number, key in enumerate(card):
-        for value in OTHER:
+        for value in OTHER[number % 2 :: 2]:
             seal(directory, {**card, key: value})
             read_or_refused(directory, whole)
         for at, inner in enumerate(card[key] if key in {"label", "layers", "splits", "tensor"} else ()):

@@ -11,8 +11,6 @@ from tcpipe.splits.assignment import NO_FOLD, Assignment, Groups, assign_splits,
 from tcpipe.splits.audit import Ground, audit_leakage, compute_nearest_m, compute_shared_fraction, find_near_pairs
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
-coordinate = st.floats(-30, 30, allow_nan=False)
-
 
 @st.composite
 def regions(draw):

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
 from dask_cluster import DaskCluster, dask_cluster, die, die_once, spend, wants_more, where
 from distributed import Client
-from wheel_drives import START_NS, drive_at
+from wheel_drives import drive_at
 
 import tcpipe
 from tcpipe import execution
@@ -33,8 +33,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
         yield running
 
 
-def test_workers_do_all_tasks_and_what_they_say_is_said_here(cluster, caplog, monkeypatch):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+def test_workers_do_all_tasks_and_what_they_say_is_said_here(cluster, caplog):
     with caplog.at_level(STEP, "tcpipe"):
         outcomes = sorted(run_all(where, range(9), jobs=1, cluster=cluster.address), key=lambda outcome: outcome.index)
     assert [outcome.result[0] for outcome in outcomes] == [value * value for value in range(9)]
@@ -102,13 +101,6 @@ def test_what_workers_spend_counts_here(cluster):
     assert 0.2 <= read_cluster_cpu_s() - before_s < 2.0
 
 
-def test_a_worker_of_many_threads_is_refused(tmp_path):
-    with dask_cluster(tmp_path, workers=0) as wide:
-        wide.start_worker(threads=2)
-        with pytest.raises(UsageError, match="has 2 threads; expected one a worker"):
-            list(run_all(where, [1], jobs=1, cluster=wide.address))
-
-
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
     monkeypatch.setattr(execution, "_ANSWER_S", 1)
     with pytest.raises(UsageError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
@@ -118,19 +110,22 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
             list(run_all(where, [1], jobs=1, cluster=address))
 
 
-def test_a_scheduler_without_workers_is_one_line(tmp_path, monkeypatch):
+def test_a_scheduler_without_workers_and_a_worker_of_many_threads_are_one_line(tmp_path, monkeypatch):
     assert execution._ANSWER_S <= 10, "with what Python takes to start, a report after 15 s"
-    monkeypatch.setattr(execution, "_ANSWER_S", 2)
     with dask_cluster(tmp_path, workers=0) as lonely, Client(lonely.address, set_as_default=False) as client:
-        for cluster in (lonely.address, client.get_executor()):
-            with pytest.raises(
-                UsageError, match=r"no workers after 2 s; start one: dask worker tcp://\S+ --nthreads 1"
-            ):
-                list(run_all(where, [1], jobs=1, cluster=cluster))
+        with monkeypatch.context() as patch:
+            patch.setattr(execution, "_ANSWER_S", 1)
+            for cluster in (lonely.address, client.get_executor()):
+                with pytest.raises(
+                    UsageError, match=r"no workers after 1 s; start one: dask worker tcp://\S+ --nthreads 1"
+                ):
+                    list(run_all(where, [1], jobs=1, cluster=cluster))
+        lonely.start_worker(threads=2)
+        with pytest.raises(UsageError, match="has 2 threads; expected one a worker"):
+            list(run_all(where, [1], jobs=1, cluster=lonely.address))
 
 
 def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
     with dask_cluster(tmp_path, workers=1) as brief:
         with closing(run_all(time.sleep, [0, 600], jobs=1, cluster=brief.address)) as outcomes:
             next(outcomes)
@@ -149,30 +144,26 @@ def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path,
                 next(outcomes)
 
 
-@contextmanager
 def submitit_executor(folder):
     submitit = pytest.importorskip("submitit", reason="submitit is not installed")
-    yield submitit.LocalExecutor(folder / "submitit")
-
-
-@contextmanager
-def dask_executor(folder):
-    with dask_cluster(folder, workers=1) as cluster, Client(cluster.address, set_as_default=False) as client:
-        yield client.get_executor()
+    return nullcontext(submitit.LocalExecutor(folder / "submitit"))
 
 
 EXECUTORS = {
     "threads": lambda _: ThreadPoolExecutor(2),
     "processes": lambda _: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")),
     "forked": lambda _: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")),
-    "dask": dask_executor,
     "submitit": submitit_executor,
 }
 
 
-@pytest.fixture(params=EXECUTORS)
+@pytest.fixture(params=["dask", *EXECUTORS])
 def executor(request, tmp_path, monkeypatch):
     """Executors of all kinds, whose workers find the tasks of tests."""
+    if request.param == "dask":
+        with Client(request.getfixturevalue("cluster").address, set_as_default=False) as client:
+            yield client.get_executor()
+        return
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     )
@@ -180,13 +171,29 @@ def executor(request, tmp_path, monkeypatch):
         yield running
 
 
-def test_any_executor_does_all_tasks_and_what_they_say_is_said_here_once(executor, caplog, monkeypatch):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A log, and the tables that this process makes of it."""
+    here = tmp_path_factory.mktemp("here")
+    ingest([drive_at(here / "drive.mcap")], store=here / "store", recipe=Recipe())
+    return here / "drive.mcap", read_tables(here / "store")
+
+
+def read_tables(store):
+    return {path.name: path.read_bytes() for path in (store / "runs").rglob("*.parquet")}
+
+
+def test_any_executor_does_all_tasks_says_once_what_they_say_and_makes_the_same_bytes(
+    executor, drive, tmp_path, caplog
+):
     with caplog.at_level(logging.INFO, "tcpipe"):
-        outcomes = sorted(run_all(where, range(3), jobs=1, cluster=executor), key=lambda outcome: outcome.index)
-    assert [outcome.result[0] for outcome in outcomes] == [0, 1, 4]
+        outcomes = sorted(run_all(where, range(2), jobs=1, cluster=executor), key=lambda outcome: outcome.index)
+    assert [outcome.result[0] for outcome in outcomes] == [0, 1]
     said = [record.getMessage() for record in caplog.records if record.name == "tcpipe" and not step_of(record)]
-    assert sorted(said) == [f"task {n}" for n in range(3)]
+    assert sorted(said) == [f"task {n}" for n in range(2)]
+    log, tables = drive
+    assert ingest([log], store=tmp_path / "store", recipe=Recipe(), cluster=executor).results[0].status == "done"
+    assert read_tables(tmp_path / "store") == tables
 
 
 def test_what_has_not_begun_when_a_call_ends_does_not_begin(tmp_path):
@@ -197,23 +204,8 @@ def test_what_has_not_begun_when_a_call_ends_does_not_begin(tmp_path):
     assert time.monotonic() - began_s < 20.0
 
 
-def test_any_executor_ingests_the_bytes_that_this_process_does(executor, tmp_path):
-    for number in range(2):
-        drive_at(tmp_path / "logs" / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
-    found = ingest([tmp_path / "logs"], store=tmp_path / "there", recipe=Recipe(), cluster=executor)
-    assert [result.status for result in found.results] == ["done", "done"]
-    ingest([tmp_path / "logs"], store=tmp_path / "here", recipe=Recipe())
-    there, here = (
-        {path.name: path.read_bytes() for path in (tmp_path / store / "runs").rglob("*.parquet")}
-        for store in ("there", "here")
-    )
-    assert there == here
-
-
-def test_a_task_whose_worker_died_is_named_and_a_stopped_executor_is_one_line(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
-    processes = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-    with processes:
+def test_a_task_whose_worker_died_is_named_and_a_stopped_executor_is_one_line(caplog):
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as processes:
         assert [outcome.died for outcome in run_all(die, [1, 2], jobs=1, cluster=processes)] == [True, True]
     assert "executor ProcessPoolExecutor: a task ended without a result (BrokenProcessPool: " in caplog.text
     with ThreadPoolExecutor(1) as threads:

@@ -46,10 +46,7 @@ def _say(value: int) -> int:
     return os.getpid()
 
 
-def test_what_workers_log_is_said_here(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        logging.getLogger("tcpipe"), "disabled", False
-    )  # the linter of the architecture tests disables it
+def test_what_workers_log_is_said_here(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(STEP, "tcpipe"):
         outcomes = list(run_all(_say, [1, 2, 3], jobs=2))
     assert sorted(of.done for of in map(step_of, caplog.records) if of) == [1, 2, 3]

@@ -33,9 +33,9 @@ from tcpipe.balance.correlation import (
     Correlation,
     Floor,
     compute_slope_residuals,
-    estimate_correlations,
     estimate_repeatability,
     find_repeated_pairs,
+    fit_correlation,
 )
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
@@ -92,7 +92,7 @@ def measure_balance(
         residual = compute_slope_residuals(values, terrain, slope)
         repeatability[name] = estimate_repeatability(values, residual, repeated, xy_m, chord_m=chord_m)
         if name in ("power_watt", velocity_column):
-            correlations |= estimate_correlations({name: residual}, xy_m, run, start_ns, chord_m=chord_m)
+            correlations[name] = fit_correlation(residual, xy_m, run, start_ns, chord_m=chord_m)
     known = [correlation for correlation in correlations.values() if correlation is not None]
     velocity_mps = to_floats(table, velocity_column)
     slopes, edges = find_slope_ranges(slope), choose_speed_edges(velocity_mps)

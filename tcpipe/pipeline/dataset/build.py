@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import shlex
 import shutil
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -17,7 +16,6 @@ from pyarrow.csv import write_csv
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
-from tcpipe.execution import Executor
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
@@ -35,16 +33,16 @@ from tcpipe.formats.dataset_files import (
     SAMPLES,
     SHARDS,
     read_card,
-    read_current_card,
+    read_intact_card,
 )
 from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
-from tcpipe.formats.json_files import digest, write_json
+from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
-from tcpipe.formats.parquet import ROWS_PER_GROUP, map_table, return_freed_memory, write_parquet_rows, write_pieces
+from tcpipe.formats.parquet import map_table, return_freed_memory, write_parquet_rows, write_pieces
 from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
@@ -59,7 +57,7 @@ from tcpipe.pipeline.calls import (
     start_stopwatch,
 )
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
+from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, make_dataset_card
 from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
@@ -80,7 +78,6 @@ from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_o
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
-from tcpipe.tables.levels import READ_VERSIONS
 from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
@@ -133,8 +130,7 @@ class BuildResult:
         ledger = f"{sum(card.distance_by_reason_m.values()):.0f} m driven: {card.distance_by_reason_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {-metres:.0f} m {name.replace('_', ' ')}" for metres, name in sorted(lost))
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
-        verdict = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
-        return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
+        return [head, ledger, *map(str, card.exclusions), *floor, f"verdict: {format_verdict(card.verdict)}"]
 
     def _closing(self) -> list[str]:
         if self.card is None or self.card.redaction is None:
@@ -152,46 +148,25 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
     measure, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
-    out, store, tags, dry_run = options.out, options.store, options.tags or {}, options.dry_run
+    out, store, dry_run = options.out, options.store, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
     opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
     log = open_log(opened)
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
-    known, proved = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
-    regions = None if options.split is None else read_regions(Path(options.split))
-    region = None if options.split is None else Path(options.split).read_bytes()
-    robot = options.robot or ruling.robot
-    covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
-    tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
-    earlier = None if keep_split is None else read_earlier_splits(keep_split)
-    keeps_own = keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place)
-    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
-    inputs = choose_inputs(
-        opened,
-        marks,
-        state=log.state,
-        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
-        robot=robot,
-        region=region,
-        covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
-        exclusions=read_exclusions(options.exclude, options.reason),
-    )
-    inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
-    left_out = _find_left_out(
-        inputs,
-        None if known is not None and known.redaction else known,
-        robot=robot,
-        tags=tags,
-        min_runs=options.min_runs,
-    )
+    known, is_intact = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
+    marks = _read_options(options, ruling, place)
+    inputs = choose_inputs(opened, marks, log.state)
+    left_out = _find_left_out(inputs, known, marks, options.min_runs)
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
-    is_same = proved and known is not None and known.inputs == inputs.digest
-    if is_same and known is not None and (isinstance(place, str) or is_whole(place, known)):
+    if is_intact and known is not None and known.inputs == inputs.digest:
         result = _make_result(place, "unchanged", known, left_out)
         _commit_references(log, _describe_dataset(result, inputs))
         return result
-    _refuse_other_options(place, known, marks, inputs, force=options.force)
+    others = [] if known is None or known.inputs == inputs.digest else find_other_options(known, marks, inputs)
+    if others and not options.force:
+        what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
+        raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
     if dry_run:
         if isinstance(place, str):
             read_generations(open_place(place), CARD)
@@ -202,8 +177,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
     with commit_call(log, BUILD, [make_absolute(place)]) as call:
-        start_workers = partial(_start_workers, jobs=options.jobs, cluster=options.cluster)
-        with output as directory, start_workers(directory, opened, inputs.digest) as workers:
+        with output as directory, _start_workers(directory, opened, inputs.digest, options) as workers:
             card = _build(directory, inputs, marks, workers)
             _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
         for entry in workers.waiting.entries():
@@ -219,19 +193,28 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     return result
 
 
+def _read_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | str) -> BuildOptions:
+    """Return a user's choices for the dataset at ``place``."""
+    split, map_name, keep_split = options.split, options.map_name, options.keep_split
+    tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
+    return BuildOptions(
+        recipe=recipe,
+        robot=options.robot or recipe.robot,
+        tags=options.tags or {},
+        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
+        regions=None if split is None else read_regions(Path(split)),
+        region=None if split is None else Path(split).read_bytes().decode("utf-8", "replace"),
+        covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
+        exclusions=read_exclusions(options.exclude, options.reason),
+        file_format=options.file_format,
+        redact=options.redact,
+        earlier=None if keep_split is None else read_earlier_splits(keep_split),
+        keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
+    )
+
+
 build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
 """`tcpipe.build_dataset`: its keywords are the fields of `BuildDatasetOptions`."""
-
-
-def _refuse_other_options(
-    place: Path | str, known: DatasetCard | None, options: BuildOptions, inputs: Inputs, *, force: bool
-) -> None:
-    """Raise `UsageError`, a line for each difference, unless a dataset with other options may be replaced."""
-    if known is None or known.inputs == inputs.digest or force:
-        return
-    if others := find_other_options(known, options, inputs):
-        what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
-        raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
 
 
 def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> None:
@@ -261,11 +244,12 @@ def _commit_references(log: LogWriter, dataset: Dataset) -> None:
 
 
 def _find_left_out(
-    inputs: Inputs, known: DatasetCard | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
+    inputs: Inputs, known: DatasetCard | None, options: BuildOptions, min_runs: int | None
 ) -> tuple[Finding, ...]:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
-    fewer = (*chosen.missing, *(() if known is None else find_gone_runs(known.runs, chosen, robot=robot, tags=tags)))
+    before = () if known is None or known.redaction else known.runs
+    fewer = (*chosen.missing, *find_gone_runs(before, chosen, robot=options.robot, tags=options.tags))
     if min_runs is None:
         return (*chosen.damaged, *fewer)
     if len(inputs.runs) < min_runs:
@@ -276,13 +260,13 @@ def _find_left_out(
 
 
 def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
-    """Return the card of the dataset at a URL, if there is one, and whether all of it can be read."""
+    """Return the card of the dataset at a URL, if there is one, and whether it is intact."""
     open_place(url).check()
     if find_newest(url, [CARD]) is None:
         return None, False
     directory, fetched = fetch_directory_by_range(url, by_range=lambda _: True)
     card = read_card(directory)
-    return card, fetched is not None and fetched.is_complete() and card.data_model_version in READ_VERSIONS
+    return card, fetched is not None and fetched.is_complete()
 
 
 def _make_result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
@@ -322,7 +306,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
         left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
         raise DatasetError(*error.problems, left) from None
     try:
-        read_current_card(place)
+        read_intact_card(place)
     except DatasetError as error:
         proved = False
         logger.warning("%s; it is built again", error.problems[0])
@@ -331,20 +315,20 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise UsageError(f"{place}: contains {others[0]}{more}, not of the dataset; move it or give another OUT")
-    return card, proved
+    files = ((place / name, entry.size_bytes) for name, entry in card.checksums.items())
+    is_whole = all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
+    return card, proved and is_whole
 
 
 @contextmanager
-def _start_workers(
-    directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | Executor | None
-) -> Iterator[Workers]:
+def _start_workers(directory: Path, store: Store, inputs: str, options: BuildDatasetOptions) -> Iterator[Workers]:
     """Yield the workers; their spool is in the new directory, or in the store, which a cluster's workers see."""
-    if cluster is None:
-        yield Workers(jobs, None, Place(directory / SPOOL), Place(directory))
+    if options.cluster is None:
+        yield Workers(options.jobs, None, Place(directory / SPOOL), Place(directory))
         return
     waiting = store.place.below(f"{SPOOL}/{inputs}")
     try:
-        yield Workers(1, cluster, waiting, waiting.below("files"))
+        yield Workers(1, options.cluster, waiting, waiting.below("files"))
     except MissingFileError as error:
         if not error.where.startswith(waiting.where()):
             raise
@@ -363,7 +347,8 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
     figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
-    shards = write_patches(directory, content, options.file_format, workers, compression=recipe.dataset.compression)
+    ids, compression = figures.column("sample_id"), recipe.dataset.compression
+    shards = write_patches(directory, content, ids, options.file_format, workers, compression=compression)
     _write_overviews(directory, content.sources)
     balance, drive_next = measure_balance(
         figures.select(BALANCE_COLUMNS),
@@ -396,7 +381,7 @@ def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *BALANCE_COLUMNS, *SAMPLE_COLUMNS)))
 
     def write_both() -> Iterator[pa.Table]:
-        for piece in samples.pieces(ROWS_PER_GROUP):
+        for piece in samples.pieces():
             write(piece)
             few = piece.select(names).replace_schema_metadata(None)
             del piece  # else it is in memory beside the next one

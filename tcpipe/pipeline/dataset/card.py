@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
-from typing import TypedDict
 
 import numpy as np
 import pyarrow as pa
@@ -39,7 +37,7 @@ from tcpipe.stages.label import make_fit_samples
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import PhysicsFit
-from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, Verdict, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import LAYERS, Layer
 
@@ -50,18 +48,6 @@ _DESCRIBED = ("power_watt", "velocity_mps", "fused_velocity_mps", "duration_s", 
 
 CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *_DESCRIBED)
 """Columns of samples.parquet that the card is made from."""
-
-
-class SampleFigures(TypedDict):
-    """Fields of the card that `CARD_COLUMNS` determine."""
-
-    samples: int
-    robots: tuple[str, ...]
-    splits: dict[str, int]
-    folds_of_train: tuple[int, ...]
-    terrain: dict[str, dict[str, int]]
-    label_statistics_of_train: dict[str, LabelStatistics]
-    flagged_samples: FlaggedSamples
 
 
 def make_dataset_card(
@@ -85,7 +71,13 @@ def make_dataset_card(
         description=about.description,
         licence=about.licence,
         creator=about.creator,
-        **measure_samples(samples, has_terrain=has_terrain),
+        samples=samples.num_rows,
+        robots=tuple(sorted(pc.unique(samples.column("robot")).to_pylist())),
+        splits={name: _count(samples, "split", name) for name in SPLITS},
+        folds_of_train=_fold_counts(samples),
+        terrain=_count_terrain(samples) if has_terrain else {},
+        label_statistics_of_train=_compute_statistics(samples),
+        flagged_samples=count_flagged(samples.column("quality")),
         recipe=recipe,
         format=options.file_format,
         patch_m=recipe.sample.patch_m,
@@ -114,6 +106,7 @@ def make_dataset_card(
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
         checksums={},
+        verdict=Verdict(),
     )
     findings = tuple(dict.fromkeys((*content.findings, *find_in_samples(card))))
     return replace(card, findings=findings, verdict=judge_dataset(findings, card.runs, card.maps))
@@ -140,19 +133,6 @@ def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistratio
     return convert_record(source.facts, MapSource, **named, **asdict(source.grid))
 
 
-def measure_samples(samples: pa.Table, *, has_terrain: bool) -> SampleFigures:
-    """Return the fields of the card that `CARD_COLUMNS` of the samples determine."""
-    return {
-        "samples": samples.num_rows,
-        "robots": tuple(sorted(pc.unique(samples.column("robot")).to_pylist())),
-        "splits": {name: _count(samples, "split", name) for name in SPLITS},
-        "folds_of_train": _fold_counts(samples),
-        "terrain": _count_terrain(samples) if has_terrain else {},
-        "label_statistics_of_train": _compute_statistics(samples),
-        "flagged_samples": count_flagged(samples.column("quality")),
-    }
-
-
 def _fold_counts(samples: pa.Table) -> tuple[int, ...]:
     """Return the number of train samples of every fold."""
     folds = samples.column("fold").filter(pc.equal(samples.column("split"), "train"))
@@ -161,12 +141,6 @@ def _fold_counts(samples: pa.Table) -> tuple[int, ...]:
 
 def _count(samples: pa.Table, column: str, value: str) -> int:
     return int(pc.sum(pc.equal(samples.column(column), value)).as_py() or 0)
-
-
-def is_whole(directory: Path, card: DatasetCard) -> bool:
-    """Return whether every file that the card lists is there with its size."""
-    files = ((directory / name, entry.size_bytes) for name, entry in card.checksums.items())
-    return all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
 
 
 def _count_terrain(samples: pa.Table) -> dict[str, dict[str, int]]:
@@ -244,7 +218,7 @@ def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
 
 def _find_flagged(card: DatasetCard, dataset: Subject) -> Iterator[Finding]:
     flagged = card.flagged_samples
-    if flagged is None or not flagged.samples:
+    if not flagged.samples:
         return
     by_bit = {name: count for name, count in flagged.by_bit.items() if count < card.samples} or flagged.by_bit
     most = max(by_bit, key=lambda name: by_bit[name])

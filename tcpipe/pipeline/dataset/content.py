@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -44,6 +44,7 @@ from tcpipe.formats.dataset_files import (
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import (
+    ROWS_PER_GROUP,
     add_geo_metadata,
     map_table,
     move_to_file,
@@ -61,7 +62,7 @@ from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.map_checks import find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded
-from tcpipe.recipe import CovariateConfig, Recipe
+from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
@@ -74,9 +75,6 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
 from tcpipe.terrain.projection import compute_area, parse_crs
 
 logger = logging.getLogger("tcpipe")
-
-_ROWS = 1 << 17
-"""Rows whose centres are computed together."""
 
 
 def _pool_segments(
@@ -149,16 +147,6 @@ def _move_losses(distance_by_reason_m: Mapping[str, float], lost_m: Mapping[Loss
     return moved
 
 
-class Redactor(Protocol):
-    """Methods of `tcpipe.pipeline.dataset.redaction.Redaction`."""
-
-    def table(self, samples: pa.Table) -> pa.Table:
-        """Return samples with public places and names."""
-
-    def segment_id(self, name: str, run_id: str) -> str:
-        """Return the public id of a run's segment."""
-
-
 @dataclass(frozen=True, slots=True)
 class SampleTable:
     """The samples in the dataset's order, made piece by piece: their segments are mapped from a file, not in memory.
@@ -176,14 +164,17 @@ class SampleTable:
     patch: NDArray[np.int64]
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
-    redaction: Redactor | None = None
-    """None: names and places are public."""
+    redact: Callable[[pa.Table], pa.Table] | None = None
+    """Gives rows public names and places; None where theirs are."""
 
     @property
     def schema(self) -> pa.Schema:
         """The samples' columns, with the extent of their places."""
         bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
-        pieces = (self._centres_deg(self.patch[first : first + _ROWS]) for first in range(0, len(self), _ROWS))
+        pieces = (
+            self._centres_deg(self.patch[first : first + ROWS_PER_GROUP])
+            for first in range(0, len(self), ROWS_PER_GROUP)
+        )
         corners = [corner for piece in pieces for corner in (piece.min(axis=0), piece.max(axis=0))]
         return add_geo_metadata(bare, "Point", np.array(corners).reshape(-1, 2)).schema
 
@@ -223,37 +214,20 @@ class SampleTable:
         added = take_rows(self.added, rows_of_segments)
         for field in added.schema:
             table = table.append_column(field, added.column(field.name))
-        return add_geo_metadata(table if self.redaction is None else self.redaction.table(table), "Point", centres)
+        return add_geo_metadata(table if self.redact is None else self.redact(table), "Point", centres)
 
-    def pieces(self, rows: int) -> Iterator[pa.Table]:
-        """Yield the table in pieces of so many rows; at least one, which may be empty."""
-        for first in range(0, max(len(self), 1), rows):
-            yield self.take(np.arange(first, min(first + rows, len(self))))
-
-    def ids(self, first: int, last: int) -> list[str]:
-        """Return the ids of rows ``first:last``."""
-        names = take_rows(self.segments.select(["segment_id", "run_id"]), self.sampled.kept[self.patch[first:last]])
-        ids: list[str] = names.column("segment_id").to_pylist()
-        if self.redaction is None:
-            return ids
-        runs = names.column("run_id").to_pylist()
-        return [self.redaction.segment_id(name, run_id) for name, run_id in zip(ids, runs, strict=True)]
+    def pieces(self) -> Iterator[pa.Table]:
+        """Yield the table in pieces of `ROWS_PER_GROUP`; at least one, which may be empty."""
+        for first in range(0, max(len(self), 1), ROWS_PER_GROUP):
+            yield self.take(np.arange(first, min(first + ROWS_PER_GROUP, len(self))))
 
     def centres_xy_m(self) -> NDArray[np.float64]:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
         centres = np.empty((len(self), 2))
-        for first in range(0, len(self), _ROWS):
-            corners = self.sampled.footprint_xy_m[self.patch[first : first + _ROWS]]
-            centres[first : first + _ROWS] = corners.mean(axis=1)
+        for first in range(0, len(self), ROWS_PER_GROUP):
+            corners = self.sampled.footprint_xy_m[self.patch[first : first + ROWS_PER_GROUP]]
+            centres[first : first + ROWS_PER_GROUP] = corners.mean(axis=1)
         return centres
-
-    def splits(self) -> NDArray[np.str_]:
-        """Return the split of every sample, shape (N,)."""
-        return self.assigned.select(self.patch).split
-
-    def slots(self) -> NDArray[np.int64]:
-        """Return the slot of every sample's pixels in the spool, shape (N,)."""
-        return self.slot[self.patch]
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,8 +277,8 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             _describe_nothing_sampled(segments, lost_m, sources),
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
-    tags = _read_tags(segments, inputs, recipe)
-    excluded = find_excluded(inputs.exclusions, segments.column("segment_id"), sampled.kept)
+    tags = read_tags(pc.unique(segments.column("run_id")).to_pylist(), inputs.sources, recipe.split)
+    excluded = find_excluded(options.exclusions, segments.column("segment_id"), sampled.kept)
     assigned, result = draw_splits(
         segments,
         sampled,
@@ -318,7 +292,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     unused = {
         Loss.SPLIT_BUFFER: assigned.is_in("buffer"),
         Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED) & ~excluded.mask,
-        **({Loss.EXCLUDED: excluded.mask} if inputs.exclusions else {}),
+        **({Loss.EXCLUDED: excluded.mask} if options.exclusions else {}),
     }
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
@@ -328,7 +302,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
-        segments, sampled.kept[order], inputs.sources, inputs.covariates, recipe.covariates, layers=tuple(spool.layers)
+        segments, sampled.kept[order], inputs.sources, options.covariates, recipe.covariates, layers=tuple(spool.layers)
     )
     robots = [run.robot for run in inputs.sources]
     narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m)
@@ -364,14 +338,6 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             *incomplete,
         ),
     )
-
-
-def _read_tags(segments: pa.Table, inputs: Inputs, recipe: Recipe) -> dict[str, str] | None:
-    """Return the value of the holdout's tag by run, None with another holdout."""
-    if recipe.split.holdout != "tag":
-        return None
-    run_ids: list[str] = pc.unique(segments.column("run_id")).to_pylist()
-    return dict(zip(run_ids, read_tags(run_ids, inputs.sources, recipe.split.holdout_tag), strict=True))
 
 
 def _rank_segments(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
@@ -421,17 +387,23 @@ def _describe_coverage(source: MapFile, *, alone: bool) -> str:
 
 
 def write_patches(
-    directory: Path, content: Content, file_format: FileFormat, workers: Workers, *, compression: Compression
+    directory: Path,
+    content: Content,
+    sample_ids: pa.ChunkedArray,
+    file_format: FileFormat,
+    workers: Workers,
+    *,
+    compression: Compression,
 ) -> list[Shard]:
     """Write the layers, shard by shard; return the shards if the format has any."""
     samples, spool = content.samples, content.spool
-    pixels = Pixels(spool.layers, spool.patch_px, samples.slots(), spool.read)
+    pixels = Pixels(spool.layers, spool.patch_px, samples.slot[samples.patch], spool.read)
     if file_format == "parquet":
         rows = partial(_spool_rows, workers.waiting, samples)
-        drawers = make_parquet_writers(workers.out, pixels, rows, samples.splits())
+        drawers = make_parquet_writers(workers.out, pixels, rows, samples.assigned.select(samples.patch).split)
     else:
         drawers = make_zarr_writers(
-            directory, workers.out, pixels, samples.ids, compression=compression, threads=workers.jobs
+            directory, workers.out, pixels, sample_ids, compression=compression, threads=workers.jobs
         )
     with closing(run_all(_write_shard, drawers, jobs=1, cluster=workers.cluster)) as outcomes:
         for outcome in outcomes:
@@ -559,16 +531,18 @@ def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tu
     return pa.table(columns, schema=pa.schema(fields)), findings
 
 
-def read_tags(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> list[str]:
-    """Return a tag's value for each run of a list; `DatasetError` that names the runs without it."""
-    tags = {run.run_id: (run.tags or {}).get(key) for run in runs}
+def read_tags(run_ids: Sequence[str], runs: Sequence[RunSource], rules: SplitConfig) -> dict[str, str] | None:
+    """Return the value of the holdout's tag by run, None with another holdout; `DatasetError` names the runs without it."""
+    if rules.holdout != "tag":
+        return None
+    key, tags = rules.holdout_tag, {run.run_id: (run.tags or {}).get(rules.holdout_tag) for run in runs}
     missing = [run_id for run_id in run_ids if tags[run_id] is None]
     if missing:
         raise DatasetError(
             f"holdout by tag {key}: {len(missing)} of {len(run_ids)} runs do not have it ({', '.join(missing[:3])}); "
             f"ingest their logs again with --tag {key}=VALUE"
         )
-    return [str(tags[run_id]) for run_id in run_ids]
+    return {run_id: str(tags[run_id]) for run_id in run_ids}
 
 
 def find_narrow_patches(robots: Sequence[str], known: Mapping[str, Robot], *, patch_m: float) -> list[Finding]:

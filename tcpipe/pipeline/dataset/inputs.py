@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,12 +23,14 @@ from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_range
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
-from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
+from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
 from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
+from tcpipe.pipeline.dataset.sampling import MapPlaces
 from tcpipe.pipeline.dataset.splitting import ExcludedIds, regions_to_json
 from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.recipe import Recipe
@@ -44,11 +46,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class BuildOptions:
-    """A user's choices for a dataset besides its runs, maps and tables; ``recipe`` includes holdout and seed of the call."""
+    """A user's choices for a dataset, read and checked; ``recipe`` includes holdout and seed of the call."""
 
     recipe: Recipe
-    regions: Regions | None
+    robot: str | None
     tags: Mapping[str, str]
+    map_names: tuple[str, ...]
+    """In order of priority where maps overlap; none: the only one."""
+    region: str | None
+    """The file of the regions, as text."""
+    regions: Regions | None
+    covariates: tuple[CovariateTable, ...]
+    exclusions: tuple[ExcludedIds, ...]
     file_format: FileFormat
     redact: bool
     earlier: pa.Table | None
@@ -65,8 +74,7 @@ class Inputs:
     sources: tuple[RunSource, ...]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap."""
-    maps: Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
-    """Returns arguments of `open_map`, on any machine."""
+    maps: MapPlaces
     map_sha256: tuple[str, ...]
     """Over the checksums of each map's files."""
     again: Mapping[str, NDArray[np.bool_]]
@@ -75,30 +83,18 @@ class Inputs:
     chosen: SelectedRuns
     findings: tuple[Finding, ...]
     """On the choice of runs."""
-    covariates: tuple[CovariateTable, ...] = ()
-    exclusions: tuple[ExcludedIds, ...] = ()
 
 
-def choose_inputs(
-    store: Store,
-    options: BuildOptions,
-    *,
-    state: State,
-    map_names: Sequence[str],
-    robot: str | None,
-    region: bytes | None,
-    covariates: tuple[CovariateTable, ...],
-    exclusions: tuple[ExcludedIds, ...],
-) -> Inputs:
+def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
     """Return the runs of one robot ingested with this recipe, and the maps; `DatasetError` lists the candidates."""
     problems = list[str]()
     try:
-        chosen = choose_runs(store, options.recipe, state=state, robot=robot, tags=options.tags)
+        chosen = choose_runs(store, options.recipe, state=state, robot=options.robot, tags=options.tags)
         _refuse_without_segments(chosen.runs)
     except DatasetError as error:
         problems += error.problems
     try:
-        names = choose_maps(store, map_names)
+        names = choose_maps(store, options.map_names)
     except DatasetError as error:
         problems += error.problems
     if problems:
@@ -111,26 +107,31 @@ def choose_inputs(
         _map_digest(name, path) if fetched is None else _digest_of(document.checksums, document.zarr)
         for name, document, (path, fetched) in zip(names, documents, maps(), strict=True)
     )
-    sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
+    sources = tuple(_make_source(run, chosen.logs[run.run_id]) for run in runs)
     fingerprint = digest(
         {
             "versions": [__version__, TABLES_VERSION],
             "recipe": options.recipe,
             "runs": [{key: value for key, value in to_plain(run).items() if key != "samples"} for run in sources],
             "maps": list(zip(names, map_sha256, strict=True)),
-            "region": None if region is None else region.decode("utf-8", "replace"),
+            "region": options.region,
             "format": options.file_format,
-            **({"covariates": [(table.name, table.checksum) for table in covariates]} if covariates else {}),
             **(
-                {"excluded": [(table.name, table.checksum, table.reason) for table in exclusions]} if exclusions else {}
+                {"covariates": [(table.name, table.checksum) for table in options.covariates]}
+                if options.covariates
+                else {}
+            ),
+            **(
+                {"excluded": [(ids.name, ids.checksum, ids.reason) for ids in options.exclusions]}
+                if options.exclusions
+                else {}
             ),
             **({} if options.earlier is None else {"kept_split": _hash_table(options.earlier)}),
         }
     )
+    fingerprint = digest(("redacted", fingerprint)) if options.redact else fingerprint
     findings = (*chosen.findings, *once.findings)
-    return Inputs(
-        runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings, covariates, exclusions
-    )
+    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings)
 
 
 def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
@@ -182,17 +183,13 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 
 
 def read_earlier_splits(dataset: str | Path) -> pa.Table:
-    """Return ``sample_id``, ``split`` and, if it has one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
+    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` if it is none."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     if read_card(directory).redaction is not None:
         raise DatasetError(
             f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"
         )
-    there = sample_columns(directory)
-    missing = [name for name in ("sample_id", "split") if name not in there]
-    if missing:
-        raise DatasetError(f"{directory}: its samples have no column {missing[0]}; its split cannot be kept")
-    return read_samples(directory, [name for name in ("sample_id", "split", "fold") if name in there])
+    return read_samples(directory, ["sample_id", "split", "fold"])
 
 
 def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
@@ -211,7 +208,7 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names)) or (maps[0],)
 
 
-def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
+def _make_source(run: RunDirectory, log: LogOrigin) -> RunSource:
     """Return the card's entry of a run."""
     named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
     return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
@@ -252,9 +249,9 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
     yield (
         "--covariates",
         tuple(table.name for table in card.covariates),
-        tuple(table.name for table in inputs.covariates),
+        tuple(table.name for table in options.covariates),
     )
-    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in inputs.exclusions)
+    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in options.exclusions)
     yield "--format", card.format, options.file_format
     if not options.keeps_own_split:
         yield "--keep-split", card.split.kept is not None, options.earlier is not None
@@ -323,26 +320,6 @@ class UniqueRuns:
 
 
 @dataclass(frozen=True, slots=True)
-class _Spans:
-    """From when to when the runs' segments are [ns] and whose they are, (N,); a run of which that is not known is there at any time."""
-
-    start_ns: NDArray[np.int64]
-    end_ns: NDArray[np.int64]
-    robot: NDArray[np.str_]
-
-    def find_overlapping(self, index: int) -> list[int]:
-        """Return which earlier runs of the same robot have segments at the time of one."""
-        early = slice(0, index)
-        apart_ns = np.maximum(self.start_ns[early], self.start_ns[index]) - np.minimum(
-            self.end_ns[early], self.end_ns[index]
-        )
-        found: list[int] = np.flatnonzero(
-            (apart_ns <= _SAME_TIME_NS) & (self.robot[early] == self.robot[index])
-        ).tolist()
-        return found
-
-
-@dataclass(frozen=True, slots=True)
 class _SegmentPositions:
     """When and where a run's segments lie, in the order of its file, which is that of time: [ns], (N,), and lon, lat [deg], (N, 2)."""
 
@@ -360,7 +337,8 @@ def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, 
     sha256_by_run : hash of each run's log.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
-    spans, kept = _read_spans(runs), dict[int, RunDirectory]()
+    start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T
+    robot, kept = np.array([run.facts.robot for run in runs]), dict[int, RunDirectory]()
 
     @lru_cache(maxsize=_WAYS)
     def way(index: int) -> _SegmentPositions:
@@ -375,7 +353,8 @@ def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, 
             findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
         twice, others = np.zeros(run.facts.segments, np.bool_), []
-        for earlier in spans.find_overlapping(index):
+        apart_ns = np.maximum(start_ns[:index], start_ns[index]) - np.minimum(end_ns[:index], end_ns[index])
+        for earlier in np.flatnonzero((apart_ns <= _SAME_TIME_NS) & (robot[:index] == run.facts.robot)).tolist():
             if earlier in kept:
                 shared = _find_shared(way(index), way(earlier))
                 twice |= shared
@@ -399,18 +378,13 @@ def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Fi
     )
 
 
-def _read_spans(runs: Sequence[RunDirectory]) -> _Spans:
-    """Return when the runs have segments; one without segments is nowhere."""
-    start_ns, end_ns = np.empty(len(runs), np.int64), np.empty(len(runs), np.int64)
-    for index, run in enumerate(runs):
-        facts = run.facts
-        if not facts.segments:
-            start_ns[index], end_ns[index] = _NEVER_NS, -_NEVER_NS
-        elif facts.start_ns is None or facts.end_ns is None:
-            start_ns[index], end_ns[index] = -_NEVER_NS, _NEVER_NS
-        else:
-            start_ns[index], end_ns[index] = facts.start_ns, facts.end_ns
-    return _Spans(start_ns, end_ns, np.array([run.facts.robot for run in runs], np.str_))
+def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
+    """Return from when to when a run has segments: without any never, where it is not known at any time."""
+    if not facts.segments:
+        return _NEVER_NS, -_NEVER_NS
+    if facts.start_ns is None or facts.end_ns is None:
+        return -_NEVER_NS, _NEVER_NS
+    return facts.start_ns, facts.end_ns
 
 
 def _read_positions(run: RunDirectory) -> _SegmentPositions:

@@ -18,7 +18,6 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, Redacted, judge_dataset
 from tcpipe.formats.geojson import FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_facts import RasterOrigin
-from tcpipe.formats.parquet import ROWS_PER_GROUP
 from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
@@ -77,10 +76,6 @@ class Redaction:
         """Return the public lon, lat [deg] of places (lon, lat) [deg], shape (..., 2)."""
         return _move_to_origin(self.in_plane(lonlat_deg))
 
-    def segment_id(self, name: str, run_id: str) -> str:
-        """Return the public id of a run's segment."""
-        return self.runs[run_id] + name[len(run_id) :]
-
     def table(self, samples: pa.Table) -> pa.Table:
         """Return samples with public places and names; courses and x, y are along the maps' grid.
 
@@ -104,7 +99,7 @@ class Redaction:
         columns["map"] = [self.maps[name] for name in samples.column("map").to_pylist()]
         for name in ("sample_id", "segment_id"):
             pairs = zip(samples.column(name).to_pylist(), runs, strict=True)
-            columns[name] = [self.segment_id(segment, run_id) for segment, run_id in pairs]
+            columns[name] = [self.runs[run_id] + segment[len(run_id) :] for segment, run_id in pairs]
         for name, values in columns.items():
             field = samples.schema.field(name)
             samples = samples.set_column(samples.schema.get_field_index(name), field, pa.array(values, field.type))
@@ -127,7 +122,7 @@ def _estimate_scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
     `DatasetError` if it is so far from 1 that the extent of the maps in pixels would reveal it.
     """
     plane_chord = chord_chord = 0.0
-    for piece in samples.pieces(ROWS_PER_GROUP):
+    for piece in samples.pieces():
         start, end = (_project_to_map(read_lonlat_deg(piece, end), gnss_crs, map_crs) for end in _ENDS)
         chord_m = to_floats(piece, "chord_m")
         plane_chord += float(np.hypot(*(end - start).T) @ chord_m)
@@ -174,7 +169,7 @@ def redact_content(content: Content, redaction: Redaction) -> Content:
     added = content.samples.added  # descriptions of its columns name files
     bare = pa.schema([field.with_metadata({"unit": "", "doc": ""}) for field in added.schema])
     sampled = replace(sampled, footprint_lonlat_deg=footprints)
-    samples = replace(content.samples, sampled=sampled, added=added.cast(bare), redaction=redaction)
+    samples = replace(content.samples, sampled=sampled, added=added.cast(bare), redact=redaction.table)
     return replace(content, samples=samples, registrations=[() for _ in content.registrations])
 
 
@@ -284,11 +279,7 @@ def move_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any:
 
 
 def find_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
-    """Yield a line for each secret that a redacted dataset reveals."""
-    return (f"it is marked as redacted, but {leak}" for leak in _iterate_leaks(card, samples))
-
-
-def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
+    """Yield what a redacted dataset reveals, a line for each secret."""
     for end in _ENDS:
         lon, lat, x_m, y_m = (to_floats(samples, f"{end}_{name}") for name in ("lon_deg", "lat_deg", "x_m", "y_m"))
         plane_x_m, plane_y_m = _make_transformer("EPSG:4326", PLANE).transform(lon, lat)
@@ -306,8 +297,7 @@ def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     if abs(ratio - 1.0) > max(most, _SCALE_VARIES):
         yield f"distances are {ratio:.6f} of chord_m: the scale of the maps' plane reveals the place; build it again"
     yield from (f"tells {text!r}" for text in (*card.label.includes, *card.added_columns.values()) if text)
-    reasons = card.verdict.reasons if card.verdict else ()
-    every = (card.findings, reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
+    every = (card.findings, card.verdict.reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
     others = (
         finding for findings in every for finding in findings if not _is_cut_sentence(finding, card.tcpipe_version)
     )

@@ -36,8 +36,6 @@ class SelectedRuns:
     """On each matching run without a usable ingestion."""
     damaged: tuple[Finding, ...]
     """On each run whose files were changed or lost."""
-    left_out: frozenset[str]
-    """Runs of those findings, and superseded runs."""
     findings: tuple[Finding, ...]
     """On superseded runs."""
 
@@ -78,12 +76,11 @@ def choose_runs(
     nothing: dict[str, str] = {}
     missing = tuple(_find_left_out(found, "run-ingested-otherwise", otherwise))
     broken = tuple(_find_left_out(found, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
-    excluded = frozenset({*damaged, *otherwise, *found.superseded})
     superseded = tuple(
         make_finding("run-superseded", Subject("run", run_id), names={"by": by})
         for run_id, by in found.superseded.items()
     )
-    return SelectedRuns(tuple(runs), logs, missing, broken, excluded, superseded)
+    return SelectedRuns(tuple(runs), logs, missing, broken, superseded)
 
 
 def _find_left_out(
@@ -173,7 +170,8 @@ def find_gone_runs(
     before: Sequence[RunSource], chosen: SelectedRuns, *, robot: str | None, tags: Mapping[str, str]
 ) -> tuple[Finding, ...]:
     """Return a finding on each matching run of the replaced dataset that the store no longer has."""
-    here = {run.run_id for run in chosen.runs} | chosen.left_out
+    excluded = (*chosen.missing, *chosen.damaged, *chosen.findings)
+    here = {*(run.run_id for run in chosen.runs), *(finding.subject.name for finding in excluded)}
     gone = [run.run_id for run in before if run.run_id not in here and _is_selected(run, robot, tags)]
     return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -156,33 +155,8 @@ class _Batch:
     spool: Spool
 
 
-@dataclass(frozen=True, slots=True)
-class _HeldMap:
-    source: MapFile
-    tiles: TilePool
-
-
-_held: OrderedDict[Path, _HeldMap] = OrderedDict()
-"""Maps of this process, while it samples."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Batches(Sequence[_Batch]):
-    """Batches that are made on access, so that one copy of their segments exists at a time."""
-
-    rows: Sequence[NDArray[np.int64]]
-    whole: _Batch
-    """All segments as one batch."""
-
-    def __len__(self) -> int:
-        """Return the number of batches."""
-        return len(self.rows)
-
-    def __getitem__(self, index: int) -> _Batch:  # type: ignore[override]  # nobody asks for slices
-        """Return one batch."""
-        rows = self.rows[index]
-        segments = take_rows(self.whole.segments, rows)
-        return replace(self.whole, number=index, ranks=self.whole.ranks[rows], segments=segments)
+_held = dict[Path, tuple[MapFile, TilePool]]()
+"""Maps of this process, while it samples, the last used one last."""
 
 
 def sample_all_segments(
@@ -218,7 +192,10 @@ def sample_all_segments(
     if count := len(spool.place.files()):
         logger.info("resuming: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
-    batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, shifts, spool))
+    batches = (  # made when a worker can have them: one copy of their segments exists at a time
+        _Batch(index, ranks[at], take_rows(placed, at), maps, config, gnss_crs, shifts, spool)
+        for index, at in enumerate(rows)
+    )
     lost_by, slots = (make_mapped_array(directory, (segments.num_rows,), kind) for kind in (np.uint32, np.int64))
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     findings: dict[int, tuple[Finding, ...]] = {}
@@ -230,9 +207,10 @@ def sample_all_segments(
                 meter.add(len(rows[batch]))
                 kept = rows[batch][part.kept]
                 lost_by[rows[batch]] = part.lost_by
-                slots[kept[_sort_rows(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
+                slots[kept[np.argsort(ranks[kept], kind="stable")]] = (batch << _ROW_BITS) + np.arange(len(kept))
                 counts[batch], findings[batch] = len(kept), part.findings
-                for name, values in _make_columns(part).items():
+                placing = {name: getattr(part, name) for name in _PLACING}
+                for name, values in (part.patches.columns() | placing).items():
                     if name not in columns:
                         columns[name] = make_mapped_array(directory, (len(lost_by), *values.shape[1:]), values.dtype)
                     columns[name][kept] = values
@@ -261,16 +239,6 @@ def _read_sampled(data: bytes) -> Sampled:
     return Sampled(patches=Patches({}, **columns), findings=findings, **rest)
 
 
-def _sort_rows(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
-    """Return the rows of a batch in the order of the dataset."""
-    return np.argsort(ranks, kind="stable")
-
-
-def _make_columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
-    """Return the columns of the patches by name."""
-    return {**sampled.patches.columns(), **{name: getattr(sampled, name) for name in _PLACING}}
-
-
 def _iterate_batches(segments: pa.Table, size: int) -> Iterator[NDArray[np.int64]]:
     """Yield the rows of each batch, rising."""
     places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
@@ -284,23 +252,22 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     try:
         if (sampled := batch.spool.find(batch.number)) is not None:
             return sampled
-        held = [_reuse_map(*arguments, batch.config) for arguments in batch.maps()]
-        sources, pools = [each.source for each in held], [each.tiles for each in held]
+        sources, pools = zip(*(_reuse_map(*arguments, batch.config) for arguments in batch.maps()), strict=True)
         sampled = sample_on_maps(
             batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools, shifts=batch.shifts
         )
-        return batch.spool.write(batch.number, _sort_rows(batch.ranks[sampled.kept]), sampled)
+        order = np.argsort(batch.ranks[sampled.kept], kind="stable")  # that of the dataset
+        return batch.spool.write(batch.number, order, sampled)
     except TcpipeError as error:
         return error
 
 
-def _reuse_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> _HeldMap:
+def _reuse_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> tuple[MapFile, TilePool]:
     """Return a map with the tiles of this process's last batch: the next batch is near and needs the same ones."""
-    held = _held.pop(path, None)
-    if held is None:
+    if (held := _held.pop(path, None)) is None:
         source = open_map(path, fetched)
-        held = _HeldMap(source, TilePool(choose_level(source, config.patch_m / config.patch_px)))
+        held = source, TilePool(choose_level(source, config.patch_m / config.patch_px))
     _held[path] = held
     if len(_held) > _HELD_MAPS:
-        _held.popitem(last=False)
+        del _held[next(iter(_held))]
     return held

@@ -186,8 +186,7 @@ def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignm
     split, fold = np.full(len(row), "", dtype="<U8"), np.full(len(row), NO_FOLD)
     rows = row[known].astype(np.int64)
     split[known] = earlier.column("split").to_numpy().astype(np.str_)[rows]
-    if "fold" in earlier.column_names:
-        fold[known] = earlier.column("fold").fill_null(NO_FOLD).to_numpy()[rows]
+    fold[known] = earlier.column("fold").fill_null(NO_FOLD).to_numpy()[rows]
     return Assignment.from_names(split, fold)
 
 

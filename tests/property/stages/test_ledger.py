@@ -12,13 +12,17 @@ from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import to_floats
 
+REASONS = [
+    *("kept", "gap", "stationary", "stuck", "turning_in_place", "reversing", "accelerating", "below_full_speed"),
+    *("time_window", "curved", "leftover"),
+]
 FINE = 50
 """Steps of the truth to one row of the track."""
 
 
 @st.composite
 def drives(draw):
-    """Return a track with stops, turns, reversing, command changes, holes, clock steps and a jump, and its true horizontal length [m]."""
+    """Return a track with stops, turns, reversing, commands, holes, a clock set back and a jump, and its true horizontal length [m]."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     seconds, fine_s = draw(st.integers(5, 60)), 0.05 / FINE
     t = np.arange(seconds * 20 * FINE + 1) * fine_s
@@ -44,7 +48,7 @@ def drives(draw):
     track = make_track(
         position[rows],
         velocity[rows],
-        stamp_ns=stamps(len(t[::FINE]))[kept],
+        stamp_ns=stamps(len(t[::FINE]))[kept] - 30 * 10**9 * clock_epoch.astype(np.int64),
         clock_epoch=clock_epoch,
         forward_mps=speed[rows],
         yaw_rate_radps=turn[rows],
@@ -58,7 +62,7 @@ def drives(draw):
 def labelled(track):
     masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
     stamp_ns = masked.table["stamp_ns"].to_numpy()
-    t_ns = np.arange(stamp_ns[0] - 10**9, stamp_ns[-1] + 10**9, 40_000_000)
+    t_ns = np.arange(stamp_ns.min() - 10**9, stamp_ns.max() + 10**9, 40_000_000)
     power = power_streams({"drive": (t_ns, np.full(len(t_ns), 24.0), np.full(len(t_ns), 6.0))})
     found = label_segments(
         segment_track(masked, SegmentConfig()),
@@ -67,7 +71,20 @@ def labelled(track):
         LabelConfig(),
         voltage_range_volt=None,
     )
-    return found, 144.0 * (t_ns[-1] - t_ns[0]) * 1e-9
+    return masked, found, 144.0 * (t_ns[-1] - t_ns[0]) * 1e-9
+
+
+def check_segments(masked, table):
+    """No segment holds a dropped row, a hole or a step of the clock, and each has the chord that was asked for."""
+    stamp_ns, clock_epoch, dropped = (masked[name].to_numpy() for name in ("stamp_ns", "clock_epoch", "dropped_by"))
+    for start, end, its_epoch in zip(
+        *(table[name].to_pylist() for name in ("start_ns", "end_ns", "clock_epoch")), strict=True
+    ):
+        inside = (clock_epoch == its_epoch) & (stamp_ns > start - 50_000_000) & (stamp_ns < end + 50_000_000)
+        assert not dropped[inside].any()
+        assert (np.diff(stamp_ns[inside]) == 50_000_000).all()
+    step = [to_floats(table, f"end_{axis}_m") - to_floats(table, f"start_{axis}_m") for axis in "xy"]
+    assert np.hypot(*step) == pytest.approx(np.ones(table.num_rows), abs=1e-6)
 
 
 @settings(max_examples=25, deadline=None)
@@ -75,13 +92,17 @@ def labelled(track):
 def test_kept_and_lost_are_what_was_driven_and_drawn(given_drives):
     ledgers_m, driven_m = [], []
     for track, true_m in given_drives:
-        found, drawn_joule = labelled(track)
-        entries = found.distance_by_reason_m
+        masked, found, drawn_joule = labelled(track)
+        check_segments(masked.table, found.table)
+        entries, cut = found.distance_by_reason_m, found.info.report.facts.segment
+        assert list(entries) == REASONS
         assert min(entries.values()) >= 0.0
         assert sum(entries.values()) == pytest.approx(true_m, rel=1e-3, abs=1e-3)
         assert entries["kept"] == pytest.approx(to_floats(found.table, "arc_length_m").sum(), rel=1e-9, abs=1e-9)
         facts = found.info.report.facts.label
-        assert facts.distance_m == pytest.approx(sum(entries.values()), rel=1e-12)
+        assert facts.distance_m == cut.odometer_m == pytest.approx(sum(entries.values()), rel=1e-12)
+        intervals_ns, steps = (np.diff(track.table[name].to_numpy()) for name in ("stamp_ns", "clock_epoch"))
+        assert sum(cut.duration_by_reason_s.values()) == pytest.approx(intervals_ns[steps == 0].sum() * 1e-9, rel=1e-9)
         if not track.table["clock_epoch"].to_numpy().any():  # power is of the first clock_epoch alone
             assert sum(facts.energy_by_entry_joule.values()) == pytest.approx(drawn_joule, rel=1e-3)
         ledgers_m.append(entries)

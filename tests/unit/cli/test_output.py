@@ -19,11 +19,6 @@ HOSTILE = "/logs/[red]a\x1b]0;owned\x07\x1b[31m\u202e.bag"
 MB = 1_000_000
 
 
-@pytest.fixture(autouse=True)
-def listening(monkeypatch):
-    monkeypatch.setattr(LOGGER, "disabled", False)  # the linter of the architecture tests disables it
-
-
 @pytest.mark.parametrize(
     ("quiet", "said"), [(False, ["reading", "tcpipe: the disk is full"]), (True, ["tcpipe: the disk is full"])]
 )

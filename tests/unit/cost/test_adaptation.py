@@ -61,7 +61,7 @@ def test_an_adapted_model_is_better_and_its_intervals_cover(change):
 
 def test_a_long_run_leaves_the_least_squares_fit():
     """With very many metres the prior counts nothing: numpy's own least squares, weighted by the spreads, says the same."""
-    errors, known = made_errors(), made_run(np.random.default_rng(3), 1500, scale=1.4, offset=15.0, payload=0.2)
+    errors, known = made_errors(), made_run(np.random.default_rng(3), 700, scale=1.4, offset=15.0, payload=0.2)
     errors = replace(errors, correlation=np.zeros_like(errors.correlation))
     adapted = adapt(errors, known, replace(known, distance_m=known.distance_m + ELSEWHERE_M)).value
     design = np.column_stack([known.predicted, known.length_m, known.rise_m])

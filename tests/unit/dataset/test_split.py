@@ -32,6 +32,11 @@ def path(directory, request):
     return directory / request.param
 
 
+@pytest.fixture
+def train(directory):
+    return open_dataset(directory / "zarr")["train"]
+
+
 def test_patches_are_the_papers_tensor(path):
     train = open_dataset(path)["train"]
     assert train.patches.shape == (len(train), 40, 40, 3)
@@ -46,14 +51,15 @@ def test_patches_are_the_papers_tensor(path):
     assert (height.min(axis=(1, 2)) == 0).all()
 
 
-def test_labels_are_power_and_velocity(path):
-    test = open_dataset(path)["test"]
+def test_labels_are_power_and_velocity(directory):
+    test = open_dataset(directory / "zarr")["test"]
     assert test.labels.dtype == np.float32
     np.testing.assert_array_equal(test.labels[:, 0], test.samples["power_watt"].to_numpy().astype(np.float32))
     np.testing.assert_array_equal(test.labels[:, 1], test.samples["velocity_mps"].to_numpy().astype(np.float32))
 
 
-def test_net_labels_are_those_of_the_same_samples_less_idle_power(path):
+def test_net_labels_are_those_of_the_same_samples_less_idle_power(directory):
+    path = directory / "zarr"
     total, above = (open_dataset(path, label=name)["test"] for name in ("total", "net"))
     assert above.label_columns == ("net_power_watt", "velocity_mps")
     np.testing.assert_allclose(above.labels[:, 0], total.labels[:, 0] - STANDING_WATT, rtol=1e-6)
@@ -195,8 +201,7 @@ def test_every_epoch_has_its_own_order_and_the_same_seed_the_same(path, from_dis
     assert not np.array_equal(first, orders(1)[0])
 
 
-def test_what_keras_wants_never_ends(path):
-    train = open_dataset(path)["train"]
+def test_what_keras_wants_never_ends(train):
     batches = train.batches(100, shuffle=True, weights=True)
     assert inspect.isgenerator(batches.forever())  # Keras takes no other iterator
     found = list(itertools.islice(batches.forever(), 2 * len(batches)))
@@ -204,8 +209,7 @@ def test_what_keras_wants_never_ends(path):
     assert found[0][2].shape == (100, 2)
 
 
-def test_a_label_whose_error_is_not_known_weighs_nothing(path):
-    train = open_dataset(path)["train"]
+def test_a_label_whose_error_is_not_known_weighs_nothing(train):
     std = train._columns["power_std_watt"].copy()
     train._columns._read["power_std_watt"] = np.where(np.arange(len(std)) == 3, np.nan, std)
     assert np.isfinite(train.weights).all()
@@ -213,8 +217,7 @@ def test_a_label_whose_error_is_not_known_weighs_nothing(path):
     assert train.take([3]).weights[0, 0] == 0
 
 
-def test_batches_that_cannot_be_are_refused_in_a_line(path):
-    train = open_dataset(path)["train"]
+def test_batches_that_cannot_be_are_refused_in_a_line(train):
     with pytest.raises(DatasetError, match="batches of 0 samples: expected 1 or more"):
         train.batches(0)
     with pytest.raises(DatasetError, match="features terrain_name: expected columns of numbers"):
@@ -248,8 +251,8 @@ def test_every_stored_value_becomes_what_the_layers_say(count):
     np.testing.assert_array_equal(apart, wanted[..., [2, 0, 1]])
 
 
-def test_a_mirrored_patch_is_reversed_across_and_its_cross_slope_changes_sign(path):
-    train = numbered(open_dataset(path)["train"])
+def test_a_mirrored_patch_is_reversed_across_and_its_cross_slope_changes_sign(train):
+    train = numbered(train)
     mirrored = 0
     names = ("power_watt", "slope_rad", "cross_slope_rad")
     for (patches, features), labels in train.batches(64, mirror=True, seed=1, features=names):
@@ -262,8 +265,7 @@ def test_a_mirrored_patch_is_reversed_across_and_its_cross_slope_changes_sign(pa
     assert 80 < mirrored < 141  # 110.5 ± 4 sigma
 
 
-def test_channels_are_chosen_and_classes_become_planes(path):
-    train = open_dataset(path)["train"]
+def test_channels_are_chosen_and_classes_become_planes(train):
     chosen = train.with_channels("height", "terrain_one_hot")
     assert chosen.patches.shape == (len(train), 40, 40, 8)
     np.testing.assert_array_equal(chosen.patches[..., 0], train.patches[..., 2])
@@ -278,8 +280,7 @@ def test_channels_are_chosen_and_classes_become_planes(path):
         train.with_channels("colour")
 
 
-def test_samples_are_left_out_by_quality_and_error(path):
-    train = open_dataset(path)["train"]
+def test_samples_are_left_out_by_quality_and_error(train):
     train._columns._read["quality"] = np.where(np.arange(len(train)) % 3 == 0, 2, 64)
     train._columns._read["power_std_watt"] = np.arange(len(train)) / 10
     assert len(train.clean(("near_gap",))) == 147
@@ -293,8 +294,7 @@ def test_samples_are_left_out_by_quality_and_error(path):
         train.clean(("fast",))
 
 
-def test_a_fold_and_the_rest_make_the_whole(path):
-    train = open_dataset(path)["train"]
+def test_a_fold_and_the_rest_make_the_whole(train):
     held = [train.fold(number)[1] for number in range(5)]
     assert sum(len(part) for part in held) == len(train)
     for number in range(5):
@@ -303,8 +303,7 @@ def test_a_fold_and_the_rest_make_the_whole(path):
         assert set(mine.samples["fold"].to_pylist()) <= {number}
 
 
-@pytest.mark.parametrize("from_disk", [False, True])
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(("workers", "from_disk"), [(0, False), (2, True)])
 def test_torch_iterates_over_every_sample_once(path, workers, from_disk):
     data = pytest.importorskip("torch.utils.data")
     torch = pytest.importorskip("torch")
@@ -317,8 +316,8 @@ def test_torch_iterates_over_every_sample_once(path, workers, from_disk):
     assert not np.array_equal(*epochs)
 
 
-def test_parts_share_nothing_and_leave_nothing_out(path):
-    batches = open_dataset(path)["train"].batches(32, from_disk=True)
+def test_parts_share_nothing_and_leave_nothing_out(train):
+    batches = train.batches(32, from_disk=True)
     parts = [[float(power) for _, labels in batches.part(number, 3) for power in labels[:, 0]] for number in range(3)]
     whole = [float(power) for _, labels in batches for power in labels[:, 0]]
     assert sorted(itertools.chain(*parts)) == sorted(whole)

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment
-from storage_server import READ_ONLY, object_store
+from storage_server import READ_ONLY
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.object_storage import read_aws_profile
@@ -56,20 +55,22 @@ def test_a_profile_gives_what_the_environment_does_not(home: dict[str, str], tmp
     assert read_aws_profile(elsewhere | {"AWS_PROFILE": "lab"}).keys() == LAB.keys() - {"region", "endpoint"}
 
 
+@pytest.mark.usefixtures("served")
 def test_a_profile_that_cannot_be_used_is_one_line(
     home: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ValueError, match=r"have no profile other, which AWS_PROFILE names"):
         read_aws_profile(home | {"AWS_PROFILE": "other"})
-    (tmp_path / "served" / READ_ONLY).mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment | home, tmp_path / "cache")
-        monkeypatch.delenv("AWS_SKIP_SIGNATURE")
+    (tmp_path / "served" / READ_ONLY).mkdir()
+    monkeypatch.setenv("HOME", home["HOME"])
+    monkeypatch.delenv("AWS_SKIP_SIGNATURE")
+    open_place(f"s3://{READ_ONLY}").check()
+    monkeypatch.setenv("AWS_PROFILE", "sso")
+    exported = (
+        r'the profile sso holds no keys; run: eval "\$\(aws configure export-credentials --profile sso --format env\)"'
+    )
+    with pytest.raises(StoreError, match=exported):
         open_place(f"s3://{READ_ONLY}").check()
-        monkeypatch.setenv("AWS_PROFILE", "sso")
-        exported = r'the profile sso holds no keys; run: eval "\$\(aws configure export-credentials --profile sso --format env\)"'
-        with pytest.raises(StoreError, match=exported):
-            open_place(f"s3://{READ_ONLY}").check()
     (tmp_path / ".aws" / "config").write_text("region = x")
     with pytest.raises(ValueError, match=r"config: cannot be read as an AWS configuration"):
         read_aws_profile(home)

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.parquet import read_row_group, read_table, write_parquet_bytes, write_table
+from tcpipe.formats.parquet import read_table, write_parquet_bytes, write_table
 
 READ = (
     "import sys; from pathlib import Path; from tcpipe.formats.parquet import read_table; read_table(Path(sys.argv[1]))"
@@ -58,7 +58,7 @@ def test_a_small_file_that_becomes_large_is_refused_before_it_does(tmp_path, bom
         read_table(path)
     if pq.read_metadata(path).num_row_groups == 1:
         with pytest.raises(StoreError, match="unfold"):
-            read_row_group(path, 0, None)
+            read_table(path, group=0)
 
 
 def test_a_page_that_says_it_is_larger_than_its_footer_does_is_refused(tmp_path):

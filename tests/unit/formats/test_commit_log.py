@@ -1,6 +1,5 @@
 """The log of a store: commits add up to a state, and a snapshot says the same; what is missing is said; no writer loses anything."""
 
-import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,7 +7,6 @@ from dataclasses import replace
 import pytest
 from object_gateway import open_bucket
 
-from tcpipe.errors import StoreError
 from tcpipe.formats import commit_log
 from tcpipe.formats.commit_log import Stamp, put_commit, read_commit, read_state, refresh
 from tcpipe.formats.commits import (
@@ -221,18 +219,3 @@ def test_reading_a_log_in_a_bucket_takes_a_constant_number_of_requests(monkeypat
     served.requests = 0
     assert refresh(place, state) == state
     assert served.requests == 1
-
-
-def test_a_log_that_cannot_be_written_is_an_error(place, monkeypatch):
-    def refused(*_):
-        raise StoreError("read-only")
-
-    monkeypatch.setattr(type(place), "put_new", refused)
-    with pytest.raises(StoreError, match="read-only"):
-        write(place, 1)
-
-
-def test_a_commit_is_readable_json(tmp_path):
-    write(Place(tmp_path), 1)
-    document = json.loads((tmp_path / "log" / "0000000001.json").read_text())
-    assert (document["number"], document["kind"], document["parent"]) == (1, "seen", "")

@@ -4,7 +4,7 @@ import pytest
 import shapely
 
 from tcpipe.errors import RegionError
-from tcpipe.formats.geojson import read_regions
+from tcpipe.formats.geojson import MAX_VALUES, read_regions
 
 SQUARE = [[15.0, 47.0], [15.001, 47.0], [15.001, 47.001], [15.0, 47.001], [15.0, 47.0]]
 BESIDE = [[round(lon + 0.001, 7), lat] for lon, lat in SQUARE]
@@ -92,7 +92,14 @@ def test_a_hole_stays_a_hole(tmp_path):
         (collection(feature(polygon(SQUARE), split="unseen")), "nothing could train"),
         ({"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}, **polygon(SQUARE)}, "export it again"),
         (polygon([[15, float("nan")], *SQUARE[1:-1], [15, float("nan")]]), "NaN is not a number"),
+        (polygon([[1e308, 1e308], *SQUARE[1:4], [1e308, 1e308]]), "no lon/lat degrees"),
+        (polygon([{"a": 1}, {"a": 1}]), "type must be array"),
+        ({"type": "GeometryCollection", "coordinates": [1]}, "key 'geometries' not found"),
+        ({"type": "x" * 10**6}, "xxx…, expected"),
+        ("[" * (MAX_VALUES + 1), "1500001 positions, rings and objects, at most 1500000; simplify it"),
+        ('{"type":' + "[" * 200_000, "not JSON"),
     ],
+    ids=lambda of: str(of)[:20],
 )
 def test_a_region_that_cannot_be_used_is_one_plain_line(tmp_path, document, says):
     with pytest.raises(RegionError) as caught:
@@ -100,6 +107,7 @@ def test_a_region_that_cannot_be_used_is_one_plain_line(tmp_path, document, says
     assert len(caught.value.problems) == 1
     assert says in caught.value.problems[0]
     assert "region.geojson" in caught.value.problems[0]
+    assert len(caught.value.problems[0]) < 1000
 
 
 def test_regions_that_disagree_are_refused_where_they_overlap(tmp_path):
@@ -118,6 +126,11 @@ def test_all_problems_come_at_once(tmp_path):
     assert [problem.split(": ")[1] for problem in caught.value.problems] == ["feature 0", "feature 1"]
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_and_one_that_is_too_large_are_named(tmp_path):
+    path = tmp_path / "region.geojson"
     with pytest.raises(RegionError, match="No such file"):
-        read_regions(tmp_path / "nowhere.geojson")
+        read_regions(path)
+    with path.open("wb") as stream:
+        stream.truncate(10**12)
+    with pytest.raises(RegionError, match="1000000 MB of GeoJSON, at most 50"):
+        read_regions(path)

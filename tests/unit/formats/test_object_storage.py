@@ -4,11 +4,11 @@ import resource
 
 import pytest
 from random_messages import assert_same, expected_columns, random_messages, write_mcap, write_rosbag2
-from storage_server import FORBIDDEN, object_store
+from storage_server import FORBIDDEN
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import is_log_file, open_log
-from tcpipe.formats.object_storage import is_url, lay_out_objects, make_stand_ins
+from tcpipe.formats.object_storage import lay_out_objects, make_stand_ins
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
 
@@ -16,27 +16,15 @@ MESSAGES = random_messages(1, count=10, types=("std_msgs/msg/ColorRGBA",))
 
 
 @pytest.fixture
-def bucket(tmp_path, monkeypatch):
+def bucket(tmp_path, served):
     """A bucket with a log, a bag directory and what is neither, over HTTP; what was fetched of it."""
-    root = tmp_path / "store" / "drives"
+    root = tmp_path / "served" / "drives"
     (root / "field").mkdir(parents=True)
     write_mcap(root / "field" / "my run.mcap", MESSAGES)
     write_rosbag2(root / "field" / "bag", MESSAGES)
     (root / "field" / "video.mp4").write_bytes(bytes(1000))
     (root / "junk.bag").write_bytes(b"nonsense")
-    with object_store(tmp_path / "store") as (environment, fetched):
-        for name in ("HTTP_PROXY", "http_proxy"):
-            monkeypatch.delenv(name, raising=False)
-        for name, value in environment.items():
-            monkeypatch.setenv(name, value)
-        yield root, fetched
-
-
-def test_what_is_a_url():
-    assert is_url("s3://bucket/run.mcap")
-    assert is_url("file:///tmp/run.mcap")
-    assert not is_url("drives/run.mcap")
-    assert not is_url("C:\\run.mcap")
+    return root, served
 
 
 def test_a_log_behind_a_url_is_read_as_any_other(bucket):

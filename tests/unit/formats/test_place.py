@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment, open_bucket
-from storage_server import FORBIDDEN, READ_ONLY, SKEWED, object_store
+from object_gateway import open_bucket
+from storage_server import FORBIDDEN, READ_ONLY, SKEWED, Fetched
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.integrity import Checksum
@@ -128,15 +128,12 @@ def test_a_bucket_that_cannot_be_used_is_one_line(tmp_path: Path, monkeypatch: p
     assert time.monotonic() - began < 10
 
 
-def test_what_is_written_counts_also_where_the_answer_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tests").mkdir()
-    with object_store(tmp_path) as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        place = open_place("s3://tests")
-        for name, put in (("a", place.put), ("b", place.put_new)):
-            fetched.lost = 2
-            put(name, b"data")
-            assert (place.read(name), fetched.lost) == (b"data", 0)
+def test_what_is_written_counts_also_where_the_answer_is_lost(served: Fetched) -> None:
+    place = open_place("s3://tests")
+    for name, put in (("a", place.put), ("b", place.put_new)):
+        served.lost = 2
+        put(name, b"data")
+        assert (place.read(name), served.lost) == (b"data", 0)
 
 
 @pytest.mark.usefixtures("served")

@@ -22,12 +22,6 @@ from tcpipe.formats.recipe_toml import (
 from tcpipe.recipe import Extrinsics, FuseConfig, ReadConfig, Recipe, SegmentConfig, SplitConfig
 
 
-def test_commented_recipe_is_the_default_recipe(tmp_path: Path) -> None:
-    path = tmp_path / "tcpipe.toml"
-    path.write_text(format_commented_toml())
-    assert load_recipe(path) == Recipe()
-
-
 def test_uncommented_keys_parse_to_the_same_defaults(tmp_path: Path) -> None:
     lines = [
         line[2:] if line.startswith("# ") and " = " in line and not re.search(r"=( +#|$)", line) else line
@@ -56,33 +50,18 @@ WRONG = {
     'read.topics.imu = "/a"': 'read.topics.imu is "/a"; expected a list',
     "read.topics.imu = [1]": "read.topics.imu.0 is 1; expected text in quotes",
     "read.extrinsics.imu.xyz_m = [1, 2]": "read.extrinsics.imu.xyz_m is [1, 2]; expected 3 values",
-    "read.extrinsics.imu.xyz_m = [1, 2, 3, 4]": "is [1, 2, 3, 4]; expected 3 values",
     'read.extrinsics.imu.xyz_m = [1, 2, "up"]': 'read.extrinsics.imu.xyz_m is [1, 2, "up"]; expected 3 values in a list, each a number',
     "read.extrinsics.imu = 3": "read.extrinsics.imu is 3; expected a table of keys",
-    "read.topics = 3": "read.topics is 3; expected a table",
     "read.extrinsics.imu.xyz_m = 3": "read.extrinsics.imu.xyz_m is 3; expected 3 values in a list, each a number from -1000 to 1000",
     'read.imu_units = "kg"': 'read.imu_units is "kg"; expected one of deg, deg_g, g, si',
     "fuse.rate_hz = -1": "fuse.rate_hz is -1; expected a number from 1 to 500",
     "fuse.rate_hz = true": "fuse.rate_hz is true; expected a number",
     'fuse.rate_hz = "20"': 'fuse.rate_hz is "20"; expected a number',
-    "fuse.rate_hz = 1e9": "fuse.rate_hz is 1000000000.0; expected a number from 1 to 500",
-    "segment.chord_m = 1e300": "segment.chord_m is 1e+300; expected a number from 0.05 to 1000",
-    "segment.chord_m = 1e-300": "segment.chord_m is 1e-300; expected a number from 0.05 to 1000",
     "split.test_fraction = 1.0": "split.test_fraction is 1.0; expected a number from 0 to below 1",
-    "split.block_m = 1e-12": "split.block_m is 1e-12; expected a number from 0.1 to 1000000",
     "split.seed = -1": "split.seed is -1; expected a whole number from 0 to 4294967295",
-    'fuse.estimator = "UKF"': 'fuse.estimator is "UKF"; expected one of smoother, ukf',
-    'split.holdout = "samples"': 'split.holdout is "samples"; expected one of block, run, sample, tag',
     "fuse.rate_hz = nan": "fuse.rate_hz is nan; expected a number from 1 to 500",
-    "fuse.rate_hz = [1]": "fuse.rate_hz is [1]; expected a number",
-    "fuse.gate_probability = 1": "fuse.gate_probability is 1; expected a number from 0.5 to 0.999999999",
-    "mask.full_speed_fraction = 1.2": "mask.full_speed_fraction is 1.2; expected a number from 0 to 1",
     'mask.keep_reversing = "maybe"': "expected true or false",
-    "mask.keep_reversing = [1]": "expected true or false",
-    "sample.patch_px = 1": "sample.patch_px is 1; expected a whole number from 2 to 1024",
     "split.folds = 2.5": "split.folds is 2.5; expected a whole number",
-    'split.seed = "x"': 'split.seed is "x"; expected a whole number',
-    "split.seed = [1]": "expected a whole number",
 }
 
 
@@ -174,6 +153,7 @@ def test_a_recipe_does_not_change_with_the_lists_it_was_made_of() -> None:
         ("read.topics.imu = " + "[" * 200 + "]" * 200, "expected text in quotes|nested too deep"),
         ("split.seed = " + "9" * 5000, "not valid TOML"),
         ("# " + "x" * 1_000_001, "larger than 1 MB"),
+        ("[" + ".".join("a" * 450_000) + "]\n", "line 1 has 449999 dots, at most 1000"),
     ],
     ids=lambda of: str(of)[:20],
 )
@@ -207,13 +187,6 @@ def test_dataset_keys_do_not_rename_runs_but_ingest_keys_do() -> None:
     plain = read_key(default, None, definitions="")
     assert plain == read_key(fused, None, definitions="")
     assert plain not in (read_key(default, "husky", definitions=""), read_key(default, None, definitions="ab"))
-
-
-def test_a_key_of_many_parts_is_refused_before_it_takes_for_ever(tmp_path):
-    path = tmp_path / "tcpipe.toml"
-    path.write_text("[" + ".".join("a" * 450_000) + "]\n")
-    with pytest.raises(RecipeError, match="line 1 has 449999 dots, at most 1000"):
-        load_recipe(path)
 
 
 def test_the_commented_recipe_is_toml_whatever_its_docstrings_say() -> None:

@@ -174,7 +174,7 @@ def crc(data):
     ("length", "place", "wanted"),
     [
         (10, (None, None), "it contains 10 bytes, expected 576"),
-        (500_000_000, (None, None), "it contains 500000000 bytes, expected 576"),
+        (50_000_000, (None, None), "it contains 50000000 bytes, expected 576"),
         (576, (2**63, 100), "its index names bytes beyond it"),
         (576, (0, 2**62), "its index names bytes beyond it"),
         (576, (0, 3), "its index names bytes beyond it"),

@@ -66,8 +66,9 @@ def numbers(value):
             yield from numbers(getattr(value, name))
 
 
-@pytest.mark.parametrize(("correlated_m", "time_s"), [(0.008, 5.0), (0.015, 10.0), (0.03, 5.0)])
-@pytest.mark.parametrize(("seed", "visual"), [(0, True), (1, False)])
+@pytest.mark.parametrize(
+    ("seed", "correlated_m", "time_s", "visual"), [(0, 0.008, 5.0, True), (1, 0.015, 10.0, False), (0, 0.03, 5.0, True)]
+)
 def test_correlated_noise_of_fixes_is_recovered(seed, correlated_m, time_s, visual):
     model = drive.estimate_noise(measure(seed, 0.006, correlated_m, time_s, visual=visual))
     true = GaussMarkov(correlated_m**2, time_s)
@@ -79,9 +80,8 @@ def test_correlated_noise_of_fixes_is_recovered(seed, correlated_m, time_s, visu
     assert model.horizontal.correlated.data_share > 0.5
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_white_noise_is_hardly_taken_for_correlated(seed):
-    model = drive.estimate_noise(measure(seed))
+def test_white_noise_is_hardly_taken_for_correlated():
+    model = drive.estimate_noise(measure())
     assert np.sqrt(model.horizontal.white_m2) == pytest.approx(0.015, rel=0.1)
     assert np.sqrt(model.horizontal.correlated.variance) < 0.007
     assert np.sqrt(model.vertical.correlated.variance) < 0.018

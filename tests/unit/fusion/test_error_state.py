@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion import error_state
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Measurements
@@ -214,8 +213,8 @@ def test_an_estimate_that_is_not_finite_is_an_error():
     assert [of.code for of in error.value.findings] == ["estimate-not-finite"]
 
 
-@pytest.mark.parametrize("lag_s", [0.05, 0.10])
-def test_a_receiver_whose_clock_is_off_is_read_at_its_time(lag_s):
+def test_a_receiver_whose_clock_is_off_is_read_at_its_time():
+    lag_s = 0.1
     late = drive.measure(truth(), 1)
     found = fuse(replace(late, gnss=replace(late.gnss, stamp_ns=late.gnss.stamp_ns + round(lag_s * 1e9))))
     lag = found.facts.parameters["lag of fixes"]
@@ -235,15 +234,6 @@ def test_the_last_bit_of_a_measurement_decides_nothing():
     assert np.abs(again.position_enu_m - found.position_enu_m).max() < 1e-8
     np.testing.assert_allclose(again.position_std_m, found.position_std_m, rtol=1e-3)
     np.testing.assert_allclose(again.displacement_std_m, found.displacement_std_m, rtol=1e-3)
-
-
-def test_any_size_of_blocks_gives_the_same(monkeypatch):
-    whole = smoothed()
-    monkeypatch.setattr(error_state, "_BLOCK", 61)
-    found = fuse(drive.measure(truth(), 1))
-    for name in ("position_enu_m", "quat_xyzw", "position_std_m", "displacement_std_m"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
-    assert found.facts == whole.facts
 
 
 @pytest.mark.parametrize(("hills", "within"), [(0.0, 5e-4), (1.0, 5e-3)], ids=["flat", "hilly"])

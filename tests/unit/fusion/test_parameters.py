@@ -25,7 +25,7 @@ DRAWN = (
 )
 SCALES_VARY = (0.01, 0.03, 0.001)
 """Standard deviations over half a minute: wheels, camera, both together."""
-SEEDS = 8
+SEEDS = 6
 
 
 def shift_base(truth, ahead_m):

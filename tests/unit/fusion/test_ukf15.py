@@ -67,9 +67,7 @@ def test_all_sensors_reach_centimetres_and_know_it(truth, orientation):
 @pytest.mark.parametrize(
     ("absent", "within_m"),
     [
-        (("visual",), 0.03),
         (("wheels", "visual"), 0.03),
-        (("imu",), 0.10),
         (("imu", "wheels", "visual"), 0.12),
         (("gnss",), 5.0),
     ],

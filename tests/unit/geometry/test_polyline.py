@@ -33,17 +33,6 @@ def test_positions_are_those_of_scipys_hermite_spline():
     assert np.array_equal(path.position_at(stamp_ns), position)
 
 
-def test_arc_of_a_circle():
-    path = circle(3.0, 1.0, 401)
-    assert path.length_m[-1] == pytest.approx(20.0, rel=1e-8)
-    assert path.length_at(path.stamp_ns[[100]])[0] == pytest.approx(5.0, rel=1e-8)
-
-
-def test_length_is_horizontal():
-    path = hill(np.radians(22.5), 1.0, 101)
-    assert path.length_m[-1] == pytest.approx(5.0 * np.cos(np.radians(22.5)), rel=1e-12)
-
-
 def test_first_crossing_on_a_hill_is_a_horizontal_chord():
     path = hill(np.radians(22.5), 0.8, 200)
     start = int(path.stamp_ns[3])

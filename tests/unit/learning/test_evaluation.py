@@ -12,10 +12,8 @@ import pyarrow.compute as pc
 import pyproj
 import pytest
 from made_models import CARD, made_model
-from object_gateway import in_environment
 from page_reading import data_of, unpacked
 from PIL import Image
-from storage_server import object_store
 from synthetic_store import STANDING_WATT, small_store
 
 from tcpipe.cost.prediction_errors import fit_bias_correction
@@ -300,23 +298,21 @@ def test_a_dataset_that_is_replaced_meanwhile_is_told(evaluated, model, dataset,
     assert not (tmp_path / "evaluation" / "evaluation.json").exists()
 
 
+@pytest.mark.usefixtures("served")
 def test_it_goes_to_a_bucket_and_another_one_is_the_next_generation(evaluated, model, dataset, tmp_path, monkeypatch):
     place, values = evaluated
-    table = read_table(place / "predictions.parquet")
+    table, url = read_table(place / "predictions.parquet"), "s3://tests/by me"
     monkeypatch.setattr(
         "tcpipe.learning.evaluation_files.evaluate", lambda *_, key, **__: (replace(values, key=key), table)
     )
-    (tmp_path / "served" / "found").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        told = run_evaluation(model, dataset, "s3://found/by me", config=CONFIG)
-        (there,) = (tmp_path / "served" / "found" / "by me" / "generations").iterdir()
-        assert str(told).endswith(f"open s3://found/by me/generations/{there.name}/evaluation.html")
-        for name in ("evaluation.json", "evaluation.html", "predictions.parquet"):
-            assert (there / name).read_bytes() == (place / name).read_bytes()
-        assert run_evaluation(model, dataset, "s3://found/by me", config=CONFIG).values == told.values
-        other = run_evaluation(model, dataset, "s3://found/by me", config=replace(CONFIG, seed=1))
-        assert "/generations/0000000002-" in other.path
+    told = run_evaluation(model, dataset, url, config=CONFIG)
+    (there,) = (tmp_path / "served" / "tests" / "by me" / "generations").iterdir()
+    assert str(told).endswith(f"open {url}/generations/{there.name}/evaluation.html")
+    for name in ("evaluation.json", "evaluation.html", "predictions.parquet"):
+        assert (there / name).read_bytes() == (place / name).read_bytes()
+    assert run_evaluation(model, dataset, url, config=CONFIG).values == told.values
+    other = run_evaluation(model, dataset, url, config=replace(CONFIG, seed=1))
+    assert "/generations/0000000002-" in other.path
 
 
 def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):

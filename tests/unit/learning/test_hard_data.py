@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from installed_command import plain_lines, tcpipe
-from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file, segments
+from synthetic_store import add_run, box, lanes, lonlat, open_world, region_file, segments
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError
@@ -16,7 +16,6 @@ from tcpipe.learning.models import load_model
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
 
 pytest.importorskip("lightgbm")
 
@@ -28,8 +27,7 @@ real_column, real_labels = Split.column, Split.labels.func
 def bare(tmp_path_factory):
     """A store whose map has heights alone, and its dataset."""
     here = tmp_path_factory.mktemp("bare")
-    store = open_store(here / "store", create=True)
-    add_world(store, here / "rasters", layers=())
+    store = open_world(here, layers=())
     for run_id, first in (("north", 1.0), ("south", -15.5)):
         start, end = lanes(first + 2.0 * np.arange(8), -14.0, 14.0)
         add_run(store, run_id, segments(run_id, start, end, start_ns=int(1e18 + first * 1e12)))

@@ -47,16 +47,6 @@ def test_all_is_the_samples_pooled(drawn):
     assert set(by_class) - {ALL} == {names[number] for number in class_ids}
 
 
-def test_the_papers_own_all_is_its_classes_combined():
-    """MAPE weighted by count, RMSE in quadrature: with the shares of classes in all its data its table I nearly gives its column All."""
-    from tcpipe.learning.evaluation_page import BY_CLASS
-
-    shares = np.array([0.51, 0.09, 0.2, 0.2])
-    rmse, mape = (np.array(BY_CLASS["test", "E", measure]) for measure in ("rmse", "mape_percent"))
-    assert np.sqrt(shares @ rmse[:4] ** 2) == pytest.approx(rmse[4], rel=0.1)
-    assert shares @ mape[:4] == pytest.approx(mape[4], rel=0.1)
-
-
 def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
     rng = np.random.default_rng(5)
     truth, sigma = rng.uniform(100.0, 300.0, 200_000), rng.uniform(2.0, 9.0, 200_000)

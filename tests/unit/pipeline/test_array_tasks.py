@@ -9,16 +9,13 @@ from dataclasses import replace
 
 import pytest
 from object_gateway import open_bucket
-from wheel_drives import START_NS, drive_at
+from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.formats.place import Place
 from tcpipe.pipeline import log_queue
-from tcpipe.pipeline import log_queue as claims_module
 from tcpipe.pipeline.calls import identify_process
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_queue import Claims, hold_claims
-from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 
@@ -85,7 +82,7 @@ def test_an_array_with_late_and_killed_tasks_makes_the_store_of_one_call(root, d
     assert open_store(root).place.entries("spool") == []
     begun = [mark.name.partition("-")[0] for mark in marks.iterdir()]
     assert {name for name in begun if begun.count(name) > 1} <= {"2", "3"}, "only logs of killed tasks are begun twice"
-    assert find_status(IngestOptions([drives], store=root, recipe=Recipe(), min_age_s=600.0)).counts == {"done": 7}
+    assert ask_status(root, drives).counts == {"done": 7}
 
 
 def test_a_task_lists_the_store_once_and_a_share_with_nothing_new_writes_nothing(tmp_path, drives, monkeypatch):
@@ -115,7 +112,7 @@ def claim_elsewhere(store, key, *, lease_s):
     theirs = Claims(open_store(store, create=True).place.below("spool/claims"))
     theirs._process = replace(identify_process(), host="node7")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(claims_module, "LEASE_S", lease_s)
+        patch.setattr(log_queue, "LEASE_S", lease_s)
         assert theirs.claim(key, "log", take_over=True, most=9) == "mine"
     return theirs
 
@@ -149,7 +146,7 @@ def test_a_store_without_runs_stays_while_another_task_is_at_it(tmp_path):
 
 
 def test_a_task_that_lives_renews_its_claims(tmp_path, monkeypatch):
-    monkeypatch.setattr(claims_module, "LEASE_S", 0.4)
+    monkeypatch.setattr(log_queue, "LEASE_S", 0.4)
     place = open_store(tmp_path, create=True).place
     with hold_claims(place) as mine:
         mine._process = replace(identify_process(), host="node7")
@@ -177,7 +174,7 @@ def test_the_first_idle_task_waits_for_claims_of_others_and_the_next_ends(tmp_pa
         patch.setattr(log_queue.LogQueue, "_wait", lambda _: False)
         assert list_waiting(1) == []
         assert list_waiting(2) == [("4.mcap", "another task of the array ingests it")]
-    monkeypatch.setattr(claims_module, "LEASE_S", 1.0)
+    monkeypatch.setattr(log_queue, "LEASE_S", 1.0)
     theirs[0].renew()
     assert list_waiting(1) == []
     assert read_runs(tmp_path / "store") == read_runs(drives.parent / "store")

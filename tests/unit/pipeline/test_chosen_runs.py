@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, commit_run, lanes, segments
+from synthetic_store import add_run, commit_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
@@ -16,22 +16,26 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Remedy, Subject, select_findings
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
-@pytest.fixture
-def store(tmp_path):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
     """Three runs: two in dry weather, one of them driven by Eva; one in wet weather."""
-    store = open_store(tmp_path / "store", create=True)
-    add_world(store, tmp_path / "rasters")
+    store = open_world(tmp_path_factory.mktemp("chosen"))
     tags = {"a": {"weather": "dry"}, "b": {"weather": "wet"}, "c": {"weather": "dry", "driver": "Eva"}}
     for number, (run_id, own) in enumerate(tags.items()):
         add_run(store, run_id, segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0)))
         store.tag_run(run_id, own)
         commit_run(store, run_id)
     return store
+
+
+@pytest.fixture
+def store(made, tmp_path):
+    return Store(shutil.copytree(made.root, tmp_path / "store", copy_function=shutil.copy2))
 
 
 def runs(store, tmp_path, **tags):

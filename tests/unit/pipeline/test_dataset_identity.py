@@ -5,11 +5,11 @@ import shutil
 import numpy as np
 import pytest
 from recipe_values import keys, with_value
-from synthetic_store import add_run, add_world, lanes, segments
+from stored_files import read_files
+from synthetic_store import add_run, lanes, open_world, segments
 
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
 
 OTHER = {
     "robot": "husky",
@@ -40,15 +40,10 @@ OTHER = {
 def places(tmp_path_factory):
     """A store with a map and a run, and the dataset of the default recipe."""
     directory = tmp_path_factory.mktemp("identity")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     add_run(store, "a", segments("a", *lanes(np.array([-3.0, 3.0]), -8.0, 8.0)))
     build_dataset(directory / "usual", store=store.root, recipe=Recipe())
     return directory, store
-
-
-def tree(directory):
-    return {path.relative_to(directory): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
 def test_every_key_of_a_dataset_is_tried():
@@ -57,12 +52,21 @@ def test_every_key_of_a_dataset_is_tried():
     }
 
 
-@pytest.mark.parametrize("key", OTHER)
+def test_another_value_of_any_key_is_another_dataset(places):
+    directory, store = places
+
+    def plan(recipe):
+        return build_dataset(directory / "usual", store=store.root, recipe=recipe, force=True, dry_run=True).status
+
+    assert plan(Recipe()) == "unchanged"
+    assert {key: plan(with_value(Recipe(), key, of)) for key, of in OTHER.items()} == dict.fromkeys(OTHER, "planned")
+
+
+@pytest.mark.parametrize("key", ["sample.patch_px", "split.holdout", "dataset.name"])
 def test_what_is_built_over_another_is_what_is_built_anew(places, tmp_path, key):
     directory, store = places
     recipe = with_value(Recipe(), key, OTHER[key])
     shutil.copytree(directory / "usual", tmp_path / "over")
     build_dataset(tmp_path / "over", store=store.root, recipe=recipe, force=True)
     build_dataset(tmp_path / "anew", store=store.root, recipe=recipe)
-    assert tree(tmp_path / "over") == tree(tmp_path / "anew")
-    assert tree(tmp_path / "over") != tree(directory / "usual")
+    assert read_files(tmp_path / "over") == read_files(tmp_path / "anew") != read_files(directory / "usual")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from object_gateway import in_environment
 from storage_server import object_store
-from synthetic_store import add_run, add_world, commit_run, lanes, segments, supersede
-from wheel_drives import START_NS, drive_at
+from synthetic_store import add_run, commit_run, lanes, open_world, segments, supersede
+from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.pipeline import report as reporting
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -19,7 +19,7 @@ from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store, open_store
+from tcpipe.store import Store
 from tcpipe.tables.findings import Subject, make_finding, select_findings
 
 LOST = {
@@ -39,8 +39,7 @@ LOST = {
 def made(tmp_path_factory):
     """A store with a map and three runs, one of them made twice and tagged since; its index is there."""
     here = tmp_path_factory.mktemp("incomplete")
-    store = open_store(here / "store", create=True)
-    add_world(store, here / "rasters")
+    store = open_world(here)
     for number, run_id in enumerate(("a", "b", "twice")):
         for more in (0.0, 1.0) if run_id == "twice" else (0.0,):
             add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 9.0 + more)))
@@ -100,7 +99,7 @@ def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, t
         result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
         assert result.exit_code == 3
         assert [of.subject.name for of in select_findings(result.findings, "run-damaged", "run-gone")] == [name]
-        found = find_status(IngestOptions([new], store=root, recipe=Recipe(), min_age_s=600.0))
+        found = ask_status(root, new)
         assert (found.exit_code, [of.code for of in found.problems]) == (3, ["run-incomplete"])
         assert verify(root).problems
         assert list(inspect(root, recipe=Recipe()).damaged_runs)
@@ -147,20 +146,27 @@ def test_what_prune_removes_is_not_missed_and_what_a_person_removes_is(place):
     assert [run_id for run_id, _ in store.ingestions().damaged] == ["a"]
 
 
+@pytest.fixture(scope="module")
+def ingested(tmp_path_factory):
+    """Two logs and the store that they were ingested into, one of them tagged."""
+    here = tmp_path_factory.mktemp("ingested")
+    drive_at(here / "logs" / "one.mcap")
+    drive_at(here / "logs" / "two.mcap", seed=1, start_ns=START_NS + 10**13)
+    ingest([here / "logs"], store=here / "store", recipe=Recipe())
+    ingest([here / "logs" / "one.mcap"], store=here / "store", recipe=Recipe(), tags={"load": "12"})
+    return here
+
+
 @pytest.mark.parametrize(
     "lost", ["runs/one-*/*/manifest-1.json", "runs/one-*", "runs/one-*/run-1.json", "runs/*/tags-1.json"]
 )
-def test_what_is_lost_is_made_again_from_the_log(tmp_path, lost):
-    logs, root = tmp_path / "logs", tmp_path / "store"
-    drive_at(logs / "one.mcap")
-    drive_at(logs / "two.mcap", seed=1, start_ns=START_NS + 10**13)
-    ingest([logs], store=root, recipe=Recipe())
-    ingest([logs / "one.mcap"], store=root, recipe=Recipe(), tags={"load": "12"})
+def test_what_is_lost_is_made_again_from_the_log(ingested, tmp_path, lost):
+    logs, root = ingested / "logs", shutil.copytree(ingested / "store", tmp_path / "store", copy_function=shutil.copy2)
     for part in root.glob(lost):
         shutil.rmtree(part) if part.is_dir() else part.unlink()
-    (finding,) = find_status(IngestOptions([], store=root, recipe=Recipe(), min_age_s=600.0)).problems
+    (finding,) = ask_status(root).problems
     assert finding.code == "run-incomplete"
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
-    found = find_status(IngestOptions([], store=root, recipe=Recipe(), min_age_s=600.0))
+    found = ask_status(root)
     assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
     assert verify(root).problems == ()

@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pyarrow.dataset as ds
+import pyarrow.parquet as pq
 import pytest
 from synthetic_store import add_run, commit_run, lanes, segments, supersede
 
 import tcpipe.store as stores
 from tcpipe.errors import StoreError
-from tcpipe.formats import index_files, stored_runs
+from tcpipe.formats import stored_runs
 from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.runs import choose_runs
@@ -133,32 +134,23 @@ def test_a_store_that_cannot_be_written_is_read_all_the_same(store, monkeypatch)
     assert len(choose_runs(store, Recipe(), robot=None, tags={}).runs) == 3
 
 
-def test_an_index_that_is_brought_up_to_date_is_the_one_that_is_written_at_once(store):
-    before, path = store.state(), store.root / "index" / "runs.parquet"
+def test_the_index_has_the_runs_of_its_state(store):
+    path = store.root / "index" / "runs.parquet"
     add_run(store, "d", segments("d", *lanes(np.array([9.0]), -10.0, 10.0)))
-    store.tag_run("a", {"weather": "wet"})
+    store.tag_run("a", {"weather": "wet", "crop": "rye"})
     commit_run(store, "a")
     supersede(store, "c", "b")
-    key = next(key for key in before.runs if key[0] == "b")
+    key = next(key for key in store.state().runs if key[0] == "b")
     open_log(store).commit("pruned", Entries(removed=(key,)))
-    store.write_index(store.state(), before=before)
-    updated = path.read_bytes()
-    assert pl.read_parquet(path)["run_id"].to_list() == ["a", "c", "d"]
     store.write_index(store.state())
-    assert path.read_bytes() == updated
-
-
-def test_only_rows_that_changed_are_made_anew(store, monkeypatch):
-    log, made = open_log(store), []
-    before, real = log.state, index_files._make_table
-    monkeypatch.setattr(index_files, "_make_table", lambda rows: (made.append(len(rows)), real(rows))[1])
-    row = next(iter(before.runs.values()))
-    log.commit("ingested", Entries(runs=(replace(row, tags={"weather": "wet"}),)))
-    store.write_index(log.state, before=before)
-    updated = (store.root / "index" / "runs.parquet").read_bytes()
-    store.write_index(log.state)
-    assert (store.root / "index" / "runs.parquet").read_bytes() == updated
-    assert made == [1, 3]
+    rows = pq.read_table(path).to_pylist(maps_as_pydicts="strict")
+    facts = store.state().runs
+    assert [(row["run_id"], row["recipe_id"]) for row in rows] == sorted(facts)
+    for row, known in zip(rows, (facts[key] for key in sorted(facts)), strict=True):
+        plain = {name: getattr(known, name) for name in ("robot", "segments", "driven_m", "start_ns", "superseded_by")}
+        assert row == row | plain | {"tags": dict(known.tags), "damage": [entry.code for entry in known.damage]}
+        assert row["log"]["source"]["sha256"] == known.log.source.sha256
+    assert rows[0]["tags"] == {"crop": "rye", "weather": "wet"}
 
 
 COUNTED = [("a", 20), ("b", 20)]

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 from click.testing import CliRunner
 from object_gateway import open_bucket
-from wheel_drives import START_NS, drive_at
+from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, UsageError
@@ -23,9 +23,7 @@ from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import status as status_module
 from tcpipe.pipeline.calls import commit_call, identify_process, list_begun_calls, open_log
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
@@ -73,10 +71,6 @@ def kill(logs, store, monkeypatch, **how):
         ingest([logs], store=store, **{"recipe": Recipe(), **how})
 
 
-def told(store, *logs, **how):
-    return find_status(IngestOptions(logs, store=store, **{"recipe": Recipe(), "min_age_s": 600.0, **how}))
-
-
 def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_it(tmp_path, logs):
     code = (
         "import os, signal, sys; from tcpipe.pipeline import ingest; from tcpipe.recipe import Recipe\n"
@@ -93,14 +87,14 @@ def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_i
     assert "was killed. To acknowledge it: 'tcpipe acknowledge call-1' [call-killed]" in lines
     assert json.loads(found.stdout)["counts"] == {"pending": 2}
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0
-    assert (told(tmp_path / "store").exit_code, told(tmp_path / "store").begun) == (0, ())
+    assert (ask_status(tmp_path / "store").exit_code, ask_status(tmp_path / "store").begun) == (0, ())
 
 
 def test_a_call_that_runs_is_no_problem_and_one_with_nothing_to_do_writes_nothing(root, logs):
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
     store = open_store(root)
     with commit_call(open_log(store), "ingest", [str(logs)]):
-        found = told(root)
+        found = ask_status(root)
         assert (found.exit_code, [call.state for call in found.begun]) == (0, ["running"])
         assert "running: ingest of 20" in str(found)
     before = store.place.entries()
@@ -112,30 +106,30 @@ def test_a_call_that_runs_is_no_problem_and_one_with_nothing_to_do_writes_nothin
 
 def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
-    assert told(root).exit_code == 3
+    assert ask_status(root).exit_code == 3
     ingest([logs / "one.mcap"], store=root, recipe=Recipe())
     ingest([logs], store=root, recipe=OTHER)
     assert len(list_begun_calls(open_store(root).state())) == 1, "other logs, another recipe: none is its work"
     ingest([logs], store=root, recipe=Recipe(), shard=(2, 2))
-    assert told(root).exit_code == 0, "a task of an array that leaves nothing undone has done all of it"
+    assert ask_status(root).exit_code == 0, "a task of an array that leaves nothing undone has done all of it"
     kill(logs, root, monkeypatch, shard=(2, 2), force=True)
-    assert told(root).exit_code == 3
+    assert ask_status(root).exit_code == 3
     assert ingest([logs.parent / "logs"], store=root, recipe=Recipe()).exit_code == 0
-    assert told(root).exit_code == 0
+    assert ask_status(root).exit_code == 0
     kill(logs / "two.mcap", root, monkeypatch, force=True)
     ingest([logs], store=root, recipe=Recipe())
-    assert told(root).exit_code == 0, "a folder is all the logs in it"
+    assert ask_status(root).exit_code == 0, "a folder is all the logs in it"
 
 
 def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
-    (call,) = told(root).begun
+    (call,) = ask_status(root).begun
     with pytest.raises(UsageError, match="nosuch: is no run or log with a known problem"):
         acknowledge(["nosuch"], store=root)
     assert [of.finding.code for of in acknowledge([call.name], store=root).acknowledged] == ["call-killed"]
-    assert (told(root).exit_code, told(root).begun) == (0, ())
+    assert (ask_status(root).exit_code, ask_status(root).begun) == (0, ())
     kill(logs, root, monkeypatch)
-    assert told(root).exit_code == 3
+    assert ask_status(root).exit_code == 3
 
 
 def test_an_error_ends_a_call_and_an_interrupt_leaves_it(tmp_path):
@@ -190,7 +184,7 @@ def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_pa
     def after(nights):
         later = SimpleNamespace(time_ns=lambda: now_ns() + nights * NIGHT_S * 10**9 + 10**9)
         monkeypatch.setattr(status_module, "time", later)
-        return told(store)
+        return ask_status(store)
 
     assert after(0).exit_code == 0, "a copy keeps its old modification time; it came today"
     assert after(1).exit_code == 0
@@ -205,7 +199,7 @@ def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_pa
     elsewhere = drive_at(tmp_path / "archive" / "old.mcap", seed=4)
     os.utime(elsewhere, ns=(10**18, 10**18))
     monkeypatch.setattr(status_module, "time", SimpleNamespace(time_ns=lambda: now_ns() + 9 * NIGHT_S * 10**9))
-    assert told(store, elsewhere.parent).exit_code == 0, "no ingest was asked for it"
+    assert ask_status(store, elsewhere.parent).exit_code == 0, "no ingest was asked for it"
     acknowledge([str(logs / "new.mcap"), str(logs / "future.mcap")], store=store)
     assert after(9).exit_code == 0
     os.utime(logs / "future.mcap")
@@ -224,7 +218,7 @@ def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path
         monkeypatch.setattr(type(store.place), verb, refused)
     with commit_call(open_log(store), "build-dataset", ["/out"]):
         assert list_begun_calls(store.state()) == []
-    assert told(tmp_path / "store").exit_code == 0
+    assert ask_status(tmp_path / "store").exit_code == 0
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0, "there is nothing new"
     drive_at(logs / "later.mcap", seed=7)
     with pytest.raises(StoreError, match="read-only; name another with --store"):

@@ -11,6 +11,7 @@ import rasterio
 from click.testing import CliRunner
 from map_worlds import World, write_tif
 from rasterio import Affine
+from stored_files import read_files
 
 from tcpipe.cli import cli
 from tcpipe.errors import MapError, StoreError, UsageError
@@ -34,25 +35,26 @@ def store(tmp_path):
     return tmp_path / "store"
 
 
-def add(store, name, **given):
-    return add_map(name, store=store, **given)
-
-
 def classes_file(tmp_path, text=CLASSES, name="c.csv"):
     (tmp_path / name).write_text(text)
     return tmp_path / name
 
 
-def contents(store):
-    return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(store.rglob("*")) if p.is_file()}
-
-
 def refused(store, name, error=MapError, **given):
-    before = contents(store)
+    before = read_files(store)
     with pytest.raises(error) as caught:
-        add(store, name, **given)
-    assert contents(store) == before
+        add_map(name, store=store, **given)
+    assert read_files(store) == before
     return caught.value.problems
+
+
+def other_height(directory):
+    corner = Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000)
+    return write_tif(directory / "h2.tif", np.ones((1, 60, 60), np.float32), WORLD.crs, corner)
+
+
+def map_of(store, name="m"):
+    return open_map(Store(store).map_files(name)[0])
 
 
 def picture_of(store):
@@ -60,62 +62,56 @@ def picture_of(store):
     return Path(opened.place.below("maps").where(opened.map_document("m").picture))
 
 
-def test_a_second_identical_call_does_nothing_and_says_so(site, store):
-    first = add(store, "m", **site)
+def test_a_second_identical_call_does_nothing_and_says_so_wherever_the_files_are(site, store, tmp_path):
+    first = add_map("m", store=store, **site)
     assert first.status == "done"
-    before = contents(store)
-    again = add(store, "m", **site)
+    before = read_files(store)
+    again = add_map("m", store=store, **site)
     assert again.status == "unchanged"
     assert "nothing to do" in str(again)
-    assert (again.map, contents(store)) == (first.map, before)
-
-
-def test_the_same_files_elsewhere_under_other_names_are_the_same_map(site, store, tmp_path):
-    add(store, "m", height=site["height"])
+    assert (again.map, read_files(store)) == (first.map, before)
     (tmp_path / "copy.tif").write_bytes(site["height"].read_bytes())
-    assert add(store, "m", height=tmp_path / "copy.tif").status == "unchanged"
+    assert add_map("m", store=store, **site | {"height": tmp_path / "copy.tif"}).status == "unchanged"
 
 
 def test_what_differs_is_named_and_needs_force(site, store, tmp_path):
-    add(store, "m", **site)
+    add_map("m", store=store, **site)
     line = refused(store, "m", height=site["height"], ortho=site["ortho"], crs="EPSG:32633")[0]
     assert "--terrain was given then, but is not now" in line
     assert "--crs is EPSG:32633, was not given" in line
     assert "--force" in line
-    other = write_tif(
-        tmp_path / "h2.tif", np.ones((1, 60, 60), np.float32), WORLD.crs, Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000)
-    )
+    other = other_height(tmp_path)
     assert "height has another content (h2.tif)" in refused(store, "m", **{**site, "height": other})[0]
-    assert add(store, "m", height=other, force=True).status == "done"
-    assert list(open_map(Store(store).map_files("m")[0]).layers) == ["height"]
+    assert add_map("m", store=store, height=other, force=True).status == "done"
+    assert list(map_of(store).layers) == ["height"]
 
 
 def test_what_lies_beside_a_raster_belongs_to_it(site, store, tmp_path):
     """A mask or an overview beside a raster changes what it says."""
     height = tmp_path / "h.tif"
     height.write_bytes(site["height"].read_bytes())
-    add(store, "m", height=height)
+    add_map("m", store=store, height=height)
     statistics = "<PAMDataset><PAMRasterBand band='1'><NoDataValue>612</NoDataValue></PAMRasterBand></PAMDataset>"
     (tmp_path / "h.tif.aux.xml").write_text(statistics)
     assert "height has another content (h.tif.aux.xml)" in refused(store, "m", height=height)[0]
 
 
 def test_the_first_map_with_classes_sets_the_stores_table(site, store, tmp_path):
-    add(store, "bare", height=site["height"])
+    add_map("bare", store=store, height=site["height"])
     table = classes_file(tmp_path)
-    add(store, "one", height=site["height"], terrain=site["terrain"], classes=table)
-    add(store, "two", height=site["height"], terrain=site["terrain"])  # takes the store's, with its values
-    one, two = (open_map(Store(store).map_files(name)[0]) for name in ("one", "two"))
+    add_map("one", store=store, height=site["height"], terrain=site["terrain"], classes=table)
+    add_map("two", store=store, height=site["height"], terrain=site["terrain"])  # takes the store's, with its values
+    one, two = map_of(store, "one"), map_of(store, "two")
     assert one.classes == two.classes
     assert [entry.name for entry in two.classes.classes] == ["meadow", "bog", "gravel"]
     np.testing.assert_array_equal(one.read("terrain", 0, 60, 0, 60), two.read("terrain", 0, 60, 0, 60))
     other_values = classes_file(tmp_path, CLASSES.replace("\n5,", "\n50,"), "v.csv")
-    add(store, "three", height=site["height"], terrain=site["terrain"], classes=other_values)
-    assert open_map(Store(store).map_files("three")[0]).classes == one.classes
+    add_map("three", store=store, height=site["height"], terrain=site["terrain"], classes=other_values)
+    assert map_of(store, "three").classes == one.classes
 
 
 def test_classes_that_are_not_the_stores_are_refused_one_line_a_difference(site, store, tmp_path):
-    add(store, "one", **site, classes=classes_file(tmp_path))
+    add_map("one", store=store, **site, classes=classes_file(tmp_path))
     wrong = classes_file(tmp_path, CLASSES.replace("2,bog,yes", "2,bog,no") + "9,9,water,no\n", "w.csv")
     problems = refused(store, "two", **site, classes=wrong)
     assert "not the one of the store's other maps" in problems[0]
@@ -126,23 +122,23 @@ def test_classes_that_are_not_the_stores_are_refused_one_line_a_difference(site,
 
 
 def test_the_only_map_may_be_replaced_with_other_classes(site, store, tmp_path):
-    add(store, "one", **site)
-    add(store, "one", **site, classes=classes_file(tmp_path), force=True)
-    assert open_map(Store(store).map_files("one")[0]).classes.count == 3
+    add_map("one", store=store, **site)
+    add_map("one", store=store, **site, classes=classes_file(tmp_path), force=True)
+    assert map_of(store, "one").classes.count == 3
 
 
 def test_a_map_that_cannot_be_read_is_replaced_by_force_and_asked_for_nothing(site, store, caplog):
-    add(store, "old", **site)
+    add_map("old", store=store, **site)
     (Store(store).map_files("old")[0] / "zarr.json").write_text("{}")
     assert "--force" in refused(store, "old", **site)[-1]
-    add(store, "new", **site)
+    add_map("new", store=store, **site)
     assert "old cannot be read" in caplog.text
-    assert add(store, "old", **site, force=True).status == "done"
+    assert add_map("old", store=store, **site, force=True).status == "done"
 
 
 def test_a_disk_that_takes_no_more_leaves_the_store_as_it_was(site, store):
     """A limit on the size of files stands for a full disk: the write itself fails."""
-    add(store, "m", height=site["height"])
+    add_map("m", store=store, height=site["height"])
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
@@ -179,9 +175,9 @@ def test_the_command_prints_a_few_plain_lines(site, store):
 
 
 def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, store):
-    add(store, "m", **site)
+    add_map("m", store=store, **site)
     picture = matplotlib.image.imread(picture_of(store))[..., :3]
-    source = open_map(Store(store).map_files("m")[0])
+    source = map_of(store)
     grey, ids = (source.read(layer, 0, 60, 0, 60) for layer in ("ortho", "terrain"))
     assert picture.shape == (60, 60, 3)
     for class_id in np.unique(ids):  # within a class, the picture follows the grey
@@ -191,7 +187,7 @@ def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, 
     before = picture_of(store).read_bytes()
     picture_of(store).unlink()
     assert [line.rpartition(": ")[2] for line in verify(store).problems] == ["is missing"]
-    assert add(store, "m", **site, force=True).status == "done"
+    assert add_map("m", store=store, **site, force=True).status == "done"
     assert picture_of(store).read_bytes() == before
     assert verify(store).problems == ()
     assert Store(store).map_number("m") == 1, "what is as it was is no new generation"
@@ -203,7 +199,7 @@ def test_a_quick_look_without_photo_is_a_relief_lit_from_the_north_west_and_smal
     height[0, :200] = np.nan
     height[0, 1000:] = np.arange(900) * 0.2
     path = write_tif(tmp_path / "h.tif", height, WORLD.crs, Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000))
-    add(store, "m", height=path)
+    add_map("m", store=store, height=path)
     picture = matplotlib.image.imread(picture_of(store))[..., 0]
     assert picture.shape == (500, 225)
     assert (picture[:49] == 1.0).all()
@@ -211,24 +207,18 @@ def test_a_quick_look_without_photo_is_a_relief_lit_from_the_north_west_and_smal
     assert picture[400, 50] == pytest.approx((0.5 + np.sqrt(0.5)) / np.sqrt(2.0), abs=0.005)
 
 
-def other_height(directory):
-    return write_tif(
-        directory / "h2.tif", np.ones((1, 60, 60), np.float32), WORLD.crs, Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000)
-    )
-
-
 def test_map_and_picture_are_replaced_together(site, store, tmp_path, monkeypatch):
     """Killed between map and picture: the old ones are there, whole."""
-    add(store, "m", **site)
+    add_map("m", store=store, **site)
     old, other = picture_of(store).read_bytes(), other_height(tmp_path)
     with monkeypatch.context() as killed:
         killed.setattr(maps, "write_overview", lambda *_: pytest.fail("killed"))
         with pytest.raises(pytest.fail.Exception):
-            add(store, "m", height=other, force=True)
-    assert len(open_map(Store(store).map_files("m")[0]).layers) == 3
+            add_map("m", store=store, height=other, force=True)
+    assert len(map_of(store).layers) == 3
     assert picture_of(store).read_bytes() == old
     assert verify(store).problems == ()
-    add(store, "m", height=other, force=True)
+    add_map("m", store=store, height=other, force=True)
     assert (Store(store).map_number("m"), picture_of(store).read_bytes() == old) == (2, False)
     assert verify(store).problems == ()
 
@@ -237,19 +227,19 @@ def test_map_and_picture_are_replaced_together(site, store, tmp_path, monkeypatc
 def test_a_map_that_another_process_adds_meanwhile_stays(site, store, tmp_path, monkeypatch, force):
     """The other one begins later and is done sooner."""
     if force:
-        add(store, "m", height=site["height"])
+        add_map("m", store=store, height=site["height"])
     build, other = maps.build_map, other_height(tmp_path)
 
     def slow(*args, **options):
         monkeypatch.setattr(maps, "build_map", build)
-        add(store, "m", height=other, force=force)
+        add_map("m", store=store, height=other, force=force)
         build(*args, **options)
 
     monkeypatch.setattr(maps, "build_map", slow)
     wanted = "another process has written it meanwhile" if force else r"made from something else.*--force"
     with pytest.raises(StoreError if force else MapError, match=wanted):
-        add(store, "m", **site, force=force)
-    assert open_map(Store(store).map_files("m")[0]).facts.sources == {"height": "h2.tif"}
+        add_map("m", store=store, **site, force=force)
+    assert map_of(store).facts.sources == {"height": "h2.tif"}
     assert verify(store).problems == ()
 
 
@@ -258,11 +248,11 @@ def test_the_same_map_added_twice_at_one_time_is_there_once(site, store, monkeyp
 
     def slow(*args, **options):
         monkeypatch.setattr(maps, "build_map", build)
-        assert add(store, "m", **site).status == "done"
+        assert add_map("m", store=store, **site).status == "done"
         build(*args, **options)
 
     monkeypatch.setattr(maps, "build_map", slow)
-    assert add(store, "m", **site).status == "unchanged"
+    assert add_map("m", store=store, **site).status == "unchanged"
 
 
 def halves(site, directory):
@@ -277,26 +267,23 @@ def halves(site, directory):
 
 def test_tiles_come_as_patterns_and_each_is_known_by_its_content(site, store, tmp_path):
     halves(site, tmp_path)
-    added = add(store, "m", height=str(tmp_path / "*/dem.tif"))
-    add(store, "whole", height=site["height"])
-    tiled, whole = (open_map(Store(store).map_files(name)[0]) for name in ("m", "whole"))
+    added = add_map("m", store=store, height=str(tmp_path / "*/dem.tif"))
+    add_map("whole", store=store, height=site["height"])
+    tiled, whole = map_of(store), map_of(store, "whole")
     np.testing.assert_array_equal(tiled.read("height", 0, 60, 0, 60), whole.read("height", 0, 60, 0, 60))
     files = [tmp_path / "east/dem.tif", tmp_path / "west/dem.tif"]
     hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
     assert tiled.facts.inputs.files["height"] == dict(zip(("east/dem.tif", "west/dem.tif"), hashes, strict=True))
     assert "from dem.tif … dem.tif (2 files): 6" in str(added)
-    assert add(store, "m", height=files).status == "unchanged"
+    assert add_map("m", store=store, height=files).status == "unchanged"
     assert "the files of height come in another order" in refused(store, "m", height=files[::-1])[0]
     assert "height has another content" in refused(store, "m", height=files[0])[0]
 
 
 def test_a_tile_that_a_pattern_names_once_more_lies_where_it_is_named_last(site, store, tmp_path):
     halves(site, tmp_path)
-    add(store, "m", height=[str(tmp_path / "*/dem.tif"), tmp_path / "east/dem.tif"])
-    assert list(open_map(Store(store).map_files("m")[0]).facts.inputs.files["height"]) == [
-        "west/dem.tif",
-        "east/dem.tif",
-    ]
+    add_map("m", store=store, height=[str(tmp_path / "*/dem.tif"), tmp_path / "east/dem.tif"])
+    assert list(map_of(store).facts.inputs.files["height"]) == ["west/dem.tif", "east/dem.tif"]
 
 
 def test_what_names_no_file_is_said(site, store, tmp_path):

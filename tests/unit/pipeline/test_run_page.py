@@ -30,13 +30,14 @@ def store(tmp_path_factory):
     return store
 
 
+@pytest.fixture(scope="module")
 def page(store):
     (run,) = store.runs()
     return run, run_report(store, run)
 
 
-def test_a_map_that_cannot_be_read_is_named_and_the_next_one_drawn(store):
-    _, html = page(store)
+def test_a_map_that_cannot_be_read_is_named_and_the_next_one_drawn(page):
+    _, html = page
     assert "Map damaged cannot be shown:" in html
     assert data_of(html)["ground"] == ["hillshade"]
 
@@ -54,14 +55,15 @@ def test_without_any_readable_map_the_path_stands_alone(store, tmp_path, damage)
     alone = tmp_path / "store"
     shutil.copytree(store.root, alone)
     damage(Store(alone).map_files("site")[0])
-    _, html = page(Store(alone))
+    (run,) = Store(alone).runs()
+    html = run_report(Store(alone), run)
     assert data_of(html)["ground"] == []
     assert "east [m]" in html
     assert html.count("cannot be shown") == 2
 
 
-def test_every_sensor_and_every_gate_stands_in_the_page_as_it_lies_in_the_store(store):
-    run, html = page(store)
+def test_every_sensor_and_every_gate_stands_in_the_page_as_it_lies_in_the_store(store, page):
+    run, html = page
     told, track = data_of(html), run.track().table
     assert len(html) < 5_000_000
     at_s = (track.column("stamp_ns").to_numpy() - track.column("stamp_ns")[0].as_py()) * 1e-9
@@ -105,8 +107,8 @@ def test_where_streams_are_gone_the_track_is_drawn_and_the_page_says_so(store, t
     assert "The measurements cannot be drawn" in html
 
 
-def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
-    run, html = page(store)
+def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(page):
+    run, html = page
     facts = run.manifest.info.report.facts
     trust = html.split("<h3>Rejected measurements by sensor</h3>")[1].split("<h3>")[0]
     for role, nis in facts.fuse.nis_mean.items():
@@ -120,8 +122,8 @@ def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     assert "Kept and excluded distances add up to the odometer" in html
 
 
-def test_the_noise_of_every_fused_sensor_is_in_the_facts_and_on_the_page(store):
-    run, html = page(store)
+def test_the_noise_of_every_fused_sensor_is_in_the_facts_and_on_the_page(page):
+    run, html = page
     noise = run.manifest.info.report.facts.fuse.stretches[0].noise
     assert {"gnss", "gnss height", "wheel_odometry", "visual_odometry", "imu turn"} <= set(noise)
     assert all(0.0 <= share <= 1.0 for each in noise.values() for share in each.data_share)
@@ -129,8 +131,8 @@ def test_the_noise_of_every_fused_sensor_is_in_the_facts_and_on_the_page(store):
     assert all(name.replace("_", " ") in section for name in noise)
 
 
-def test_every_topic_stands_on_the_page_and_may_break(store):
-    run, html = page(store)
+def test_every_topic_stands_on_the_page_and_may_break(page):
+    run, html = page
     source = json.loads(run_document(run).read_text())
     with open_log(source["source"]["paths"][0]) as log:
         names = set(log.topics)

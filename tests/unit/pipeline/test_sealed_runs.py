@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from stored_files import manifest, run_document, table
-from synthetic_store import add_run, add_world, box, commit_run, lanes, region_file, segments, supersede
+from synthetic_store import add_run, box, commit_run, lanes, open_world, region_file, segments, supersede
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
@@ -17,7 +17,7 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
-from tcpipe.store import Store, open_store
+from tcpipe.store import Store
 from tcpipe.tables.findings import is_problem
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
@@ -26,8 +26,7 @@ from tcpipe.tables.levels import STREAMS, Sensor, Streams
 def made(tmp_path_factory):
     """Four runs beside each other."""
     directory = tmp_path_factory.mktemp("made")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory / "rasters")
+    store = open_world(directory)
     for number, run_id in enumerate("abcd"):
         add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 10.0), start_ns=number * 10**15))
     return store

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
-from wheel_drives import START_NS, drive_at
+from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe import __version__
 from tcpipe.cli import cli
@@ -17,9 +17,7 @@ from tcpipe.pipeline import calls
 from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store
 
@@ -30,7 +28,7 @@ OLD_NS = 10**18
 def first_night(tmp_path_factory):
     """A folder of four logs, long written, and the store of its first night."""
     root = tmp_path_factory.mktemp("status")
-    whole = drive_at(root / "logs" / "whole.mcap")
+    drive_at(root / "logs" / "whole.mcap")
     drive_at(root / "logs" / "second.mcap", seed=1, start_ns=START_NS + 10**13)
     (root / "logs" / "cut.mcap").write_bytes(
         drive_at(root / "third.mcap", seed=2, start_ns=START_NS + 10**14).read_bytes()[:-4000]
@@ -39,7 +37,6 @@ def first_night(tmp_path_factory):
     for path in (root / "logs").iterdir():
         os.utime(path, ns=(OLD_NS, OLD_NS))
     assert ingest([root / "logs"], store=root / "store", recipe=Recipe()).exit_code == 3
-    assert whole.exists()
     return root
 
 
@@ -50,9 +47,7 @@ def night(first_night, tmp_path):
 
 
 def where(root, *logs, **how):
-    return find_status(
-        IngestOptions(logs or [root / "logs"], store=root / "store", **{"recipe": Recipe(), "min_age_s": 600.0, **how})
-    )
+    return ask_status(root / "store", *(logs or [root / "logs"]), **how)
 
 
 def states(found):
@@ -99,32 +94,25 @@ def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
 
 
 def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
-    assert (
-        find_status(IngestOptions([], store=first_night / "store", recipe=Recipe(), min_age_s=600.0)).counts
-        == where(first_night).counts
-    )
+    assert ask_status(first_night / "store").counts == where(first_night).counts
     with pytest.raises(UsageError, match="no earlier call of ingest is known; give the logs"):
-        find_status(IngestOptions([], store=tmp_path, recipe=Recipe(), min_age_s=600.0))
+        ask_status(tmp_path)
 
 
 def test_a_log_that_is_gone_is_trouble_only_where_the_latest_call_was_given_it(first_night, tmp_path):
     stick = drive_at(tmp_path / "stick" / "one.mcap", seed=3)
     ingest([stick], store=tmp_path / "store", recipe=Recipe())
     stick.unlink()
-    found = find_status(IngestOptions([], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0))
+    found = ask_status(tmp_path / "store")
     assert (found.exit_code, [of.code for of in found.problems], found.gone) == (3, ["log-missing"], ())
     shutil.copytree(first_night / "logs", tmp_path / "logs", ignore=lambda *_: {"cut.mcap", "junk.bag"})
     ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
-    found = find_status(IngestOptions([], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0))
+    found = ask_status(tmp_path / "store")
     assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
     assert f"of earlier calls: {stick}: there is no such file or directory" in str(found)
-    assert (
-        find_status(IngestOptions([stick], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0)).exit_code == 3
-    )
+    assert ask_status(tmp_path / "store", stick).exit_code == 3
     acknowledge([str(stick)], store=tmp_path / "store")
-    assert (
-        find_status(IngestOptions([stick], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0)).exit_code == 0
-    )
+    assert ask_status(tmp_path / "store", stick).exit_code == 0
 
 
 def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
@@ -220,9 +208,7 @@ def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_n
     shutil.copytree(first_night / "store", tmp_path / "store", copy_function=shutil.copy2)
     (gone,) = (tmp_path / "store" / "runs").glob("whole-*/run-1.json")
     gone.unlink()
-    found = find_status(
-        IngestOptions([first_night / "logs"], store=tmp_path / "store", recipe=Recipe(), min_age_s=600.0)
-    )
+    found = ask_status(tmp_path / "store", first_night / "logs")
     (group,) = [group for group in found.groups if group.state == "pending"]
     assert (group.cause, group.logs) == (
         "files of its run are missing",
@@ -238,12 +224,9 @@ def test_a_store_that_is_not_there_is_named_as_it_was_given(tmp_path, monkeypatc
     assert str(told.exception) == "nosuch: no store here and none at tcpipe-store; name one with --store"
 
 
-def test_a_dry_run_of_what_is_forced_says_that_it_is_done_again(first_night):
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_path):
     causes = {group.cause for group in where(first_night, force=True).groups}
     assert "to be ingested again if present" in causes
-
-
-def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_path):
     told = CliRunner().invoke(
         cli, ["ingest", str(first_night / "logs"), "--store", str(tmp_path / "none"), "--dry-run"]
     )

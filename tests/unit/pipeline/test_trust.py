@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from made_tracks import with_columns
 from map_worlds import World
 from stored_files import manifest, run_document, table
 from synthetic_store import WORLD, add_run, box, commit_run, lanes, put_map, region_file, segments, small_store
@@ -238,8 +239,7 @@ def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path
     start, end = lanes(1.0 + 2.0 * np.arange(8), -14.0, 14.0)
     table = segments("north", start, end, start_ns=int(1e18 + 1e12))
     power = table.column("power_watt").to_numpy() + 1.0
-    moved = table.set_column(table.column_names.index("power_watt"), table.schema.field("power_watt"), [power])
-    add_run(store, "north", moved)
+    add_run(store, "north", with_columns(table, power_watt=power))
     sample = next(
         row for row in open_dataset(made / "zarr")["train"].samples["sample_id"].to_pylist() if "north" in row
     )
@@ -251,22 +251,13 @@ def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path
 def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
     store = Store(copy("store"))
     sample = open_dataset(made / "zarr")["train"].samples["sample_id"][0].as_py()
-    put_map(
-        store,
-        "site",
-        height=made / "rasters" / "height.tif",
-        inputs=MapInputs({"height": {"height.tif": "another"}}),
-    )
+    height = WORLD.write(tmp_path, pixel_size_m=0.2)["height"]
+    put_map(store, "site", height=height, inputs=MapInputs({"height": {"height.tif": "another"}}))
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
     assert "terrain: map site no longer has this layer" in found
     assert found[-1] == "map site was added again later, from other files"
     elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pixel_size_m=0.2)
-    put_map(
-        store,
-        "site",
-        height=elsewhere["height"],
-        inputs=MapInputs({"height": {"height.tif": "another"}}),
-    )
+    put_map(store, "site", height=elsewhere["height"], inputs=MapInputs({"height": {"height.tif": "another"}}))
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
     assert found[0] == "map site no longer gives a patch for it"
 
@@ -385,9 +376,9 @@ def test_samples_are_matched_by_run_and_time(counts):
 def test_the_changes_of_labels_are_those_of_the_samples_in_both(made, copy):
     other = copy("zarr")
     table = pq.read_table(other / "samples.parquet")
-    at, energy = table.schema.get_field_index("energy_joule"), table.column("energy_joule").to_numpy().copy()
+    energy = table.column("energy_joule").to_numpy().copy()
     energy[:3] += (1.0, -4.0, 2.0)
-    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(energy)), other / "samples.parquet")
+    pq.write_table(with_columns(table, energy_joule=energy), other / "samples.parquet")
     card = json.loads((other / "dataset.json").read_text())
     card["checksums"]["samples.parquet"] = to_plain(compute_checksum(other / "samples.parquet"))
     write_sealed(other / "dataset.json", card)

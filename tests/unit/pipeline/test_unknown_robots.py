@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, commit_run, lanes, segments
+from synthetic_store import add_run, commit_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.runs import group_similar_runs
-from tcpipe.store import open_store
 from tcpipe.tables.levels import Sensor
 
 
@@ -41,8 +40,7 @@ def test_what_is_one_robot(other, groups):
 
 @pytest.fixture
 def store(tmp_path):
-    store = open_store(tmp_path / "store", create=True)
-    add_world(store, tmp_path / "rasters")
+    store = open_world(tmp_path)
     sensors = {"a": ROVER, "b": {"imu": sensor("/imu/data", frame="base_imu")}, "c": ROVER}
     for number, (run_id, of) in enumerate(sensors.items()):
         table = segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0), robot="generic")

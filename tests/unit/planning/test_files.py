@@ -18,7 +18,7 @@ from tcpipe.planning.cost_map import make_cost_map
 from tcpipe.planning.path_files import make_summary_path, plan, predict_path
 from tcpipe.planning.path_options import PlanPathOptions
 
-MODEL = PhysicsModel()
+MODEL = PhysicsModel(patch_px=8)
 
 
 @dataclass(frozen=True)

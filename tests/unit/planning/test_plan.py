@@ -15,7 +15,7 @@ from tcpipe.planning.plan import OBJECTIVES, plan_paths
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import ClassTable, TerrainClass
 
-MODEL = PhysicsModel()
+MODEL = PhysicsModel(patch_px=8)
 
 
 def _plan(source, start, goal, objective, *, model=MODEL, survey=None, **options):

@@ -12,7 +12,7 @@ import pytest
 import zarr
 from page_reading import data_of, unpacked
 from PIL import Image
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -22,7 +22,6 @@ from tcpipe.report import dataset_report
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, find_nearest_train_m, render_dataset_report, select_samples
 from tcpipe.report.label_sections import QUALITY_WORDS
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 
 DRAWS_DATASET_PAGES = True
@@ -31,8 +30,7 @@ DRAWS_DATASET_PAGES = True
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     here = tmp_path_factory.mktemp("page")
-    store = open_store(here / "store", create=True)
-    add_world(store, here)
+    store = open_world(here)
     for number, run in enumerate(("north", "south")):
         start, end = lanes((4.0 * number, 4.0 * number + 1.5), -12.0, 12.0)
         add_run(store, run, segments(run, start, end, start_ns=int((number + 1) * 1e18)))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from page_reading import data_of
-from synthetic_store import add_run, add_world, lanes, segments, supersede
+from synthetic_store import add_run, lanes, open_world, segments, supersede
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.commits import CallRecord, Entries, Failure
@@ -39,8 +39,7 @@ def driven_below_limit(slow_fraction):
 def store(tmp_path_factory):
     """Runs a and b in a dataset, b with an older ingestion too, c of a damaged log and in none, d superseded by a; two logs failed."""
     here = tmp_path_factory.mktemp("store page")
-    store = open_store(here / "store", create=True)
-    add_world(store, here)
+    store = open_world(here)
     add(store, "b", 1, recipe=OLD)
     for number, run_id in enumerate(("a", "b", "d")):
         found = [driven_below_limit(0.6 + 0.1 * number)] if number < 2 else []

@@ -1,6 +1,7 @@
 """The clock doctor on simulated drives with every fault on: offsets found as they were put in, none where there are none."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,11 +20,18 @@ WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odomet
 FAULTS = {role: f"{role.split('_')[0]}_clock_offset" for role in LATE_S}
 
 
-def drive_log(tmp_path, index, seed, *late):
-    demo = find_scenario("demo")
-    drive = demo.drives[index]
-    faults = replace(drive.faults, **{FAULTS[role]: True for role in late})
-    return log_of(demo, replace(drive, faults=faults), tmp_path, seed=seed)
+@pytest.fixture(scope="module")
+def drive_log(tmp_path_factory):
+    """Return the log of a drive of the demo in which some sensors are late."""
+
+    @cache
+    def make(index, seed, *late):
+        demo = find_scenario("demo")
+        drive = demo.drives[index]
+        faults = replace(drive.faults, **{FAULTS[role]: True for role in late})
+        return log_of(demo, replace(drive, faults=faults), tmp_path_factory.mktemp("drive"), seed=seed)
+
+    return make
 
 
 def doctor(log, config=None):
@@ -31,35 +39,34 @@ def doctor(log, config=None):
     return correct_clocks(streams, prepare_inputs(streams, FuseConfig()))[1]
 
 
-@pytest.mark.parametrize("seed", [31, 33])
 @pytest.mark.parametrize("index", [0, 1])
-def test_clean_drives_give_no_warning(tmp_path, index, seed):
-    found = doctor(drive_log(tmp_path, index, seed))
+def test_clean_drives_give_no_warning(drive_log, index):
+    found = doctor(drive_log(index, 31))
     assert found.findings == ()
     assert {"imu", "wheel_odometry", "visual_odometry"} <= {found.facts.reference, *found.facts.offsets}
 
 
-@pytest.mark.parametrize(("role", "index"), [(role, k % 2) for k, role in enumerate(LATE_S)])
-def test_the_sensor_that_is_late_is_found_and_by_how_much(tmp_path, role, index):
-    found = doctor(drive_log(tmp_path, index, 41, role))
+@pytest.mark.parametrize("late", [("wheel_odometry",), ("imu",), ("visual_odometry",), ("gnss", "power")])
+def test_the_sensor_that_is_late_is_found_and_by_how_much(drive_log, late):
+    found = doctor(drive_log(1, 42, *late))
     noted = {name: offset for name, offset in found.facts.offsets.items() if offset.noted}
-    assert set(noted) == {role}
-    assert noted[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
-    (finding,) = found.findings
-    assert (finding.code, finding.subject) == ("time-offset", Subject("role", role))
-    assert finding.action == ("kept" if role == "power" else "corrected")
-    assert finding.numbers["offset_s"] == noted[role].offset_s
-    assert proposed(finding)["read"]["time_offset_s"] == {
-        role: pytest.approx(-LATE_S[role], abs=WITHIN_S[role] + 0.005)
+    assert set(noted) == set(late)
+    assert {finding.subject: finding.code for finding in found.findings} == {
+        Subject("role", role): "time-offset" for role in late
     }
+    for finding in found.findings:
+        role = finding.subject.name
+        assert noted[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
+        assert finding.action == ("kept" if role == "power" else "corrected")
+        assert finding.numbers["offset_s"] == noted[role].offset_s
+        said = proposed(finding)["read"]["time_offset_s"]
+        assert said == {role: pytest.approx(-LATE_S[role], abs=WITHIN_S[role] + 0.005)}
 
 
-def test_the_remedy_corrects_it(tmp_path):
-    log = drive_log(tmp_path, 1, 42, "gnss", "power")
-    before = doctor(log)
-    assert {finding.subject.name for finding in before.findings} == {"gnss", "power"}
+def test_the_remedy_corrects_it(drive_log):
+    log = drive_log(1, 42, "gnss", "power")
     offsets_s: dict[str, float] = {}
-    for finding in before.findings:
+    for finding in doctor(log).findings:
         offsets_s |= proposed(finding)["read"]["time_offset_s"]
     assert doctor(log, ReadConfig(time_offset_s=offsets_s)).findings == ()
     # What a partly corrected log proposes holds for the log as it is: the offset in the recipe is counted in.
@@ -67,8 +74,8 @@ def test_the_remedy_corrects_it(tmp_path):
     assert proposed(again)["read"]["time_offset_s"]["gnss"] == pytest.approx(offsets_s["gnss"], abs=0.011)
 
 
-def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(tmp_path):
-    streams = streams_of(drive_log(tmp_path, 0, 41, "wheel_odometry"))
+def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(drive_log):
+    streams = streams_of(drive_log(1, 42, "wheel_odometry"))
     before = prepare_inputs(streams, FuseConfig())
     after, _ = correct_clocks(streams, before)
     moved_s = (after.measurements[0].wheels.stamp_ns - before.measurements[0].wheels.stamp_ns) * 1e-9

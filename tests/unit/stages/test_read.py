@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyproj
 import pytest
+from made_tracks import with_columns
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import RecipeError, RoleError
@@ -345,7 +346,7 @@ def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
 
 def test_a_log_whose_only_motion_is_unusable_fails_and_says_why() -> None:
     kind, table = fix()
-    lost = table.set_column(table.column_names.index("status.status"), "status.status", pa.array([-1] * 50, pa.int8()))
+    lost = with_columns(table, **{"status.status": [-1] * 50})
     with pytest.raises(RoleError) as error:
         read({"/fix": (kind, lost), "/imu/data": imu()})
     assert error.value.problems[0].startswith("no motion in the log")
@@ -402,9 +403,7 @@ def with_step(table: pa.Table) -> pa.Table:
         return table
     seconds = table["header.stamp.sec"].to_numpy().copy()
     seconds[seconds >= START // S + 5] += 7
-    return table.set_column(
-        table.column_names.index("header.stamp.sec"), "header.stamp.sec", pa.array(seconds, pa.int32())
-    )
+    return with_columns(table, **{"header.stamp.sec": seconds})
 
 
 def test_a_step_of_all_clocks_divides_every_table() -> None:

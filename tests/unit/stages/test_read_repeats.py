@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made_tracks import power_streams, stamps
+from made_tracks import power_streams, stamps, with_columns
 
 from tcpipe.power.noise import compute_median_period_s, estimate_energy_noise
 from tcpipe.power.rails import integrate_energy
@@ -89,9 +89,7 @@ def test_clock_epochs_are_told_together_and_kept_apart():
     table = power_streams({"battery": (STAMP_NS, drawn(1) + 20, held(drawn(2), 20))}).tables["power"]
     clock_epoch = (np.arange(COUNT) >= COUNT - 300).astype(np.int16)  # 15 readings are too few to tell by themselves
     back_ns = np.where(clock_epoch, STAMP_NS - 30_000_000_000, STAMP_NS)
-    for name, values in (("clock_epoch", clock_epoch), ("stamp_ns", back_ns)):
-        table = table.set_column(table.column_names.index(name), table.schema.field(name), [values])
-    streams, _ = remove_repeats({"power": table})
+    streams, _ = remove_repeats({"power": with_columns(table, clock_epoch=clock_epoch, stamp_ns=back_ns)})
     assert [rates_hz(make_rails(Streams(streams, {}, "husky"), number))[0] for number in (0, 1)] == [1.0, 1.0]
 
 

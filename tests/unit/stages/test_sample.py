@@ -3,6 +3,7 @@
 import numpy as np
 import pyproj
 import pytest
+from made_tracks import with_columns
 from map_worlds import ArrayMap, random_map, segment_table, segments_from
 
 from tcpipe.errors import TableError
@@ -31,25 +32,15 @@ def test_every_loss_has_its_reason_and_its_metres():
     starts = [(500_001.0, 5_199_995.0), (500_012.5, 5_199_995.0), (499_000.0, 5_199_995.0), (500_001.0, 5_199_987.0)]
     starts += [(500_005.2, 5_199_995.0), (500_001.0, 5_199_992.0)]
     segments = drive(starts)
-    uncertain = np.full(6, 0.02)
-    uncertain[5] = 0.2
-    segments = segments.set_column(
-        segments.column_names.index("position_std_m"),
-        segments.schema.field("position_std_m"),
-        [uncertain],
-    )
+    segments = with_columns(segments, position_std_m=[*[0.02] * 5, 0.2])
     got = sample(segments, source)
     wanted = [0, Loss.OUTSIDE_MAP, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE, Loss.POSITION_UNCERTAIN]
     assert got.lost_by.tolist() == wanted
     assert got.kept.tolist() == [0]
     assert got.patches.pixels["height"].shape == (1, 40, 40)
     assert got.footprint_lonlat_deg.shape == (1, 4, 2)
-    metres = {
-        Loss.OUTSIDE_MAP: 2.008,
-        Loss.NODATA: 1.004,
-        Loss.NOT_TRAVERSABLE: 1.004,
-        Loss.POSITION_UNCERTAIN: 1.004,
-    }
+    metres = dict.fromkeys((Loss.NODATA, Loss.NOT_TRAVERSABLE, Loss.POSITION_UNCERTAIN), 1.004)
+    metres |= {Loss.OUTSIDE_MAP: 2.008}
     assert sum_losses(segments.column("arc_length_m").to_numpy(), got.lost_by) == pytest.approx(metres)
 
 

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tcpipe.tables.arrays import (
-    make_column,
     make_lines,
     make_points,
     make_text_column,
@@ -78,27 +77,6 @@ to_numbers(table["x"]), to_texts(table["y"]), select_rows(table, "y", "b")
 assert "pandas" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
-
-
-NESTED = pa.struct({
-    "text": pa.string(), "whole": pa.int64(), "real": pa.float64(), "true": pa.bool_(), "names": pa.list_(pa.string()),
-    "pairs": pa.list_(pa.list_(pa.int64())), "of": pa.map_(pa.string(), pa.struct({"topic": pa.string()})),
-})  # fmt: skip
-VALUES = st.none() | st.fixed_dictionaries({
-    "text": st.none() | st.text(st.characters(exclude_categories=["Cs"])), "whole": st.none() | st.integers(-(2**63), 2**63 - 1),
-    "real": st.none() | st.floats(allow_nan=False), "true": st.none() | st.booleans(),
-    "names": st.none() | st.lists(st.none() | st.just("a")),
-    "pairs": st.none() | st.lists(st.lists(st.integers(0, 9))),
-    "of": st.none() | st.dictionaries(st.sampled_from("xyz"), st.none() | st.just({"topic": "t"})),
-})  # fmt: skip
-
-
-@given(st.lists(VALUES, max_size=9))
-def test_nested_values_are_as_arrow_makes_them(values):
-    made = make_column(values, NESTED)
-    made.validate(full=True)
-    pairs = [value and value | {"of": value["of"] and sorted(value["of"].items())} for value in values]
-    assert made.equals(pa.array(pairs, NESTED))
 
 
 NAN = float("nan")

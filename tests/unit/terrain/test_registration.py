@@ -57,9 +57,9 @@ def test_a_shift_is_found_to_a_few_centimetres_whatever_the_datum(shift_m):
 
 
 def test_the_stated_deviation_is_about_the_real_one():
-    """Sixteen drives with errors alike over metres: the shift's errors over their stated deviations are near one."""
+    """Eight drives with errors alike over metres: the shift's errors over their stated deviations are near one."""
     source, xy, scaled = site(), drive(), []
-    for seed in range(16):
+    for seed in range(8):
         height = 600.0 + rolling(*xy.T) + drift(len(xy), 0.05, 200, seed)
         found = register_track(source, np.add(xy, (0.4, 0.3)), height)
         scaled.append(np.hypot(found.shift_xy_m[0] + 0.4, found.shift_xy_m[1] + 0.3) / found.shift_std_m)
@@ -192,10 +192,10 @@ def register_tilted(seed, *, shift_m, tilt=0.0, noise_m=0.03, **ground):
     return register_track(source, xy, height), shift
 
 
-@pytest.mark.parametrize(("shift_m", "tilt"), [(0.0, 0.02), (0.3, 0.0), (1.0, 0.015), (3.0, 0.02)])
+@pytest.mark.parametrize(("shift_m", "tilt"), [(0.0, 0.02), (0.3, 0.0), (3.0, 0.02)])
 def test_a_shift_is_inside_two_sigma_on_tilted_and_noisy_maps(shift_m, tilt):
-    """Twelve worlds for each shift: errors of both axes over their deviations, and no error that is large in metres."""
-    found, truth = zip(*(register_tilted(seed, shift_m=shift_m, tilt=tilt) for seed in range(12)), strict=True)
+    """Eight worlds for each shift: errors of both axes over their deviations, and no error that is large in metres."""
+    found, truth = zip(*(register_tilted(seed, shift_m=shift_m, tilt=tilt) for seed in range(8)), strict=True)
     assert not any(of.at_reach for of in found)
     error_m = np.array([of.shift_xy_m for of in found]) - truth
     scaled = error_m / np.array([of.axis_std_m for of in found])
@@ -203,7 +203,7 @@ def test_a_shift_is_inside_two_sigma_on_tilted_and_noisy_maps(shift_m, tilt):
     assert 0.4 < np.sqrt(np.mean(scaled**2)) < 1.4
     assert np.linalg.norm(error_m, axis=1).max() < 0.2
     assert np.median([of.position_std_m for of in found]) < 0.1
-    assert [of.height_offset_m for of in found] == pytest.approx([46.2] * 12, abs=0.2)
+    assert [of.height_offset_m for of in found] == pytest.approx([46.2] * 8, abs=0.2)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -54,30 +54,31 @@ def read(path):
         return log.tables(log.topics), log.findings
 
 
-def topic_of(definition, name="acme_msgs/msg/Thing", topic="/evil"):
+def write_topics(path, topics, version=2):
+    """Write messages of topics, given as topic, type, definition, and time and payload of each."""
+    with path.open("wb") as file:
+        writer = McapWriter(file, compression=CompressionType.NONE)
+        writer.start(profile=f"ros{version}", library="test")
+        for topic, kind, definition, messages in topics:
+            schema = writer.register_schema(kind, f"ros{version}msg", definition.encode())
+            channel = writer.register_channel(topic, "cdr" if version == 2 else "ros1", schema)
+            for log_time_ns, payload in messages:
+                writer.add_message(channel, log_time_ns, payload, log_time_ns)
+        writer.finish()
+    return path
+
+
+def write_evil(path, definition):
     """Write a log of one good topic, and one with this definition."""
-
-    def write(path):
-        messages = random_messages(1, count=5, types=TYPES)
-        with path.open("wb") as file:
-            writer = McapWriter(file, compression=CompressionType.NONE)
-            writer.start(profile="ros2", library="test")
-            text, _ = ROS2.generate_msgdef(TYPES[0], ros_version=2)
-            good = writer.register_channel("/good", "cdr", writer.register_schema(TYPES[0], "ros2msg", text.encode()))
-            evil = writer.register_channel(topic, "cdr", writer.register_schema(name, "ros2msg", definition.encode()))
-            for message in messages:
-                writer.add_message(good, message.log_time_ns, message.payload, message.log_time_ns)
-                writer.add_message(evil, message.log_time_ns, message.payload, message.log_time_ns)
-            writer.finish()
-        return path
-
-    return write
+    messages = [(of.log_time_ns, of.payload) for of in random_messages(1, count=5, types=TYPES)]
+    good, _ = ROS2.generate_msgdef(TYPES[0], ros_version=2)
+    topics = [("/good", TYPES[0], good, messages), ("/evil", "acme_msgs/msg/Thing", definition, messages)]
+    return write_topics(path, topics)
 
 
 @pytest.mark.parametrize(
     ("definition", "said"),
     [
-        ("Thing[] children\n", "contains itself"),
         ("Other other\n" + "=" * 80 + "\nMSG: acme_msgs/Other\nThing thing\n", "contains itself"),
         ("float64[4000000000] values\n", "an array of 4000000000 elements is longer than any message"),
         ("string[99999999999999999999] texts\n", "longer than any message"),
@@ -95,7 +96,7 @@ def topic_of(definition, name="acme_msgs/msg/Thing", topic="/evil"):
     ],
 )
 def test_a_hostile_definition_costs_its_topic_only(tmp_path, bounded, definition, said):
-    tables, damage = read(topic_of(definition)(tmp_path / "a.mcap"))
+    tables, damage = read(write_evil(tmp_path / "a.mcap", definition))
     assert set(tables) == {"/good"}
     assert tables["/good"].num_rows == 5
     (finding,) = damage
@@ -104,7 +105,7 @@ def test_a_hostile_definition_costs_its_topic_only(tmp_path, bounded, definition
 
 
 def test_a_fixed_array_that_no_message_can_hold_is_counted(tmp_path, bounded):
-    tables, damage = read(topic_of("float64[200000000] values\n")(tmp_path / "a.mcap"))
+    tables, damage = read(write_evil(tmp_path / "a.mcap", "float64[200000000] values\n"))
     assert tables["/evil"].num_rows == 0
     assert sum(finding.numbers["lost_messages_count"] for finding in damage) == 5
 
@@ -234,13 +235,8 @@ def test_lengths_and_counts_of_2_to_the_32(tmp_path, bounded, encoding):
 @pytest.mark.parametrize("nothing", ["", "float64[0] none\n"])
 def test_arrays_whose_elements_take_no_bytes_are_refused(tmp_path, bounded, nothing):
     definition = "Nothing[] many\n" + "=" * 80 + f"\nMSG: acme_msgs/Nothing\n{nothing}"
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = McapWriter(file)
-        writer.start(profile="ros1", library="test")
-        schema = writer.register_schema("acme_msgs/Thing", "ros1msg", definition.encode())
-        writer.add_message(writer.register_channel("/evil", "ros1", schema), 1, b"\xff\xff\xff\xff", 1)
-        writer.finish()
+    topics = [("/evil", "acme_msgs/Thing", definition, [(1, b"\xff\xff\xff\xff")])]
+    path = write_topics(tmp_path / "a.mcap", topics, version=1)
     tables, damage = read(path)
     assert tables == {}
     assert ["take no bytes" in finding.names["reason"] for finding in damage] == [True]
@@ -297,25 +293,20 @@ def test_what_no_checksum_covers_is_said(tmp_path):
 @pytest.mark.parametrize("count", [3, 40])
 def test_a_field_called_like_a_time_keeps_its_values(tmp_path, count):
     text = "int64 log_time_ns\nint64 publish_time_ns\nstring log_time_ns_\n"
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as file:
-        writer = McapWriter(file)
-        writer.start()
-        schema = writer.register_schema("acme_msgs/msg/Thing", "ros2msg", text.encode())
-        channel = writer.register_channel("/thing", "cdr", schema)
-        for number in range(count):
-            name = b"a" * (1 + number % 2)
-            payload = b"\0\1\0\0" + struct.pack("<qqI", number, -number, len(name) + 1) + name + b"\0"
-            writer.add_message(channel, START_NS + number, payload, START_NS)
-        writer.finish()
-    tables, damage = read(path)
+    names = ["a" * (1 + number % 2) for number in range(count)]
+    payloads = [
+        b"\0\1\0\0" + struct.pack("<qqI", number, -number, len(name) + 1) + name.encode() + b"\0"
+        for number, name in enumerate(names)
+    ]
+    messages = [(START_NS + number, payload) for number, payload in enumerate(payloads)]
+    tables, damage = read(write_topics(tmp_path / "a.mcap", [("/thing", "acme_msgs/msg/Thing", text, messages)]))
     assert damage == []
     found = tables["/thing"]
     assert found.column_names == ["log_time_ns", "publish_time_ns", "log_time_ns_", "publish_time_ns_", "log_time_ns__"]
     assert found["log_time_ns"].to_pylist() == [START_NS + number for number in range(count)]
     assert found["log_time_ns_"].to_pylist() == list(range(count))
     assert found["publish_time_ns_"].to_pylist() == [-number for number in range(count)]
-    assert found["log_time_ns__"].to_pylist() == ["a" * (1 + number % 2) for number in range(count)]
+    assert found["log_time_ns__"].to_pylist() == names
 
 
 def test_a_broken_schema_in_a_chunk_costs_its_topics_only(tmp_path):

@@ -15,7 +15,6 @@ from random_messages import (
     write_mcap,
 )
 from rosbags.rosbag1 import Writer as BagWriter
-from storage_server import object_store
 from wheel_drives import drive_at
 
 from tcpipe.errors import LogError
@@ -58,16 +57,11 @@ def write(path, kind):
 
 
 @pytest.fixture
-def drives(tmp_path, monkeypatch):
+def drives(tmp_path, served):
     """A bucket ``drives`` in a directory, and what was fetched of it."""
     bucket = tmp_path / "served" / "drives"
-    bucket.mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, fetched):
-        for name in ("HTTP_PROXY", "http_proxy"):
-            monkeypatch.delenv(name, raising=False)
-        for name, value in environment.items():
-            monkeypatch.setenv(name, value)
-        yield bucket, fetched
+    bucket.mkdir()
+    return bucket, served
 
 
 @pytest.mark.parametrize("kind", ["mcap zstd", "mcap", "mcap without CRC", "bag", "bag lz4"])

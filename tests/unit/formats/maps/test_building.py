@@ -26,6 +26,12 @@ def plane(x, y):
     return 500.0 + 0.2 * (x - WORLD.x_m) + 0.1 * (y - WORLD.y_m)
 
 
+@pytest.fixture(scope="module")
+def height(tmp_path_factory):
+    """A raster of the plane."""
+    return write_tif(tmp_path_factory.mktemp("h") / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+
+
 def raster_of(function, affine, rows=400, cols=400, dtype=np.float32):
     """Values at pixel centres of an affine of corners, with a band axis."""
     j, i = np.meshgrid(np.arange(cols) + 0.5, np.arange(rows) + 0.5)
@@ -74,19 +80,15 @@ CONVENTIONS = {
     "rotated": (Affine(0.08, 0.06, LEFT, 0.06, -0.08, TOP), {}),
     "flat pixels": (Affine(0.1, 0.0, LEFT, 0.0, -0.2, TOP), {"rows": 200}),
     "mirrored": (Affine(-0.1, 0.0, LEFT + 40.0, 0.0, -0.1, TOP), {}),
+    "pixel is point": (NORTH_UP, {}),
 }
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_pixel_conventions_show_the_same_ground(tmp_path, name):
     affine, size = CONVENTIONS[name]
-    write_tif(tmp_path / "h.tif", raster_of(plane, affine, **size), WORLD.crs, affine)
-    _, source = built(tmp_path, height=tmp_path / "h.tif")
-    check_plane(source)
-
-
-def test_pixel_is_point_is_half_a_pixel_off_pixel_is_area(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP, point=True)
+    point = name == "pixel is point"  # half a pixel off pixel is area
+    write_tif(tmp_path / "h.tif", raster_of(plane, affine, **size), WORLD.crs, affine, point=point)
     _, source = built(tmp_path, height=tmp_path / "h.tif")
     check_plane(source)
 
@@ -157,11 +159,10 @@ def test_a_raster_may_be_of_these_kinds_whatever_its_name(tmp_path, driver):
 
 
 @pytest.mark.parametrize(("options", "value"), [({"nbits": 1}, 1), ({"photometric": "YCBCR", "compress": "jpeg"}, 120)])
-def test_orthophotos_of_odd_kinds_become_grey(tmp_path, options, value):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+def test_orthophotos_of_odd_kinds_become_grey(tmp_path, options, value, height):
     bands = 3 if "photometric" in options else 1
     write_tif(tmp_path / "o.tif", np.full((bands, 400, 400), value, np.uint8), WORLD.crs, NORTH_UP, **options)
-    _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "o.tif")
+    _, source = built(tmp_path, height=height, ortho=tmp_path / "o.tif")
     assert np.unique(source.read("ortho", 0, 400, 0, 400)).tolist() == [255 if bands == 1 else value]
 
 
@@ -237,10 +238,9 @@ def test_heights_beside_a_crs_in_feet_must_say_their_unit(tmp_path):
     assert np.nanmax(heights(source)) == pytest.approx(30.0 * 1200.0 / 3937.0, abs=1e-3)
 
 
-def test_every_way_of_saying_nodata_is_heard(tmp_path):
+def test_every_way_of_saying_nodata_is_heard(tmp_path, height):
     base = np.full((3, 400, 400), 200, np.uint8)
     base[:, 50:100, :] = 0
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
     write_tif(tmp_path / "tag.tif", base, WORLD.crs, NORTH_UP, nodata=0)
     alpha = np.where(base[:1] == 0, 0, 255).astype(np.uint8)
     write_tif(tmp_path / "alpha.tif", np.vstack([base, alpha]), WORLD.crs, NORTH_UP, photometric="RGB", alpha="YES")
@@ -250,33 +250,31 @@ def test_every_way_of_saying_nodata_is_heard(tmp_path):
             dataset.write_mask(alpha[0])
     write_tif(tmp_path / "black.tif", base, WORLD.crs, NORTH_UP)
     for name, value in (("tag", 0), ("alpha", 0), ("mask", 0), ("black", 1)):
-        _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / f"{name}.tif")
+        _, source = built(tmp_path, height=height, ortho=tmp_path / f"{name}.tif")
         found = source.read("ortho", 0, 400, 0, 400)
         assert (found[50:100] == value).all(), name
         assert (found[:50] == 200).all(), name
 
 
-def test_sixteen_bits_grey_and_palettes_become_grey(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+def test_sixteen_bits_grey_and_palettes_become_grey(tmp_path, height):
     wide = np.full((1, 400, 400), 65535 * 100 // 255, np.uint16)
     write_tif(tmp_path / "wide.tif", wide, WORLD.crs, NORTH_UP)
     index = np.tile(np.array([1, 2], np.uint8), (1, 400, 200))
     write_tif(tmp_path / "palette.tif", index, WORLD.crs, NORTH_UP)
     with rasterio.open(tmp_path / "palette.tif", "r+") as dataset:
         dataset.write_colormap(1, {1: (255, 0, 0, 255), 2: (0, 255, 0, 255)})
-    _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "wide.tif")
+    _, source = built(tmp_path, height=height, ortho=tmp_path / "wide.tif")
     assert (source.read("ortho", 0, 400, 0, 400) == 100).all()
-    _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "palette.tif")
+    _, source = built(tmp_path, height=height, ortho=tmp_path / "palette.tif")
     assert source.read("ortho", 0, 1, 0, 4).tolist() == [[76, 150, 76, 150]]
 
 
-def test_class_values_are_mapped_and_unnamed_ones_are_nodata_and_said(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+def test_class_values_are_mapped_and_unnamed_ones_are_nodata_and_said(tmp_path, height):
     values = np.full((1, 400, 400), 40, np.uint16)
     values[0, :100], values[0, 100:110] = 1000, 77
     write_tif(tmp_path / "t.tif", values, WORLD.crs, NORTH_UP)
     (tmp_path / "c.csv").write_text("value,id,name,traversable\n40,2,meadow,yes\n1000,1,water,no\n41,2,meadow,yes\n")
-    paths = {"height": tmp_path / "h.tif", "terrain": tmp_path / "t.tif"}
+    paths = {"height": height, "terrain": tmp_path / "t.tif"}
     summary, source = built(tmp_path, **paths, classes=tmp_path / "c.csv")
     found = source.read("terrain", 0, 400, 0, 1)[:, 0]
     assert found.tolist() == [1] * 100 + [0] * 10 + [2] * 290
@@ -312,12 +310,11 @@ def named_raster(directory, names, *, as_categories=False, name="t.tif"):
 
 
 @pytest.mark.parametrize("as_categories", [False, True])
-def test_a_rasters_own_class_names_say_what_its_values_mean(tmp_path, as_categories):
+def test_a_rasters_own_class_names_say_what_its_values_mean(tmp_path, as_categories, height):
     """Value 4 is named mud: the name rules, not the number."""
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
     names = {4: "Mud", 10: "GRASS", 11: "paved_road", 12: "water"}
     path = named_raster(tmp_path, names, as_categories=as_categories)
-    summary, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path)
+    summary, source = built(tmp_path, height=height, terrain=path)
     found = source.read("terrain", 5, 6, 0, 400)[0, 4::8]
     wanted = np.zeros(50, np.uint8)
     wanted[[4, 10, 11]] = 5, 4, 7
@@ -327,29 +324,26 @@ def test_a_rasters_own_class_names_say_what_its_values_mean(tmp_path, as_categor
     assert unnamed.names["values"] == "0, 1, 2 …"
 
 
-def test_names_that_the_class_table_lacks_are_not_guessed(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+def test_names_that_the_class_table_lacks_are_not_guessed(tmp_path, height):
     path = named_raster(tmp_path, {4: "Wiese", 5: "Wasser"})
     with pytest.raises(
         MapError, match=r"none of its class names \(Wiese, Wasser\) is in the class table \(obstacle, .*--classes"
     ):
-        built(tmp_path, height=tmp_path / "h.tif", terrain=path)
+        built(tmp_path, height=height, terrain=path)
     (tmp_path / "c.csv").write_text("value,id,name,traversable\n4,1,meadow,yes\n")
-    _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path, classes=tmp_path / "c.csv")
+    _, source = built(tmp_path, height=height, terrain=path, classes=tmp_path / "c.csv")
     assert source.read("terrain", 5, 6, 36, 37).tolist() == [[1]]
     assert source.facts.classes_from == "file"
 
 
-def test_attribute_tables_without_names_or_with_ranges_leave_values_as_ids(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+def test_attribute_tables_without_names_or_with_ranges_leave_values_as_ids(tmp_path, height):
     path = named_raster(tmp_path, {4: "", 5: ""})
-    _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path)
+    _, source = built(tmp_path, height=height, terrain=path)
     assert source.read("terrain", 5, 6, 0, 400)[0, 4::8].tolist() == [0, *range(1, 8), *[0] * 42]
     assert source.facts.classes_from == "default"
 
 
-def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_path, height):
     index = np.repeat(np.array([4, 5, 6, 7], np.uint8), 100)[None, None, :].repeat(400, axis=1)
     write_tif(tmp_path / "p.tif", index, WORLD.crs, NORTH_UP)
     opacity = {4: 255, 5: 255, 6: 0, 7: 255}
@@ -361,7 +355,7 @@ def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_
     rasterio.shutil.copy(
         tmp_path / "p.vrt", tmp_path / "p.img", driver="HFA"
     )  # keeps opacity, which a GeoTIFF does not
-    _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=tmp_path / "p.img")
+    _, source = built(tmp_path, height=height, terrain=tmp_path / "p.img")
     assert source.read("terrain", 9, 10, 0, 400)[0, 50::100].tolist() == [4, 5, 0, 7]
 
 
@@ -450,10 +444,9 @@ def test_what_cannot_be_placed_is_refused_in_one_line_and_leaves_nothing(tmp_pat
         assert not list((tmp_path / "out").iterdir()), path
 
 
-def test_several_wrong_rasters_are_named_at_once(tmp_path):
-    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+def test_several_wrong_rasters_are_named_at_once(tmp_path, height):
     with pytest.raises(MapError) as caught:
-        built(tmp_path, height=tmp_path / "no.tif", ortho=tmp_path / "h.tif", terrain=tmp_path / "h.tif")
+        built(tmp_path, height=tmp_path / "no.tif", ortho=height, terrain=height)
     assert len(caught.value.problems) == 3
 
 

@@ -9,8 +9,6 @@ import pytest
 import rasterio
 import xarray
 from map_worlds import World
-from object_gateway import in_environment
-from storage_server import object_store
 
 from tcpipe.errors import MapError
 from tcpipe.formats.bucket_directories import fetch_files
@@ -71,16 +69,6 @@ def test_gdal_opens_each_layer_in_its_place(path):
         np.testing.assert_allclose(values, wanted, atol=1e-4)
 
 
-def test_an_open_map_knows_what_it_is(path):
-    source = open_map(path)
-    assert (source.name, tuple(source.layers), source.classes.count) == ("garden", ("height", "ortho", "terrain"), 7)
-    assert source.facts.sources == {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif"}
-    assert source.read("height", 3, 5, 7, 11).shape == (2, 4)
-    summary = source.summary()
-    assert (summary.crs, summary.rows, summary.pixel_size_m) == (WORLD.crs, 200, 0.1)
-    assert summary.covered == {"height": 1.0, "ortho": 1.0, "terrain": 1.0}
-
-
 def test_overviews_are_maps_of_the_same_ground(path):
     source = open_map(path)
     assert source.factors == (1, 2, 4, 8)
@@ -129,25 +117,23 @@ def test_overviews_across_shards_have_no_seam(wide):
         assert (level.read("terrain", 0, side, 0, side) > 0).all()
 
 
-def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path, monkeypatch):
-    path, served = wide[0], tmp_path / "served" / "tests" / "m.zarr"
-    shutil.copytree(path, served)
+def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path, served):
+    path, files = wide[0], tmp_path / "served" / "tests" / "m.zarr"
+    shutil.copytree(path, files)
     checksums = {f"m.zarr/{name}": of for name, of in compute_checksums(path).items()}
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        root, shards = fetch_files(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)
-        here, there = open_map(path), open_map(root / "m.zarr", shards)
-        opened, requests = fetched.sent_bytes, len(fetched)
-        for layer in here.layers:  # of one tile
-            np.testing.assert_array_equal(there.read(layer, 10, 500, 600, 1000), here.read(layer, 10, 500, 600, 1000))
-        there.expect([(0, 1)])
-        assert set(fetched[requests:]) == {f"m.zarr/{layer}/c/0/0" for layer in here.layers}
-        assert len(fetched) - requests == 2 * len(here.layers)  # the index of a shard, and its tile
-        whole = sum((served / layer / "c" / "0" / "0").stat().st_size for layer in here.layers)
-        assert fetched.sent_bytes - opened < 0.1 * whole
-        (served / "height" / "c" / "1" / "1").unlink()
-        with pytest.raises(MapError, match=r"height, rows 2050 to 2090.*cannot be read.*is missing"):
-            there.read("height", 2050, 2090, 2050, 2090)
+    root, shards = fetch_files(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)
+    here, there = open_map(path), open_map(root / "m.zarr", shards)
+    opened, requests = served.sent_bytes, len(served)
+    for layer in here.layers:  # of one tile
+        np.testing.assert_array_equal(there.read(layer, 10, 500, 600, 1000), here.read(layer, 10, 500, 600, 1000))
+    there.expect([(0, 1)])
+    assert set(served[requests:]) == {f"m.zarr/{layer}/c/0/0" for layer in here.layers}
+    assert len(served) - requests == 2 * len(here.layers)  # the index of a shard, and its tile
+    whole = sum((files / layer / "c" / "0" / "0").stat().st_size for layer in here.layers)
+    assert served.sent_bytes - opened < 0.1 * whole
+    (files / "height" / "c" / "1" / "1").unlink()
+    with pytest.raises(MapError, match=r"height, rows 2050 to 2090.*cannot be read.*is missing"):
+        there.read("height", 2050, 2090, 2050, 2090)
 
 
 def test_what_is_no_map_says_so(path, tmp_path):

@@ -1,6 +1,7 @@
 """Terrain drawn as polygons, against point-in-polygon in lon/lat; and drawings that cannot be used, refused in one line."""
 
 import json
+import re
 
 import numpy as np
 import pyproj
@@ -120,32 +121,14 @@ def test_every_feature_without_a_class_of_the_table_is_named(tmp_path, height):
 
 
 def test_drawings_that_cannot_be_placed_are_refused_in_one_line(tmp_path, height):
-    swapped = [[point[::-1] for point in FIELD[0]]]
-    projected = [
-        [[560_000.0, 5_215_000.0], [560_010.0, 5_215_000.0], [560_010.0, 5_215_010.0], [560_000.0, 5_215_000.0]]
-    ]
-    utm = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
+    """Of what the reader of polygons refuses (test_geojson.py) one case."""
     far = [[[10.0, 50.0], [10.1, 50.0], [10.1, 50.1], [10.0, 50.0]]]
     bow = [ring((0, 0), (9, 9), (9, 0), (0, 9))]
-    mud = {"class": "mud"}
-    cases = [
-        (collection(tmp_path, feature(swapped, **mud)), "axes swapped"),
-        (collection(tmp_path, feature(projected, **mud), name="p.geojson"), "no lon/lat degrees: they look projected"),
-        (collection(tmp_path, feature(FIELD, **mud), name="u.geojson", crs=utm), "declares the CRS"),
-        (collection(tmp_path, feature(far, **mud), name="f.geojson"), r"they are around 10.05.*the map covers 15.7"),
-        (collection(tmp_path, feature(bow, **mud), name="b.geojson"), "Self-intersection"),
-        (collection(tmp_path, feature([], **mud), name="e.geojson"), "geometry is empty"),
-        (collection(tmp_path, feature([0.0, 0.0], "Point", **mud), name="o.geojson"), "geometry is 'Point'"),
-        (collection(tmp_path, name="n.geojson"), "no polygon in it"),
-        (tmp_path / "absent.geojson", "cannot be read"),
-    ]
-    (tmp_path / "text.json").write_text("not json")
-    cases.append((tmp_path / "text.json", "not GeoJSON"))
-    for path, wanted in cases:
+    for drawing, wanted in ((far, r"they are around 10.05.*the map covers 15.7"), (bow, "Self-intersection")):
+        path = collection(tmp_path, feature(drawing, **{"class": "mud"}))
         (problem,) = refused(tmp_path, height, path)
         assert str(path) in problem
-        with pytest.raises(MapError, match=wanted):
-            build(tmp_path, height, path)
+        assert re.search(wanted, problem)
 
 
 def test_polygons_beyond_the_map_do_not_matter(tmp_path, height):

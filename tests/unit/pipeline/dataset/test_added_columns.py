@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, RecipeError
@@ -14,7 +14,7 @@ from tcpipe.pipeline.dataset.content import find_narrow_patches
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import CovariateConfig, Recipe, SampleConfig, SplitConfig
 from tcpipe.robots import Robot
-from tcpipe.store import Store, open_store
+from tcpipe.store import Store
 from tcpipe.tables.findings import Subject, select_findings
 
 START_NS = 1_760_000_000 * 10**9
@@ -27,8 +27,7 @@ LOADS = {"a": "0", "b": "12.5", "c": "0", "d": "2e1"}
 def store(tmp_path_factory):
     """Four runs of a lane and a day each, tagged."""
     directory = tmp_path_factory.mktemp("tagged")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     for day, run_id in enumerate(SEASONS):
         table = segments(run_id, *lanes(np.array([3.0 * day]), -10.0, 10.0), start_ns=START_NS + day * DAY_NS)
         tags = {"season": SEASONS[run_id], "load_kg": LOADS[run_id]} | ({"driver": "7"} if day else {"note": "x"})

@@ -8,12 +8,12 @@ import pyarrow.parquet as pq
 import pyproj
 import pytest
 import shapely
-from synthetic_store import WORLD, add_run, add_world, box, lanes, region_file, segments
+from made_tracks import with_columns
+from synthetic_store import WORLD, add_run, box, lanes, open_world, region_file, segments
 
 from tcpipe.balance.cells import SLOPE_NAMES, find_slope_ranges
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
 
 DRAWS_DATASET_PAGES = True
 
@@ -25,15 +25,13 @@ NOISE_WATT = 7.0
 def built(tmp_path_factory):
     """Eight lanes that are driven twice, the second time a little off and with other noise, and one that is driven back."""
     directory = tmp_path_factory.mktemp("balance")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory / "rasters")
+    store = open_world(directory)
     rng = np.random.default_rng(0)
     start, end = lanes(-15.0 + 4.0 * np.arange(8), -4.0, 16.0)
     for run_id, offset in (("once", 0.0), ("again", 0.1)):
         table = segments(run_id, start + offset, end + offset, start_ns=int(1e18 + offset * 1e15))
         power = 150.0 + rng.normal(0.0, NOISE_WATT, len(start))
-        at = table.column_names.index("power_watt")
-        add_run(store, run_id, table.set_column(at, table.schema.field(at), [power]))
+        add_run(store, run_id, with_columns(table, power_watt=power))
     add_run(store, "back", segments("back", end[:20] + 0.05, start[:20] + 0.05, start_ns=int(2e18)))
     region = region_file(directory / "region.geojson", box(-20, -20, 20, 20), CLOSED, splits=(None, "exclude"))
     build_dataset(directory / "out", store=store.root, recipe=Recipe(), split=region)

@@ -3,13 +3,14 @@
 import csv
 import json
 import math
+import shutil
 
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
-from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+from synthetic_store import add_run, box, lanes, open_world, region_file, segments
 
 from tcpipe.cli import cli
 from tcpipe.dataset import open_dataset
@@ -19,7 +20,7 @@ from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
+from tcpipe.store import Store
 from tcpipe.tables.findings import select_findings
 
 WHY = "the robot pushed a fence"
@@ -29,21 +30,28 @@ def add(store, run_id, y_m, start_ns):
     add_run(store, run_id, segments(run_id, *lanes(np.array([y_m]), -10.0, 10.0), start_ns=start_ns))
 
 
-@pytest.fixture
-def store(tmp_path):
-    opened = open_store(tmp_path / "store", create=True)
-    add_world(opened, tmp_path)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A store of two runs, a region, and the dataset without an exclusion."""
+    here = tmp_path_factory.mktemp("made")
+    opened = open_world(here)
     add(opened, "a", 0.0, 10**18)
     add(opened, "b", 3.0, 2 * 10**18)
-    return opened
+    region = region_file(here / "region.geojson", box(-20, -20, 5, 20))
+    build_dataset(here / "plain", store=opened.root, recipe=Recipe(), split=region)
+    return here
 
 
 @pytest.fixture
-def plain(store, tmp_path):
+def store(made, tmp_path):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True, copy_function=shutil.copy2)
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture(scope="module")
+def plain(made):
     """The samples of the dataset without an exclusion."""
-    region = region_file(tmp_path / "region.geojson", box(-20, -20, 5, 20))
-    build_dataset(tmp_path / "plain", store=store.root, recipe=Recipe(), split=region)
-    return pq.read_table(tmp_path / "plain/samples.parquet")
+    return pq.read_table(made / "plain/samples.parquet")
 
 
 def build(store, tmp_path, *, ids=None, **more):

@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pyarrow as pa
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from made_tracks import with_columns
+from synthetic_store import add_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
@@ -15,7 +16,6 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.card import count_flagged
 from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
 
@@ -81,12 +81,9 @@ def test_a_bit_that_every_sample_carries_is_not_counted():
 
 
 def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_found(tmp_path):
-    store = open_store(tmp_path / "store", create=True)
-    add_world(store, tmp_path)
+    store = open_world(tmp_path)
     table = segments("a", *lanes([0.0], -10.0, 10.0))
-    place = table.column_names.index("position_std_m")
-    table = table.set_column(place, table.schema.field(place), pa.array(np.full(table.num_rows, 0.3)))
-    add_run(store, "a", table, findings=(slow(0.6),))
+    add_run(store, "a", with_columns(table, position_std_m=np.full(table.num_rows, 0.3)), findings=(slow(0.6),))
     with pytest.raises(DatasetError) as caught:
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     nothing, how_sure, found = caught.value.problems
@@ -100,14 +97,11 @@ def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_fo
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     directory = tmp_path_factory.mktemp("found")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     for number, run_id in enumerate("ab"):
         table = segments(run_id, *lanes([4.0 * number], -10.0, 10.0), start_ns=number * 10**12)
-        place = table.column_names.index("quality")
         bits = np.where(np.arange(table.num_rows) < 5 * number, int(Quality.WEAK_GNSS), 0) | int(Quality.NO_COMMAND)
-        table = table.set_column(place, table.schema.field(place), pa.array(bits, table.schema.field(place).type))
-        add_run(store, run_id, table, findings=(slow(0.1 * number + 0.6),))
+        add_run(store, run_id, with_columns(table, quality=bits), findings=(slow(0.1 * number + 0.6),))
     return build_dataset(directory / "out", store=store.root, recipe=Recipe()), directory / "out"
 
 
@@ -136,8 +130,7 @@ def test_the_page_has_one_verdict_with_the_worst_first_and_no_praise(built):
 
 
 def test_a_difference_between_two_datasets_names_findings_by_code_and_subject(built, tmp_path):
-    store = open_store(tmp_path / "store", create=True)
-    add_world(store, tmp_path)
+    store = open_world(tmp_path)
     add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), findings=(make_finding("no-command", ROLE),))
     build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     found = diff(built[1], tmp_path / "out")
@@ -149,8 +142,7 @@ def test_a_difference_between_two_datasets_names_findings_by_code_and_subject(bu
 
 @pytest.mark.parametrize("holdout", ["sample", "block", "run"])
 def test_a_split_that_shares_ground_is_never_told_to_hold_out_as_it_does(tmp_path, holdout):
-    store = open_store(tmp_path / "store", create=True)
-    add_world(store, tmp_path / "rasters")
+    store = open_world(tmp_path)
     for number, run_id in enumerate("abc"):
         add_run(store, run_id, segments(run_id, *lanes(0.2 * number, -10.0, 10.0), start_ns=number * 10**15))
     built = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), holdout=holdout)

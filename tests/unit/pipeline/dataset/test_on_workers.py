@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from stored_files import read_files as files
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, lanes, open_world, segments
 
 from tcpipe import execution
 from tcpipe.errors import StoreError
@@ -48,8 +48,7 @@ def many_tasks():
 def made(tmp_path_factory, many_tasks):
     """A store of 600 segments, and the datasets that this machine makes of it."""
     directory = tmp_path_factory.mktemp("made")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     add_run(store, "a", segments("a", *lanes(np.linspace(-14.0, 14.0, 30), -10.0, 10.0)))
     for kind in ("zarr", "parquet"):
         built = build_dataset(directory / kind, store=store.root, recipe=Recipe(), file_format=kind)

@@ -10,8 +10,9 @@ from typing import get_args
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from made_tracks import with_columns
 from pyproj import Transformer
-from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+from synthetic_store import add_run, box, lanes, open_world, region_file, segments
 from written_bytes import written_bytes
 
 from tcpipe.errors import DatasetError
@@ -20,7 +21,6 @@ from tcpipe.formats.json_files import to_json
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.redaction import PLANE, compute_plane_per_chord, find_leaks, redact_findings
 from tcpipe.pipeline.verify import verify
-from tcpipe.store import open_store
 from tcpipe.tables.findings import Finding, Remedy, Subject, SubjectKind, make_finding, read_catalogue, select_findings
 
 DRAWS_DATASET_PAGES = True
@@ -45,8 +45,7 @@ LEAKING = tuple(
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     here = tmp_path_factory.mktemp("redaction")
-    store = open_store(here / "store", create=True)
-    add_world(store, here / "rasters")
+    store = open_world(here)
     rng = np.random.default_rng(5)
     for run_id, first in (("north", 1.0), ("south", -15.5)):
         each = [
@@ -155,13 +154,11 @@ def test_nothing_names_logs_maps_places_or_paths(built):
 
 
 def test_a_column_of_geometry_is_moved_too(built):
-    here, *_ = built
-    samples = pq.read_table(here / "redacted/samples.parquet")
-    if "geometry" in samples.column_names:
-        points = np.array([struct.unpack("<BI2d", value)[2:] for value in samples["geometry"].to_pylist()])
-        assert np.abs(points).max() < 0.01
-        geo = json.loads(samples.schema.metadata[b"geo"])
-        assert np.abs(geo["columns"]["geometry"]["bbox"]).max() < 0.01
+    samples = pq.read_table(built[0] / "redacted/samples.parquet")
+    points = np.array([struct.unpack("<BI2d", value)[2:] for value in samples["geometry"].to_pylist()])
+    assert np.abs(points).max() < 0.01
+    geo = json.loads(samples.schema.metadata[b"geo"])
+    assert np.abs(geo["columns"]["geometry"]["bbox"]).max() < 0.01
 
 
 def test_verify_says_that_it_is_redacted_and_finds_what_is_told_all_the_same(built):
@@ -250,10 +247,9 @@ def test_distances_do_not_tell_the_scale_of_the_plane(built):
     )
     assert abs(np.mean(length_m / redacted["chord_m"].to_numpy()) - 1.0) < 1e-4
     k = 0.99  # a plane of another scale
-    as_before = redacted
-    for name in ("start_x_m", "start_y_m", "end_x_m", "end_y_m"):
-        at = as_before.schema.get_field_index(name)
-        as_before = as_before.set_column(at, name, [(redacted[name].to_numpy() * k / 0.01).round() * 0.01])
+    names = ("start_x_m", "start_y_m", "end_x_m", "end_y_m")
+    scaled = {name: (redacted[name].to_numpy() * k / 0.01).round() * 0.01 for name in names}
+    as_before = with_columns(redacted, **scaled)
     assert compute_plane_per_chord(as_before)[0] == pytest.approx(k, abs=5 * std)
     assert any(
         "the scale of the maps' plane reveals the place" in line

@@ -3,8 +3,9 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from made_tracks import with_columns
 from physics_model import PhysicsModel
-from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, segments
+from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, open_world, segments
 
 from tcpipe import open_dataset
 from tcpipe.errors import MapError
@@ -47,8 +48,7 @@ def winding(count=3000):
 
 def build_with(directory, track, recipe=None):
     """Build a dataset of one run with this track."""
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), track=track)
     return build_dataset(directory / "out", store=store.root, recipe=recipe or Recipe())
 
@@ -61,15 +61,14 @@ SHIFT_M = (-1.5, 0.8)
 def moved(tmp_path_factory):
     """Two runs whose map lies elsewhere, and where their ground is by the map; one of them is too uncertain to be moved."""
     directory = tmp_path_factory.mktemp("moved")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     xy, (start, end) = winding(), lanes([-6.0, 2.0], -10.0, 10.0)
     add_run(store, "off", segments("off", start, end), track=track_at(xy, np.add(xy, SHIFT_M)))
     short = track_at(xy[:300], np.add(xy[:300], SHIFT_M))
     add_run(store, "short", segments("short", *lanes([6.0], -10.0, 10.0), start_ns=10**13), track=short)
     result = build_dataset(directory / "out", store=store.root, recipe=ALIGN)
     there = open_store(directory / "there", create=True)
-    add_world(there, directory)
+    add_world(there)
     add_run(there, "off", segments("off", np.add(start, SHIFT_M), np.add(end, SHIFT_M)))
     build_dataset(directory / "truth", store=there.root, recipe=Recipe())
     return directory, result
@@ -171,8 +170,7 @@ def test_a_shift_that_is_not_known_well_enough_is_not_applied(tmp_path, shift_m,
 
 def build_repeated(directory, shifts_m):
     """Build a dataset of drives over the same ground, the last shorter than the others."""
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     for number, shift_m in enumerate(shifts_m):
         xy = np.add(winding()[: 1200 if number == len(shifts_m) - 1 else None], (0.0, 0.1 * number))
         start, end = lanes([4.0 * number - 6.0], -10.0, 10.0)
@@ -227,8 +225,7 @@ HEIGHTS = ("map-heights-differ", "map-height-scale")
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     directory = tmp_path_factory.mktemp("registered")
-    store = open_store(directory / "store", create=True)
-    add_world(store, directory)
+    store = open_world(directory)
     xy = winding()
     for number, (run_id, shift_m, std_m) in enumerate(
         [("fits", (0.0, 0.0), 0.02), ("off", (-1.5, 0.8), 0.02), ("vague", (-1.5, 0.8), 0.5)]
@@ -283,8 +280,6 @@ def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):
     """Heights of 1.5 m of brushwood that the map has not."""
     track = track_at(winding(), winding())
     bumps = 1.5 * np.sin(np.arange(track.num_rows) / 15.0)
-    place = track.column_names.index("alt_m")
-    track = track.set_column(place, track.schema.field("alt_m"), pa.array(track.column("alt_m").to_numpy() + bumps))
-    found = build_with(tmp_path, track)
+    found = build_with(tmp_path, with_columns(track, alt_m=track.column("alt_m").to_numpy() + bumps))
     (other,) = select_findings(found.findings, *HEIGHTS)
     assert (other.code, other.numbers["expected_m"]) == ("map-heights-differ", pytest.approx(0.1, abs=0.001))
