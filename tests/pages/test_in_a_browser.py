@@ -516,14 +516,6 @@ def test_a_click_shows_the_sample_without_scrolling(chromium, dataset):
             assert 0.0 < box["y"] < box["y"] + box["height"] < 900.0
 
 
-def test_a_run_shows_the_selected_segment_and_why_metres_are_lost_without_scrolling(chromium, run_page):
-    with quiet_page(chromium, run_page, (1400, "light")) as tab:
-        reasons = tab.locator("figure", has=tab.locator(f"#{tab.evaluate('page.model(`gates`).id')}")).bounding_box()
-        chosen = tab.locator("#chosen").bounding_box()
-        assert chosen["y"] + chosen["height"] < 900.0
-        assert reasons["y"] + 0.8 * reasons["height"] < 900.0
-
-
 def test_a_value_has_as_many_decimals_as_its_uncertainty(chromium, dataset):
     with quiet_page(chromium, dataset / "report.html", LOOKS[0]) as tab:
         for call, text in {
