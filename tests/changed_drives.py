@@ -2,14 +2,17 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation import Faults, Truth, find_scenario
+from tcpipe.simulation import Faults, Truth, compute_true_cost, find_scenario
 from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.site_files import simulate_messages
+from tcpipe.store import Store
+from tcpipe.tables.columns import to_floats, to_integers
 
 NAMES = TOPICS["ros2"]
 Columns = dict[str, np.ndarray]
@@ -47,3 +50,12 @@ def make(plan=None, *, placements: bool = True) -> Drive:
     demo = replace(demo, drives=(spec,))
     truth, messages = simulate_messages(demo, seed=5)
     return Drive(truth, tuple(messages))
+
+
+def energy_ratio(drive: Drive, store: Path) -> float:
+    """Return the energy of the segments of a store's only run over what they truly took."""
+    (run,) = Store(store).runs()
+    segments = run.segments()
+    assert segments.num_rows > 15
+    true = compute_true_cost(drive.truth, to_integers(segments, "start_ns"))
+    return float(to_floats(segments, "energy_joule").sum() / true.energy_joule.sum())

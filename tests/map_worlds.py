@@ -1,6 +1,7 @@
 """Analytic worlds for map tests: closed-form height, grey and class, written as GeoTIFFs, and segments that lie in them."""
 
 from collections.abc import Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,10 +10,13 @@ import pyproj
 import rasterio
 from rasterio import Affine
 
+from tcpipe.formats.maps.geotiff import keep_open
+from tcpipe.formats.maps.layer_building import open_raster
 from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import find_no_data_value, make_paper_layers
+from tcpipe.terrain.layers import PAPER_LAYERS, find_no_data_value, make_paper_layers
+from tcpipe.terrain.resampling import iterate_levels, make_overview_grid
 from tcpipe.terrain.target_grid import MapGrid
 
 
@@ -119,6 +123,13 @@ def segment_table(
     return LABELLED_SEGMENTS.table(**given, **rest | {"geometry": make_lines(start, end)})
 
 
+@contextmanager
+def open_heights(paths):
+    """Yield heights in many files as `build_map` opens them."""
+    with keep_open() as open_file:
+        yield open_raster(paths, "height", "metres", open_file)
+
+
 @dataclass(frozen=True)
 class ArrayMap:
     """A map in memory, for tests of sampling alone."""
@@ -154,6 +165,17 @@ class ArrayMap:
         part = self.read(layer, i * side, (i + 1) * side, j * side, (j + 1) * side)
         out[...] = find_no_data_value(self.layers[layer].mapped)
         out[: part.shape[0], : part.shape[1]] = part
+
+
+class LeveledMap(ArrayMap):
+    """A map in memory with overviews."""
+
+    def at(self, factor):
+        arrays = {
+            name: dict(iterate_levels(PAPER_LAYERS[name], layer, self.factors))[factor]
+            for name, layer in self.arrays.items()
+        }
+        return ArrayMap(make_overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
 
 
 def random_map(seed=0, rows=300, cols=260, pixel_size_m=0.05, tile_px=64) -> ArrayMap:

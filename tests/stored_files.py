@@ -41,3 +41,10 @@ def read_files(directory: Path) -> dict[str, bytes]:
     """The content of every file below a directory, by its path there."""
     files = (path for path in directory.rglob("*") if path.is_file())
     return {path.relative_to(directory).as_posix(): path.read_bytes() for path in files}
+
+
+def flip(path: Path, place: float = 0.5, *, bit: int = 0) -> None:
+    """Change one bit of a file, at a share of its length."""
+    data = bytearray(path.read_bytes())
+    data[min(int(place * len(data)), len(data) - 1)] ^= 1 << bit
+    path.write_bytes(data)

@@ -155,7 +155,7 @@ def _measure_time(seconds: Counter[str], stage: str) -> Iterator[None]:
 def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
     """Read the logs, add the map and build the dataset, as a user would."""
     store = place / "store"
-    ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs, force=True)
+    ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs)
     if problems := [problem for result in ingested.results for problem in result.problems]:
         raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.level_motion import KNOT_S
-from tcpipe.fusion.measurements import GNSS, IMU, Measurements, Positions
+from tcpipe.fusion.measurements import GNSS, IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, TURN, TURN_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
 from tcpipe.power.noise import solve_non_negative
@@ -211,7 +211,9 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     prior = replace(
         prior,
         turns={role: by_turns.find_turn_noise(role, noise) for role, noise in prior.turns.items()},
-        vertical=by_heights.find_fix_noise("up", prior.vertical) if prior.vertical and claims else prior.vertical,
+        vertical=by_heights.find_fix_noise("up", prior.vertical)
+        if prior.vertical and claims and prior.vertical.claimed_m2 < NO_TRUST
+        else prior.vertical,
     )
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
     return replace(
@@ -478,6 +480,8 @@ def make_prior_model(measurements: Measurements) -> NoiseModel:
 def _make_fix_prior(gnss: Positions, axes: slice) -> FixNoise:
     """Return the noise of fixes whose claims are right in total."""
     claimed = float(np.median(gnss.variance_m2[:, axes]))
+    if claimed >= NO_TRUST:  # not measured: there is no error that lasts, which would be kilometres
+        return FixNoise(claimed, claimed, GaussMarkov(0.0, _SHARE_S), ())
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
     correlated = GaussMarkov(prior.variance * claimed, prior.time_s)
     return FixNoise(claimed, (1.0 - prior.variance) * claimed, correlated, (correlated,))

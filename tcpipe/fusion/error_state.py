@@ -44,6 +44,7 @@ from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
     IMU,
+    NO_TRUST,
     STATED_ARM_STD_M,
     InitialState,
     Measurements,
@@ -277,6 +278,13 @@ def _make_trajectory(  # noqa: PLR0917
     antenna = np.zeros(3) if m.gnss is None else np.asarray(m.gnss.lever_arm_m)
     slope_std = estimate_slope_std_rad(m) or SLOPE_RAD
     tilted = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2 * slope_std**2)
+    if m.gnss is not None and not m.gnss.has_heights:
+        position_variance[:, 2] += NO_TRUST
+        is_tilt_seen = (
+            m.imu is not None or m.has_posed_tilt or (m.visual is not None and m.visual.turn_rate_radps is not None)
+        )
+        if not is_tilt_seen:  # nothing shows a slope, by which the antenna sways
+            position_variance[:, :2] += (slope_std * antenna[2]) ** 2
     if is_gliding(m):  # level, and along the course
         yaw = compute_course(velocity)
         rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))

@@ -273,6 +273,8 @@ def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> 
     )
     driven = path.length(float(at_s[-1]))
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
+    if not gnss.has_heights:  # they count from the start: kilometres of doubt would lean on the plane by every tilt
+        std[2] = 0.0
     std += np.array([0.1, 0.1, 0.2]) * max(driven, 1.0)
     return position, std
 

@@ -29,6 +29,8 @@ POSE = "pose"
 FIXES = (GNSS, POSE)
 """Roles of positions: a pose is fused as fixes with an attitude."""
 
+NO_TRUST = 1e6
+"""Larger variances, of a kilometre or a kilometre a second, are cut to this: as little trust, and differences keep their digits."""
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 STATED_ARM_STD_M = (0.05, 0.05, 0.1)
 """Of an antenna whose place is stated: a tape measure, and the height of base_link over the ground."""
@@ -68,6 +70,11 @@ class Positions:
     rotation_variance_rad2: NDArray[np.float64] | None = None
     mounting_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
     mounting_std_rad: float = 0.0
+
+    @property
+    def has_heights(self) -> bool:
+        """Whether any fix measures the height."""
+        return bool((self.variance_m2[:, 2] < NO_TRUST).any())
 
 
 @dataclass(frozen=True, slots=True)

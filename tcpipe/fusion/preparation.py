@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.attitude import add_attitude, add_turn_variance
 from tcpipe.fusion.measurements import (
     IMU,
+    NO_TRUST,
     VISUAL,
     WHEELS,
     BodyVelocities,
@@ -47,8 +48,6 @@ Columns = Mapping[str, Floats]
 """Columns of a stream by name, null as NaN."""
 
 _IMU = Subject("role", IMU)
-_NO_TRUST = 1e6
-"""Larger variances, of a kilometre or a kilometre a second, are cut to this: as little trust, and differences keep their digits."""
 _VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
 _YAW_RATE_STD_RADPS = 0.1  # default of an odometry without one
 _YAW_RATE_FLOOR_RADPS = 0.02  # no odometry is better
@@ -220,7 +219,7 @@ def prepare_ground_velocities(
     velocity, variance = velocity[usable], variance[usable]
     default = np.square(default_std_mps * np.array([1.0, 1.0, 2.0]))
     variance, replaced = _clean_variances(variance, default, _VELOCITY_FLOOR_MPS**2)
-    variance[np.isnan(velocity[:, 2]), 2] = _NO_TRUST
+    variance[np.isnan(velocity[:, 2]), 2] = NO_TRUST
     made = GroundVelocities(stamp_ns[usable], np.nan_to_num(velocity), variance)
     return made, Prepared(stamp_ns[~measured], repeated, replaced)
 
@@ -268,7 +267,7 @@ def prepare_body_velocities(
     # Off-diagonal terms that the rotation makes are dropped.
     variance = _rotate_vectors(rotation**2, variance[usable])
     turned = turned[usable]
-    variance[np.isnan(turned)] = _NO_TRUST
+    variance[np.isnan(turned)] = NO_TRUST
     variance, replaced = _clean_variances(variance, np.full(3, default_std_mps**2), _VELOCITY_FLOOR_MPS**2)
     turn_rate = _rotate_vectors(rotation, rate)[usable]
     yaw_rate = turn_rate[:, 2]
@@ -437,7 +436,7 @@ def _is_known(variance: Floats) -> Mask:
 def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
     """Return usable variances (N, k) and how many rows had one replaced."""
     known = _is_known(variance)
-    filled = np.clip(np.where(known, variance, default), floor, _NO_TRUST)
+    filled = np.clip(np.where(known, variance, default), floor, NO_TRUST)
     return filled, int((~known).any(1).sum())
 
 

@@ -27,8 +27,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.rails import Rail, Samples, interpolate_rail
+from tcpipe.power.rails import Rail, Samples, interpolate_rail, sum_power
+from tcpipe.power.sampling import estimate_smoothing_variance
 from tcpipe.robust import MEDIAN_OF_SQUARES
+from tcpipe.tables.facts import Smoothing
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -43,7 +45,8 @@ _SETTLED_S = 0.2  # after a stop and before a start the motors still draw
 class EnergyNoise:
     """Variances of each span's energy by cause [J²], shape (M,), independent of each other; 0 without rails.
 
-    ``rate`` is of the current between its samples, ``current`` of its noise and rounding, ``voltage`` all of the voltage's.
+    ``rate`` is of the current between its samples, or within the time over which it is smoothed, ``current`` of its noise and rounding,
+    ``voltage`` all of the voltage's.
     """
 
     rate: Floats
@@ -56,7 +59,13 @@ class EnergyNoise:
 
 
 def estimate_energy_noise(
-    rails: list[Rail], start_ns: Stamps, end_ns: Stamps, still_ns: Stamps, *, rate_hz: float | None = None
+    rails: list[Rail],
+    start_ns: Stamps,
+    end_ns: Stamps,
+    still_ns: Stamps,
+    *,
+    rate_hz: float | None = None,
+    smoothing: Smoothing | None = None,
 ) -> EnergyNoise:
     """Return the uncertainty of each span's energy from sampling, noise and quantisation.
 
@@ -79,6 +88,9 @@ def estimate_energy_noise(
         rate += volt**2 * between
         current += volt**2 * error
         voltage += amp**2 * sum(of_voltage)
+    if smoothing is not None and (power := sum_power(rails)) is not None:
+        steady = _select_used_samples(power.stamp_ns, start_ns, end_ns)
+        rate += np.square((end_ns - start_ns) * _NS) * estimate_smoothing_variance(power, steady, smoothing)
     return EnergyNoise(rate, current, voltage)
 
 

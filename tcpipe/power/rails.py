@@ -124,6 +124,14 @@ def compute_power_watt(rails: list[Rail], at_ns: Stamps) -> Floats:
     return total
 
 
+def sum_power(rails: list[Rail]) -> Samples | None:
+    """Return the power of all rails [W] at the first one's currents; None where a rail is never known, or there is none."""
+    if not rails or not all(len(each.stamp_ns) for each in rails):
+        return None
+    stamp_ns = rails[0].current.stamp_ns
+    return Samples(stamp_ns, compute_power_watt(rails, stamp_ns))
+
+
 def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
     """Return mean voltage [V], summed current [A] and summed power [W] at each stamp, each of shape (M,).
 

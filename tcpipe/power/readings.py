@@ -313,7 +313,7 @@ def _exclude_implausible(rails: Rails) -> tuple[dict[str, list[RailReadings]], l
             odd_amp = np.abs(rail.current_amp) > rail.largest_amp
             counts: dict[str, Any] = {
                 "voltages_count": int(np.count_nonzero(odd_volt)),
-                "currents_count": int(np.count_nonzero(odd_amp)),
+                "currents_count": int(np.count_nonzero(odd_amp)) + rail.unmeasured_count,
             }
             if any(counts.values()):
                 numbers = counts | {"low_volt": low_volt, "high_volt": high_volt, "high_amp": rail.largest_amp}

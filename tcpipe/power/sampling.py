@@ -1,4 +1,4 @@
-"""How a power source samples: whether its messages repeat slower readings, and whether a value is a mean over its period.
+"""How a power source samples: whether its messages repeat slower readings, a value is a mean over its period, or the record is smoothed.
 
 A driver may publish one reading several times: a battery monitor that is read once a second, in messages at 20 Hz. Messages repeat
 readings where values change only every so many messages, at almost constant intervals (a reading that equals the one before makes an
@@ -7,12 +7,20 @@ where it does so regularly (a ramp, an oscillation), it passes from level to lev
 
 The motion shows whether a source averages: a mean lags the motion by half a period. A clock that is off by half a period looks the same,
 and has the same effect: values that are held backwards from their stamps are right then.
+
+A battery monitor may pass on a running mean over seconds, or a low-pass filter's output: power then follows the motion of all that time.
+Where the power of a run wanders like a random walk, a mean over a seconds before and b seconds after the stamp errs by the variance
+(a³ + b³) / (2 (a + b)³) times the mean squared change of the smoothed record over a + b seconds.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tcpipe.power.rails import Samples
+from tcpipe.tables.facts import Smoothing
+from tcpipe.tables.findings import read_threshold
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -170,3 +178,58 @@ def _mean_about(at_s: Floats, width_s: float, motion_s: Floats, sums: Floats) ->
 def _compute_unexplained(power_watt: Floats, causes: Floats) -> float:
     fitted = causes @ np.linalg.lstsq(causes, power_watt, rcond=None)[0]
     return float(np.sum((power_watt - fitted) ** 2))
+
+
+_INSTANT_S = 0.1
+"""Motion is averaged over so much about a sample."""
+_WIDTHS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+
+
+def find_smoothing(
+    power: Samples, motion_ns: Stamps, motion: Floats, *, averaged: bool, corrected_s: float = 0.0
+) -> Smoothing | None:
+    """Return over how long power [W] is smoothed, by the motion that it follows; None where that is not sure.
+
+    It has to explain clearly more than power as it is, and than means about the stamp, which fit better where the motion is noisy.
+
+    Parameters
+    ----------
+    motion_ns, motion : rising stamps [ns], shape (M,), with forward velocity, yaw rate and rate of climb, shape (M, 3).
+    averaged : whether a value is stated to be the mean since the one before it.
+    corrected_s : what the recipe adds to the stamps [s]: a mean ends at the stamp before that.
+    """
+    if min(power.value.size, motion_ns.size) < _FEWEST:
+        return None
+    margin_ns = round(_WIDTHS_S[-1] * 1e9)
+    inside = (power.stamp_ns > motion_ns[0] + margin_ns) & (power.stamp_ns < motion_ns[-1] - margin_ns)
+    if inside.sum() < _FEWEST:
+        return None
+    stated_s = float(np.median(np.diff(power.stamp_ns))) / 1e9 if averaged else 0.0
+    at_s, motion_s = (power.stamp_ns[inside] - motion_ns[0]) / 1e9, (motion_ns - motion_ns[0]) / 1e9
+    sums = _integrate_causes(motion_s, np.column_stack((_collect_causes(motion_s, *motion[:, :2].T), motion[:, 2])))
+
+    def judge(smoothing: Smoothing) -> float:
+        width_s = max(stated_s + smoothing.width_s, _INSTANT_S)
+        means = _mean_about(at_s - stated_s / 2.0 - smoothing.late_s, width_s, motion_s, sums)
+        return _compute_unexplained(power.value[inside], means)
+
+    after_s = max(-corrected_s, 0.0)
+    tried = [Smoothing(width_s - after_s, after_s) for width_s in _WIDTHS_S if width_s > after_s]
+    about = [Smoothing(width_s / 2.0 - after_s, width_s / 2.0 + after_s) for width_s in _WIDTHS_S]
+    unexplained = [judge(smoothing) for smoothing in tried]
+    least = min(judge(smoothing) for smoothing in (Smoothing(0.0, 0.0), *about))
+    if min(unexplained) > read_threshold("power-smoothed", "max_unexplained_fraction") * least:
+        return None
+    return tried[int(np.argmin(unexplained))]
+
+
+def estimate_smoothing_variance(power: Samples, steady: NDArray[np.bool_], smoothing: Smoothing) -> float:
+    """Return the variance of power [W²] that smoothing hides, by how smoothed power [W] changes while ``steady``, shape (N,)."""
+    at_s = (power.stamp_ns - power.stamp_ns[0]) / 1e9
+    earlier_s = at_s - smoothing.width_s
+    change = power.value - np.interp(earlier_s, at_s, power.value)
+    used = steady & (np.interp(earlier_s, at_s, steady) == 1.0) & (earlier_s > 0.0)
+    if used.sum() < _FEWEST:
+        used = earlier_s > 0.0
+    share = (smoothing.before_s**3 + smoothing.after_s**3) / (2.0 * smoothing.width_s**3)
+    return share * float(np.mean(np.square(change[used]))) if used.any() else 0.0

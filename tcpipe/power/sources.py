@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter as Counts
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -27,6 +27,7 @@ from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshol
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
 HuskyPower = Literal["battery", "drivers"]
 
 NAMES, SPEED, TORQUE = "name[]", "velocity", "effort"
@@ -98,7 +99,8 @@ REJECTED = "power-rejected"
 class RailReadings:
     """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,).
 
-    Of a counter of energy the current is a first one, by times that nobody has judged yet.
+    Of a counter of energy the current is a first one, by times that nobody has judged yet. In ``unmeasured_count`` rows one of the summed
+    currents stood still or was clipped: there the current is NaN.
     """
 
     name: str
@@ -106,6 +108,7 @@ class RailReadings:
     current_amp: Floats
     counter: Counter | None = None
     joints: JointPower | None = None
+    unmeasured_count: int = 0
 
     @property
     def largest_amp(self) -> float:
@@ -186,6 +189,18 @@ def make_rail_name(topic: str) -> str:
 def is_of_drives(topic: str) -> bool:
     """Whether a topic's name says that it is of what drives, rather than of a whole battery."""
     return re.search(r"drive|motor|traction|wheel|esc(?![a-z])|inverter", topic.lower()) is not None
+
+
+_OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+def find_lone_side(topics: Collection[str]) -> str | None:
+    """Return a topic of the drives of one side whose other side is not among the topics; None without one."""
+    names = {topic.lower() for topic in topics}
+    for topic in filter(is_of_drives, topics):
+        if re.sub("left|right", lambda side: _OTHER_SIDE[side[0]], topic.lower()) not in names:
+            return topic
+    return None
 
 
 def is_corrected(topic: str) -> bool:
@@ -289,7 +304,54 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
         current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)
-    return RailReadings(name, voltage, current)
+    parts = [_read_values(columns, field).reshape(len(current), -1) for field in parse_fields(source.current)]
+    unmeasured = (
+        find_unmeasured(np.hstack(parts), _choose_stamps(columns)) if parts else np.zeros(len(current), np.bool_)
+    )
+    current = np.where(unmeasured, np.nan, current)
+    return RailReadings(name, voltage, current, unmeasured_count=int(unmeasured.sum()))
+
+
+_FROZEN_NS, _FEWEST_EQUAL = 5_000_000_000, 20
+_MOVES = 0.5
+"""Of the range that holds 90 % of a current: what changes by so much is driven."""
+_BESIDE, _CROWDED = 20, 10.0
+"""Levels next to the end of a range, and how many times as many values as on one of them are at the end of a clipped current."""
+
+
+def find_unmeasured(parts: Floats, stamp_ns: Stamps) -> NDArray[np.bool_]:
+    """Return the rows in which one of several currents, shape (N, K), is clipped, or repeats a value while another changes, shape (N,)."""
+    found = np.zeros(len(parts), np.bool_)
+    for column, values in enumerate(parts.T):
+        found |= _is_clipped(values) | _is_frozen(values, np.delete(parts, column, axis=1), stamp_ns)
+    return found
+
+
+def _is_clipped(values: Floats) -> NDArray[np.bool_]:
+    """Return where a current is at the end of its sensor's range: values crowd there, and stay."""
+    levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+    at_end = np.zeros(len(values), np.bool_)
+    if len(levels) <= _BESIDE:
+        return at_end
+    if abs(levels[0]) > abs(levels[-1]):
+        levels, counts = levels[::-1], counts[::-1]
+    if counts[-1] >= max(_FEWEST_EQUAL, _CROWDED * float(counts[-1 - _BESIDE : -1].mean())):
+        at_end = values == levels[-1]
+    stays = at_end[1:] & at_end[:-1]
+    return at_end if 2 * stays.sum() >= at_end.sum() else np.zeros_like(at_end)
+
+
+def _is_frozen(values: Floats, others: Floats, stamp_ns: Stamps) -> NDArray[np.bool_]:
+    """Return where a current repeats one value for seconds while one of the others, shape (N, K), changes as in driving."""
+    frozen = np.zeros(len(values), np.bool_)
+    first = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
+    last = np.append(first[1:], len(values)) - 1
+    is_long = (last - first >= _FEWEST_EQUAL) & (stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS)
+    if is_long.any() and others.size:
+        low, high = np.nanquantile(others, (0.05, 0.95), axis=0)
+        for begin, end in zip(first[is_long], last[is_long] + 1, strict=True):
+            frozen[begin:end] = (np.ptp(others[begin:end], axis=0) > _MOVES * (high - low)).any()
+    return frozen
 
 
 def _choose_stamps(columns: Columns) -> NDArray[np.int64]:
@@ -333,6 +395,8 @@ def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding 
     volt = float(np.median(voltage)) if len(voltage) else np.nan
     amp = float(np.median(np.abs(current))) if len(current) else np.nan
     reason = _check_voltage(voltage, volt, rail.voltage_volt, columns) or _check_current(current, amp, rail.largest_amp)
+    if 2 * rail.unmeasured_count > len(rail.current_amp):
+        reason = "current-constant"
     if not len(voltage) and not len(current):
         reason = "no-numbers"
     if reason is None:
@@ -385,9 +449,6 @@ def apply_sign(rail: RailReadings, sign: int) -> RailReadings:
     """Return the rail with its current positive when drawn."""
     counter = None if rail.counter is None else rail.counter.times(sign)
     return replace(rail, current_amp=sign * rail.current_amp, counter=counter)
-
-
-Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,7 +54,7 @@ from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
-from tcpipe.tables.facts import PhysicsFacts
+from tcpipe.tables.facts import PhysicsFacts, Smoothing
 from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,
     MASKED_TRACK,
@@ -84,8 +84,10 @@ def label_segments(
     variance_j2: list[dict[str, NDArray[np.float64]]] = []
     epochs: list[int] = np.unique(to_integers(masked.table, "clock_epoch")).tolist()
     rails_by_epoch = {epoch: make_rails(streams, epoch) for epoch in epochs}
-    standing = find_idle_power(masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz)
     power = audit_power_sensor(masked.table, rails_by_epoch, masked.info, config)
+    standing = find_idle_power(
+        masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz, smoothing=power.smoothing or Smoothing(0.0, 0.0)
+    )
     for epoch, rails in rails_by_epoch.items():
         rows, cut = (select_rows(table, "clock_epoch", epoch) for table in (masked.table, segments.table))
         joules.update(sum_energy_entries(rows, rails, rate_hz=masked.info.rate_hz, rule=rule))
@@ -94,7 +96,7 @@ def label_segments(
         sensor = make_sensor_error(cut, rails, power, rule=rule)
         power = replace(power, lost_signs=power.lost_signs + int(np.count_nonzero(sensor.sign_joule)))
         cost, net, causes = compute_segment_costs(
-            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor
+            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor, smoothing=power.smoothing
         )
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
@@ -150,6 +152,7 @@ def compute_segment_costs(
     rule: Rule,
     standing: IdlePower,
     sensor: SensorError,
+    smoothing: Smoothing | None = None,
 ) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
     """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
@@ -157,8 +160,8 @@ def compute_segment_costs(
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, find_stationary_ns(rows, info.rate_hz)
-    noise = estimate_energy_noise(rails, *spans)
-    better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ)
+    noise = estimate_energy_noise(rails, *spans, smoothing=smoothing)
+    better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ, smoothing=smoothing)
     ground_mps = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
     end_watt, noise_joule = compute_power_watt(rails, end_ns), noise.std_joule()
     scale_std = find_common_scale_std(info.report.facts.fuse, start_ns, to_integers(cut, "clock_epoch"))
@@ -215,13 +218,16 @@ _EDGE_S = 0.3
 """After a stop and before a start motors draw."""
 
 
-def find_idle_power(rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float) -> IdlePower:
+def find_idle_power(
+    rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float, smoothing: Smoothing
+) -> IdlePower:
     """Return the idle power of all rows of a masked track, and its standard deviation; ``rails`` (by clock epoch) show the resolution."""
     piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
-    halt, edge = np.full(rows.num_rows, -1), round(_EDGE_S * rate_hz)
+    halt = np.full(rows.num_rows, -1)
+    begin, end = (round((_EDGE_S + more_s) * rate_hz) for more_s in (smoothing.settles_s, smoothing.after_s))
     for number, (first, last) in enumerate(find_runs(standing, piece).tolist()):
-        halt[first + edge : max(last + 1 - edge, first + edge)] = number
+        halt[first + begin : max(last + 1 - end, first + begin)] = number
     power_watt = to_floats(rows, "power_watt")
     return estimate_idle_power(
         power_watt[standing], halt[standing], window_rows=round(rate_hz), step_watt=_step_watt(rails)

@@ -20,14 +20,15 @@ from tcpipe.power.audit import (
     measure_sag,
     summarize_rest,
 )
-from tcpipe.power.rails import Rail, Rule, integrate_energy
+from tcpipe.power.rails import Rail, Rule, integrate_energy, sum_power
+from tcpipe.power.sampling import find_smoothing
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
 from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import LabelFacts, PowerSensorFacts, PowerSign, StageFacts
+from tcpipe.tables.facts import LabelFacts, PowerSensorFacts, PowerSign, Smoothing, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import Streams, TrackInfo
 
@@ -51,7 +52,11 @@ def audit_power_sensor(
     ``rows`` are those of the masked track.
     """
     power = info.report.facts.power
-    facts = PowerSensorFacts(*_find_prior(power))
+    clocks = info.report.facts.clock_offsets
+    late = clocks is not None and "power" in clocks.offsets and clocks.offsets["power"].noted  # flags every label
+    corrected_s = info.report.facts.time_offset_s.get("power", 0.0)
+    smoothing = None if late else _find_longest_smoothing(rows, rails_by_epoch, corrected_s)
+    facts = PowerSensorFacts(*_find_prior(power), smoothing=smoothing)
     if config.power_gain_std_fraction is not None:
         facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
     else:
@@ -61,8 +66,10 @@ def audit_power_sensor(
     if power is None or power.rest_current_amp is None:
         return facts
     rest_amp: dict[str, list[Floats]] = {}
+    settling_s = np.array((smoothing.settles_s, -smoothing.after_s) if smoothing else (0.0, 0.0))
     for epoch, rails in rails_by_epoch.items():
         still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz, but=DropReason.STUCK)
+        still_ns = still_ns + np.rint(1e9 * settling_s).astype(np.int64)
         for rail in rails:
             rest_amp.setdefault(rail.name, []).append(measure_rest_currents(rail, still_ns))
     joined = [current_amp for parts in rest_amp.values() if (current_amp := np.concatenate(parts)).size]
@@ -91,6 +98,24 @@ def _add_gain_change(facts: PowerSensorFacts, rails_by_epoch: Mapping[int, list[
     return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
 
 
+def _find_longest_smoothing(
+    rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], corrected_s: float
+) -> Smoothing | None:
+    """Return how power is smoothed in the clock epoch in which it is most; None where none shows it."""
+    found = []
+    for epoch, rails in rails_by_epoch.items():
+        mine = select_rows(rows, "clock_epoch", epoch)
+        motion = np.column_stack(
+            [to_floats(mine, name) for name in ("forward_velocity_mps", "yaw_rate_radps", "pitch_rad")]
+        )
+        motion[:, 2] = -motion[:, 0] * np.sin(motion[:, 2])  # pitch is positive nose down
+        known = np.isfinite(motion).all(axis=1)
+        if (power := sum_power(rails)) is not None:
+            stamp_ns, averaged = to_integers(mine, "stamp_ns")[known], any(rail.averaged for rail in rails)
+            found.append(find_smoothing(power, stamp_ns, motion[known], averaged=averaged, corrected_s=corrected_s))
+    return max(filter(None, found), key=lambda smoothing: smoothing.width_s, default=None)
+
+
 _POWER = Subject("role", "power")
 
 
@@ -99,6 +124,7 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
     facts, power = label.power_sensor, info.report.facts.power
     if facts is None:
         return
+    given_s = info.report.facts.time_offset_s.get("power", 0.0)
     if facts.rest_amp and power and power.rest_current_amp and facts.offset_std_amp > _find_prior(power)[1]:
         yield make_finding(
             "current-offset",
@@ -121,6 +147,12 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
             at_s=at_s,
             gain_std_fraction=facts.gain_std_fraction,
         )
+    if (smoothing := facts.smoothing) is not None:
+        yield make_finding(
+            "power-smoothed", _POWER,
+            remedies=suggest("correct", {"read.time_offset_s": {"power": given_s - smoothing.late_s}}) if smoothing.late_s else (),
+            width_s=smoothing.width_s, late_s=smoothing.late_s,
+        )  # fmt: skip
     if facts.lost_signs:
         yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
 

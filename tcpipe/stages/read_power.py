@@ -15,7 +15,7 @@ from tcpipe.logs.messages import LOG_TIME, Readings, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.sampling import find_readings, is_stated_averaged
-from tcpipe.power.sources import Counter, RailReadings, reject_power
+from tcpipe.power.sources import Counter, RailReadings, find_lone_side, reject_power
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
@@ -39,6 +39,8 @@ def read_power_of_topics(
     if len(topics) < wanted:
         lost = [topic for topic in assignment.roles["power"].topics if topic not in topics]
         return PowerReadings(findings=tuple(reject_power(topic, "not-decoded") for topic in lost))
+    if "power" not in config.topics and (topic := find_lone_side(topics)):
+        return PowerReadings(findings=(reject_power(topic, "other-side-missing"),))
     return read_power(
         topics,
         known.power_sources,

@@ -368,11 +368,34 @@ class PhysicsFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class Smoothing:
+    """Every value of the power is a mean from ``before_s`` before its stamp to ``after_s`` after it, beyond what the source states."""
+
+    before_s: float
+    after_s: float
+
+    @property
+    def width_s(self) -> float:
+        """Over how long each value is a mean [s]."""
+        return self.before_s + self.after_s
+
+    @property
+    def settles_s(self) -> float:
+        """How long after a stop values contain the motion before it [s]: a filter's output longer than the mean that is most like it."""
+        return 2.0 * self.before_s
+
+    @property
+    def late_s(self) -> float:
+        """How late the middle of that time is stamped [s]."""
+        return (self.before_s - self.after_s) / 2.0
+
+
+@dataclass(frozen=True, slots=True)
 class PowerSensorFacts:
     """What is not known of the power sensor: σ of its gain and of the zero of a rail [A], and what the log shows (`tcpipe.power.audit`).
 
     ``rest_amp``: lowest and highest current of a rail in halts; the gain changed by ``gain_ratio`` at ``gain_changed_ns``;
-    ``lost_signs``: segments whose current flows back without a sign.
+    ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None where none shows.
     """
 
     gain_std_fraction: float
@@ -381,6 +404,7 @@ class PowerSensorFacts:
     gain_ratio: float | None = field(default=None, metadata=LEFT_OUT)
     gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
     lost_signs: int = 0
+    smoothing: Smoothing | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,12 +106,8 @@ def test_the_drive_as_it_is_raises_no_doubt(drive, tmp_path):
     assert not select_findings(labelled.info.report.findings, "idle-power-high")
 
 
-@pytest.mark.parametrize("units", ["g", "deg_g"])
-def test_an_imu_in_degrees_or_in_g_is_refused_until_it_is_declared(drive, tmp_path, units):
-    factors = {
-        "angular_velocity": np.degrees(1.0) if "deg" in units else 1.0,
-        "linear_acceleration": 1 / 9.80665 if "g" in units.split("_") else 1.0,
-    }
+def test_an_imu_in_degrees_and_in_g_is_refused_until_it_is_declared(drive, tmp_path):
+    factors = {"angular_velocity": np.degrees(1.0), "linear_acceleration": 1 / 9.80665}
     other = drive.changed(
         "imu", lambda c: {n: v * factors[n.split(".")[0]] for n, v in c.items() if n.split(".")[0] in factors}
     )
@@ -119,7 +115,7 @@ def test_an_imu_in_degrees_or_in_g_is_refused_until_it_is_declared(drive, tmp_pa
     assert refused(labelled) == {"imu"}
     assert_labels_hold(labelled, drive.truth)
     config = cure(labelled, "imu")
-    assert config.imu_units == units
+    assert config.imu_units == "deg_g"
     declared = run(other, tmp_path, config)
     assert refused(declared) == set()
     assert "imu" in fused(declared)
@@ -137,13 +133,9 @@ UKF = Recipe(fuse=FuseConfig(estimator="ukf"))
 FIXES = ("wheels", "visual", "doppler")
 
 
-@pytest.mark.parametrize(
-    ("when", "without"),
-    [(every(1.0), ("visual", "doppler")), (every(0.2), FIXES), (lambda at_s: at_s % 1.0 < 0.3, FIXES)],
-    ids=["1 Hz", "5 Hz", "bursts"],
-)
-def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path, when, without):
-    few = drive.without(*without)
+@pytest.mark.parametrize("when", [every(0.2), lambda at_s: at_s % 1.0 < 0.3], ids=["5 Hz", "bursts"])
+def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path, when):
+    few = drive.without(*FIXES)
     slow, none = run(heard(few, "imu", when), tmp_path), run(few.without("imu"), tmp_path)
     assert refused(slow) == {"imu"}
     assert exclusion(slow, "imu").code == "imu-too-slow"
@@ -152,39 +144,30 @@ def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path, when, wit
         np.testing.assert_array_equal(slow.table[name].to_numpy(), none.table[name].to_numpy())
 
 
-@pytest.mark.parametrize(
-    ("recipe", "without", "period_s"),
-    [
-        (Recipe(), ("visual", "doppler"), 0.08),
-        (Recipe(), FIXES, 0.01),
-        (UKF, FIXES, 0.08),
-    ],
-)
-def test_gaps_of_an_imu_are_driven_as_without_it(drive, tmp_path, recipe, without, period_s):
+@pytest.mark.parametrize(("recipe", "period_s"), [(Recipe(), 0.01), (UKF, 0.08)])
+def test_gaps_of_an_imu_are_driven_as_without_it(drive, tmp_path, recipe, period_s):
     """What it felt last is not held for seconds: the forward filter made 272 m of these 63."""
     gaps = ((20.0, 23.0), (40.0, 45.0), (60.0, 70.0))
 
     def when(at_s):
         return every(period_s)(at_s) & ~np.any([(at_s > first) & (at_s < last) for first, last in gaps], axis=0)
 
-    labelled = run(heard(drive.without(*without), "imu", when), tmp_path, recipe=recipe)
+    labelled = run(heard(drive.without(*FIXES), "imu", when), tmp_path, recipe=recipe)
     assert "imu" in fused(labelled)
     assert sum(labelled.distance_by_reason_m.values()) == pytest.approx(63.0, rel=0.06)
     assert_labels_hold(labelled, drive.truth, within=0.04)
 
 
-@pytest.mark.parametrize("without", [("visual", "doppler"), FIXES])
-def test_an_imu_that_is_silent_while_the_robot_sets_off_leaves_its_heading_known(drive, tmp_path, without):
+def test_an_imu_that_is_silent_while_the_robot_sets_off_leaves_its_heading_known(drive, tmp_path):
     """The first yaw came from a path that turned through the gap as the gyroscope did on both sides of it: labels were 2 to 5 % off."""
-    silent = heard(drive.without(*without), "imu", lambda at_s: (at_s < 7.0) | (at_s > 10.0))
+    silent = heard(drive.without(*FIXES), "imu", lambda at_s: (at_s < 7.0) | (at_s > 10.0))
     labelled = run(silent, tmp_path)
     assert "imu" in fused(labelled)
     assert not select_findings(labelled.info.report.findings, "gnss-contradicts-odometry")
     assert_labels_hold(labelled, drive.truth, at_least=54, within=0.012)
 
 
-@pytest.mark.parametrize(("recipe", "without"), [(Recipe(), ("visual", "doppler")), (Recipe(), FIXES), (UKF, FIXES)])
-def test_an_imu_that_leads_the_track_astray_is_left_out(drive, tmp_path, recipe, without):
+def test_an_imu_that_leads_the_track_astray_is_left_out(drive, tmp_path):
     """Its x and y axes change places halfway: with fixes alone that made 6.8 km and 4,132 labels of 63 m."""
 
     def loosened(c):
@@ -195,7 +178,7 @@ def test_an_imu_that_leads_the_track_astray_is_left_out(drive, tmp_path, recipe,
             for axis, other, sign in (("x", "y", 1.0), ("y", "x", -1.0))
         }
 
-    labelled = run(drive.without(*without).changed("imu", loosened), tmp_path, recipe=recipe)
+    labelled = run(drive.without(*FIXES).changed("imu", loosened), tmp_path)
     assert refused(labelled) == {"imu"}
     assert exclusion(labelled, "imu").code == "misleads-track"
     assert sum(labelled.distance_by_reason_m.values()) == pytest.approx(63.0, rel=0.08)
@@ -252,9 +235,6 @@ def flipped(drive: Drive, sensor: str, flip: str) -> Drive:
     [
         ("forward", ()),
         ("yaw rate", ("command",)),
-        ("both", ()),
-        ("forward", ("command", "visual")),
-        ("yaw rate", ("command", "visual")),
         ("both", ("command", "visual")),
     ],
 )
@@ -305,7 +285,6 @@ UNLIKE = {
         {"unit": "radians"},
     ),
     "exchanged axes": ("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]}, "path-mirrored", {}),
-    "wheels that never change": ("wheels", constant("twist.twist"), "frozen", {"quantity": "velocity"}),
     "wheels in km/h": (
         "wheels",
         lambda c: {"twist.twist.linear.x": 3.6 * c["twist.twist.linear.x"]},
@@ -358,12 +337,14 @@ def test_two_that_contradict_each_other_are_both_refused(drive, tmp_path):
     assert suspects == {"gnss": "wheel_odometry", "wheel_odometry": "gnss"}
 
 
+SENSORS = ("gnss", "imu", "wheels", "power", "visual", "command")
+
+
 def scattered(size: int, share: float = 0.05) -> np.ndarray:
     return np.random.default_rng(8).random(size) < share
 
 
-@pytest.mark.parametrize("sensors", [("gnss", "imu"), ("wheels", "power"), ("visual", "command")], ids="-".join)
-def test_values_that_are_no_numbers_cost_only_themselves(drive, tmp_path, sensors):
+def test_values_that_are_no_numbers_cost_only_themselves(drive, tmp_path):
     def broken(columns: Columns) -> Columns:
         found = {}
         for name, values in columns.items():
@@ -373,7 +354,7 @@ def test_values_that_are_no_numbers_cost_only_themselves(drive, tmp_path, sensor
                 found[name] = values
         return found
 
-    labelled = run(reduce(lambda drive, sensor: drive.changed(sensor, broken), sensors, drive), tmp_path)
+    labelled = run(reduce(lambda drive, sensor: drive.changed(sensor, broken), SENSORS, drive), tmp_path)
     assert refused(labelled) == set()
     assert_labels_hold(labelled, drive.truth, at_least=15)
 
@@ -409,7 +390,7 @@ def covariances(kind: str, size: int) -> np.ndarray:
 ODD = ("zero", "negative", "nan", "infinite", "not positive", "too good")
 
 
-@pytest.mark.parametrize("kinds", [ODD[:4], ODD[2:], (*ODD[4:], *ODD[:2]), ("too large",) * 4], ids=", ".join)
+@pytest.mark.parametrize("kinds", [ODD[:4], ODD[2:], ("too large",) * 4], ids=", ".join)
 def test_covariances_that_cannot_be_are_replaced(drive, tmp_path, kinds):
     """The kinds are of GNSS, wheels, camera and IMU."""
     of_gnss, *of_others = kinds
@@ -445,27 +426,23 @@ def unused(labelled: LabelledSegments) -> Finding:
     return found
 
 
-def test_fixes_at_zero_zero_are_no_places(drive, tmp_path):
-    def somewhere(columns: Columns) -> Columns:
+def test_fixes_at_zero_zero_are_no_places_and_others_without_altitude_still_say_where(drive, tmp_path):
+    def broken(columns: Columns) -> Columns:
         hit = scattered(len(columns["latitude"]), 0.2)
-        return {name: np.where(hit, 0.0, columns[name]) for name in ("latitude", "longitude", "altitude")}
+        given = columns | {"altitude": np.full_like(columns["altitude"], np.nan)}
+        return {name: np.where(hit, 0.0, given[name]) for name in ("latitude", "longitude", "altitude")}
 
-    labelled = run(drive.changed("gnss", somewhere), tmp_path)
-    assert_labels_hold(labelled, drive.truth)
+    labelled = run(drive.changed("gnss", broken), tmp_path)
+    assert labelled.info.datum is not None
     assert unused(labelled).numbers["null_island_count"]
+    assert select_findings(labelled.info.report.findings, "altitude-missing")
+    assert_labels_hold(labelled, drive.truth)
 
 
 def test_a_current_with_an_offset_is_said(drive, tmp_path):
     other = drive.changed("power", lambda c: {n: v + 50.0 for n, v in c.items() if "current" in n})
     (finding,) = select_findings(run(other, tmp_path).info.report.findings, "idle-power-high")
     assert finding.numbers["idle_watt"] > 0.5 * finding.numbers["driving_watt"]
-
-
-def test_fixes_without_altitude_still_say_where(drive, tmp_path):
-    labelled = run(drive.changed("gnss", lambda c: {"altitude": np.full_like(c["altitude"], np.nan)}), tmp_path)
-    assert labelled.info.datum is not None
-    assert select_findings(labelled.info.report.findings, "altitude-missing")
-    assert_labels_hold(labelled, drive.truth)
 
 
 def test_a_receiver_that_never_had_a_fix_leaves_a_local_frame(drive, tmp_path):
@@ -479,7 +456,7 @@ def test_a_receiver_that_never_had_a_fix_leaves_a_local_frame(drive, tmp_path):
 
 @pytest.mark.parametrize(
     ("sensors", "share"),
-    [(("gnss", "imu"), 0.1), (("gnss", "power"), 1.0), (("imu",), 1.0), (("wheels", "visual"), 1.0)],
+    [(("gnss", "imu"), 0.1), (("gnss", "power"), 1.0), (("imu", "wheels", "visual"), 1.0)],
 )
 def test_stamps_at_zero_are_taken_from_the_recorder(drive, tmp_path, sensors, share):
     def unset(columns: Columns) -> Columns:
@@ -556,16 +533,6 @@ def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_co
     assert select_findings(found.findings, "rate-from-orientation")
 
 
-def test_a_scale_that_is_taken_out_is_told_where_the_estimator_has_none(drive, tmp_path):
-    other = drive.without("imu", "visual", "command")
-    other = other.changed("wheels", lambda c: {"twist.twist.linear.x": 3.0 * c["twist.twist.linear.x"]})
-    labelled = run(other, tmp_path, recipe=parse_recipe({"fuse": {"estimator": "ukf"}}, where="test"))
-    (scale,) = select_findings(labelled.info.report.findings, "odometry-scale")
-    assert scale.numbers["scale"] == pytest.approx(3.0, rel=0.1)
-    stated = proposed(scale)["read"]["odometry_scale"]["wheel_odometry"]
-    assert stated == pytest.approx(1.0 / 3.0, rel=0.1)
-
-
 LATE_S = 0.3
 
 
@@ -594,7 +561,7 @@ def time_offsets(labelled: LabelledSegments) -> list[Finding]:
     return select_findings(labelled.info.report.findings, "time-offset")
 
 
-@pytest.mark.parametrize("sensor", ["gnss", "imu", "wheels", "visual", "power", "pose"])
+@pytest.mark.parametrize("sensor", ["gnss", "pose"])
 def test_a_late_clock_is_corrected_by_the_lines_as_they_are_printed(drive, tmp_path, sensor):
     config = {"read": {"topics": {"pose": [POSE_TOPIC]}}} if sensor == "pose" else {}
     other = with_pose(drive) if sensor == "pose" else drive
@@ -604,9 +571,8 @@ def test_a_late_clock_is_corrected_by_the_lines_as_they_are_printed(drive, tmp_p
     )
     off = Drive(drive.truth, messages)
     (finding,) = time_offsets(run(off, tmp_path, parse_recipe(config, where="test").read))
-    role = {"wheels": "wheel_odometry", "visual": "visual_odometry"}.get(sensor, sensor)
-    ((role_said, offset_s),) = proposed(finding)["read"]["time_offset_s"].items()
-    assert (finding.subject.name, role_said) == (role, role)
+    ((role, offset_s),) = proposed(finding)["read"]["time_offset_s"].items()
+    assert (finding.subject.name, role) == (sensor, sensor)
     assert offset_s == pytest.approx(-LATE_S, abs=0.03)
     assert not time_offsets(run(off, tmp_path, recipe_that_follows(finding, before=config).read))
 

@@ -21,35 +21,24 @@ COLOR = "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n"
 
 READ = """
 import json, re, sys, time
-import tcpipe
+from click.testing import CliRunner
+from tcpipe.cli import cli
 from tcpipe.errors import TcpipeError
-from tcpipe.formats.finding_lines import describe_finding
-from tcpipe.pipeline.inspect import inspect
-from tcpipe.recipe import Recipe
 
 def most_bytes():  # getrusage's would hold what the parent had before this program was begun
     with open("/proc/self/status") as status:
         return int(re.search(r"VmHWM:\\s+(\\d+)", status.read())[1]) * 1024
 
-def read(path):
-    with tcpipe.read_log(path) as log:
-        rows = sum(table.num_rows for table in log.tables(log.topics).values())
-        return [describe_finding(finding) for finding in log.findings][:5], rows
-
 for path in sys.argv[1:]:
-    for what, run in {
-        "read": read,
-        "inspect": lambda path: inspect(path, recipe=Recipe(), full=True),
-        "ingest": lambda path: [result.problems for result in tcpipe.ingest([path], store=path + "-store").results],
-    }.items():
+    for command, *options in (("inspect", "--full"), ("ingest", "--store", path + "-store")):
         start = time.process_time()
-        try:
-            said = str(run(path))
-        except TcpipeError as error:
-            said = str(error)
-        except Exception as error:
-            said = f"raw: {type(error).__name__}: {error}"
-        print(json.dumps([path, what, said[:1000], time.process_time() - start, most_bytes()]), flush=True)
+        done = CliRunner().invoke(cli, [command, path, *options], standalone_mode=False)
+        error = done.exception
+        raw = "" if error is None or isinstance(error, TcpipeError) else f"raw: {type(error).__name__}: "
+        said = f"{done.output}{raw}{error}"
+        print(json.dumps([path, command, said, time.process_time() - start, most_bytes()]), flush=True)
+        if error is not None:
+            break  # `ingest` opens it in the same way
 """
 
 
@@ -200,7 +189,7 @@ HOSTILE = {
     "claims.bag": (bag(bag_chunk(lz4.frame.compress(bytes(1 << 28)), b"lz4", 1 << 31)), "a length, type or field is impossible"),
     "connections.bag": (bag(bag_chunk(b"".join(bag_record(7, b"", conn=struct.pack("<I", n), topic=b"/t") for n in range(70_000)))), BOMB),
     "long metadata": (directory("x: [1, 2]\n" * 300_000), "metadata.yaml is missing, unusable or without this file"),
-    "files": (directory("", 4200), "bags of up to 4096 are read"),
+    "files": (directory("a: 1", 4200), "bags of up to 4096 are read"),
     "names of files": (directory("rosbag2_bagfile_information:\n  relative_file_paths:\n" + "  - a\n" * 5000), "names 5000 files"),
     "links": (linked, ""),
     "lists.ulg": (ulog("a:b[60000] b;", "b:c[60000] c;", "c:double[60000] d;"), "longer than any can be"),

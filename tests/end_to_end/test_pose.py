@@ -87,7 +87,7 @@ def inside(labelled):
     return np.mean(np.abs(error) < 2.0 * to_floats(labelled.table, "duration_std_s"))
 
 
-@pytest.mark.parametrize("without", [(), ("visual",), ("imu", "visual")], ids=["all", "no camera", "wheels"])
+@pytest.mark.parametrize("without", [(), ("imu", "visual")], ids=["all", "wheels"])
 def test_labels_hold_and_yaw_is_better_than_without_attitude(run, without):
     track, labelled = run(*without)
     error, std = yaw_errors(track)

@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from simulated_streams import streams_of
 
 from tcpipe.pipeline.ingest_run import run_stages
@@ -20,7 +21,7 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import MASKED_TRACK, STREAMS
 
 NOISY = Faults.only("gnss_noise", "imu_noise", "wheel_noise", "visual_noise", "power_noise")
-CODES = {"current-offset", "current-gain-changes", "current-sign-lost"}
+CODES = {"current-offset", "current-gain-changes", "current-sign-lost", "power-smoothed"}
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +67,12 @@ def find_codes(labelled):
     return {found.code: found for found in labelled.info.report.findings if found.code in CODES}
 
 
+def average(amp, seconds):
+    """Return the mean of the samples at 20 Hz so far back."""
+    total = np.cumsum(np.concatenate((np.full(20 * seconds, amp[0]), amp)))
+    return (total[20 * seconds :] - total[: -20 * seconds]) / (20 * seconds)
+
+
 FAULTS = {
     "offset of 1 A": (lambda amp, _: amp + 1.0, "current-offset"),
     "offset of 0.5 A": (lambda amp, _: amp + 0.5, "current-offset"),
@@ -74,6 +81,9 @@ FAULTS = {
     "unsigned": (lambda amp, _: np.abs(amp), "current-sign-lost"),
     "gain + 10 %": (lambda amp, share: amp * np.where(share > 0.5, 1.1, 1.0), "current-gain-changes"),
     "gain - 10 %": (lambda amp, share: amp * np.where(share > 0.4, 0.9, 1.0), "current-gain-changes"),
+    "mean of 2 s": (lambda amp, _: average(amp, 2), "power-smoothed"),
+    "mean of 6 s": (lambda amp, _: average(amp, 6), "power-smoothed"),
+    "two means of 1 s": (lambda amp, _: average(average(amp, 1), 1), "power-smoothed"),
 }
 
 
@@ -113,10 +123,10 @@ def test_a_right_sensor_gives_no_finding_and_only_its_prior(drive):
 
 
 def test_labels_of_many_sensors_are_as_wrong_as_they_say(drive):
-    """Gain and zero drawn once a run, as the prior has them: pooled over runs, σ is right."""
-    rng = np.random.default_rng(5)
-    drawn = [partial(lambda amp, _, gain, zero: amp * (1.0 + gain) + zero, gain=rng.normal(0, 0.02), zero=rng.normal(0, 0.2))
-             for _ in range(40)]  # fmt: skip
+    """Gain and zero of each run are quantiles of their priors: pooled over runs, σ is right."""
+    rng, quantiles = np.random.default_rng(5), norm.ppf((np.arange(20) + 0.5) / 20)
+    drawn = [partial(lambda amp, _, gain, zero: amp * (1.0 + gain) + zero, gain=gain, zero=zero)
+             for gain, zero in zip(0.02 * rng.permutation(quantiles), 0.2 * rng.permutation(quantiles), strict=True)]  # fmt: skip
     runs = [label(drive, change) for change in drawn]
     for name in ("power_watt", "energy_joule"):
         off = np.abs(np.concatenate([normalized(drive, run, name) for run in runs]))

@@ -66,7 +66,7 @@ def test_again_is_nothing_to_do(reproduced):
     before = (here / "here" / "reproduction.json").read_bytes()
     again = tcpipe("reproduce", "here", "--quick", "--seeds", "1", "--jobs", "1", cwd=here, env=ENV)
     assert again.returncode == 0
-    assert "epoch" not in again.stderr
+    assert not {"fusing", "epoch"} & set(re.findall(r"\w+", again.stderr))
     assert (here / "here" / "reproduction.json").read_bytes() == before
     assert again.stdout.splitlines()[:-2] == first.stdout.splitlines()[:-2]
 

@@ -4,6 +4,7 @@ import re
 import threading
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import cycle
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -142,16 +143,18 @@ CREDENTIALS = (
 )
 
 
-@pytest.mark.parametrize("url", CREDENTIALS)
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("ingest", "{}"), ("inspect", "{}"), ("preflight", "{}"), ("export", "{}", "out"), ("status", "--store", "{}"),
-        ("ingest", "none.bag", "--store", "{}"), ("ingest", "none.bag", "--cluster", "{}"), ("verify", "{}"), ("report", "{}"),
-        ("add-map", "site", "--height", "{}"), ("build-dataset", "--out", "{}"), ("explain", "x", "--dataset", "{}"),
-        ("predict-path", "{}", "path.geojson"), ("train", "{}"), ("status", "one", "two", "{}", "--unknown={}"),
-    ],
+COMMANDS = (
+    ("inspect", "{}"), ("preflight", "{}"), ("export", "{}", "out"), ("status", "--store", "{}"), ("verify", "{}"), ("report", "{}"),
+    ("ingest", "none.bag", "--store", "{}"), ("ingest", "none.bag", "--cluster", "{}"), ("add-map", "site", "--height", "{}"),
+    ("build-dataset", "--out", "{}"), ("explain", "x", "--dataset", "{}"), ("predict-path", "{}", "path.geojson"), ("train", "{}"),
+    ("status", "one", "two", "{}", "--unknown={}"),
 )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("url", "arguments"),
+    [*((url, ("ingest", "{}")) for url in CREDENTIALS), *zip(cycle(CREDENTIALS), COMMANDS, strict=False)],
+)
 def test_a_url_with_credentials_is_refused_and_they_are_not_shown(url, arguments, tmp_path):
     done = tcpipe(*(argument.format(url) for argument in arguments), cwd=tmp_path)
     plain_lines(done, done.returncode)

@@ -202,7 +202,7 @@ def stamp_ns(message):
 def test_diff_names_cause_and_effect(work):
     same = tcpipe("diff", "dataset", "dataset", cwd=work)
     assert (same.returncode, len(same.stdout.splitlines())) == (0, 1)
-    done = tcpipe("build-dataset", "other", "--holdout", "sample", "--quiet", cwd=work)
+    done = tcpipe("build-dataset", "other", "--holdout", "sample", "--jobs", "2", "--quiet", cwd=work)
     assert done.returncode == 0, done.stderr
     other = tcpipe("diff", "dataset", "other", cwd=work)
     assert other.returncode == 1

@@ -18,8 +18,8 @@ TARGETS = fuzz_log_reading.TARGETS
 
 CHANGES = 8
 """Changed copies of each input of a corpus."""
-RUNS = {"autopilots": 100, "containers": 40, "plans": 100, "definitions": 250}
-"""Inputs of a run with atheris: each takes some seconds."""
+RUNS = 250
+"""Inputs of a run with atheris."""
 
 
 def changed(data, rng):
@@ -51,12 +51,11 @@ def test_inputs_and_changed_inputs_break_nothing(name, tmp_path):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
-@pytest.mark.parametrize("name", TARGETS)
-def test_a_run_guided_by_coverage_finds_nothing(name, tmp_path):
-    command = [sys.executable, "-W", "ignore", TARGET_FILE, name, f"--runs={RUNS[name]}", "--seed=1"]
+def test_a_run_guided_by_coverage_finds_nothing(tmp_path):
+    command = [sys.executable, "-W", "ignore", TARGET_FILE, "definitions", f"--runs={RUNS}", "--seed=1"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     ended = re.search(r"^Done (\d+) runs", done.stderr, re.MULTILINE)  # libFuzzer may do one more than is asked for
     assert ended is not None, done.stderr[-3000:]
-    assert int(ended[1]) >= RUNS[name], done.stderr[-3000:]
+    assert int(ended[1]) >= RUNS, done.stderr[-3000:]
     assert list(tmp_path.iterdir()) == []

@@ -59,14 +59,6 @@ def test_every_field_is_what_rosbags_reads(name):
         assert_same(tables[topic], {name: [row[name] for _, row in rows] for name in names})
 
 
-def test_the_bags_of_one_content_and_three_compressions_are_equal():
-    def content(name):
-        with open_log(shared_data(f"peers/rosbag.js/fixtures/{name}")) as log:
-            return {topic: table_bytes(table) for topic, table in log.tables(log.topics).items()}
-
-    assert content("example.bag") == content("example-bz2.bag") == content("example-lz4.bag")
-
-
 def test_compressed_and_split_bags_of_old_recorders():
     base = shared_data("peers/rosbag2_old/rosbag2_tests/resources/reindex_test_bags")
     counts = {}

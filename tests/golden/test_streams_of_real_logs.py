@@ -9,7 +9,6 @@ import pytest
 from shared_data import shared_data
 
 import tcpipe
-from tcpipe.errors import RoleError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.recipe import Extrinsics, ReadConfig
@@ -106,10 +105,3 @@ def test_a_battery_that_says_nothing_and_stamps_in_whole_seconds() -> None:
     (by_log,) = select_findings(found.report.findings, "log-time-used")
     assert by_log.names == {"topic": "/velocity", "reason": "header-repeats"}
     assert found.tables["wheel_odometry"].num_rows == 5270
-
-
-def test_two_turtles_tell_no_motion() -> None:
-    with pytest.raises(RoleError) as error:
-        read(shared_data("peers/rosbag.js/fixtures/example.bag"))
-    assert len(error.value.problems) == 2
-    assert "/turtle1/cmd_vel (geometry_msgs/msg/Twist" in error.value.problems[1]

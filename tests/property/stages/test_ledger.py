@@ -65,11 +65,7 @@ def labelled(track):
     t_ns = np.arange(stamp_ns.min() - 10**9, stamp_ns.max() + 10**9, 40_000_000)
     power = power_streams({"drive": (t_ns, np.full(len(t_ns), 24.0), np.full(len(t_ns), 6.0))})
     found = label_segments(
-        segment_track(masked, SegmentConfig()),
-        masked,
-        power,
-        LabelConfig(),
-        voltage_range_volt=None,
+        segment_track(masked, SegmentConfig()), masked, power, LabelConfig(), voltage_range_volt=None
     )
     return masked, found, 144.0 * (t_ns[-1] - t_ns[0]) * 1e-9
 

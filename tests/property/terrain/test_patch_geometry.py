@@ -5,7 +5,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tcpipe.terrain.sampling import compute_footprints, make_patch_frames, map_px_from_patch, sample_chord_px
-from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.target_grid import MapGrid
 
 PLACES = st.tuples(st.floats(-4e5, 4e5), st.floats(-4e5, 4e5))
@@ -52,19 +51,3 @@ def test_pixels_lie_where_the_ruling_says(*, start, angle, scale, chord_m, facto
     line = sample_chord_px(frames, grid, chord_m=np.array([chord_m]), points=7)[0]
     np.testing.assert_allclose(grid.xy_from_px(line[:2] + 3 * line[2:]), (p0[0] + pn[0]) / 2.0, atol=1e-7)
     np.testing.assert_allclose(grid.xy_from_px(line[:2] - 0.5 * line[2:]), p0[0], atol=1e-7)
-
-
-@given(PLACES)
-def test_pixels_and_points_are_inverse(place):
-    grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.05, 10, 10)
-    xy = np.array([500_000.0, 5_200_000.0]) + np.array(place) / 1e3
-    np.testing.assert_allclose(grid.xy_from_px(grid.px_from_xy(xy)), xy, atol=1e-8)
-
-
-@given(st.lists(st.tuples(st.integers(0, 2**20), st.integers(0, 2**20)), min_size=1, max_size=50))
-def test_morton_interleaves_bits(cells):
-    x, y = np.array(cells, np.int64).T
-    code = compute_morton(np.ascontiguousarray(x), np.ascontiguousarray(y))
-    for a, b, c in zip(x.tolist(), y.tolist(), code.tolist(), strict=True):
-        digits = "".join(q + p for p, q in zip(f"{a:021b}", f"{b:021b}", strict=True))
-        assert c == int(digits, 2)

@@ -46,8 +46,3 @@ def test_every_reference_is_to_a_definition_and_every_definition_is_referred_to(
             assert pointer in schemas[file or name]["$defs"], (name, reference)
             used.add((file or name, pointer))
     assert used == {(name, of) for name, schema in schemas.items() for of in schema.get("$defs", {})}
-
-
-def test_no_two_schemas_are_the_same() -> None:
-    texts = [path.read_text() for path in SCHEMAS.glob("*.json")]
-    assert len(texts) == len(set(texts))

@@ -128,11 +128,7 @@ def test_without_steep_descents_nothing_is_said_of_what_comes_back():
 
 def test_without_turn_rates_there_is_no_term_of_turning():
     metres = replace(made(), mean_abs_yaw_rate_radps=np.full(400, np.nan))
-    assert {term for term, _ in fit_physics(metres, idle_watt=STANDING_WATT).terms} == {
-        "idle",
-        "rolling",
-        "grade",
-    }
+    assert {term for term, _ in fit_physics(metres, idle_watt=STANDING_WATT).terms} == {"idle", "rolling", "grade"}
 
 
 def test_too_few_metres_give_no_fit_and_no_robot_no_plausible_one():

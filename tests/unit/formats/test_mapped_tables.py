@@ -23,10 +23,7 @@ def table(tmp_path_factory):
 def test_rows_of_several_pieces_come_in_the_order_that_was_asked_for(table, count):
     rows = np.random.default_rng(count).integers(0, table.num_rows, count)
     assert take_rows(table, rows).equals(table.take(pa.array(rows)))
-
-
-def test_rows_of_no_piece_are_none(table):
-    assert take_rows(table.slice(0, 0), np.empty(0, np.int64)).equals(table.slice(0, 0))
+    assert take_rows(table.slice(0, 0), rows[:0]).equals(table.slice(0, 0))
 
 
 def test_rows_of_an_array_are_moved_into_a_file(tmp_path):

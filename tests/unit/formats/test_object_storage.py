@@ -64,22 +64,26 @@ def test_stand_ins_cost_nothing(bucket, tmp_path):
     assert bucket[1] == []
 
 
-@pytest.mark.parametrize("name", ["nowhere.mcap", "no/such/directory/run.mcap"])
-@pytest.mark.parametrize("store", ["file", "s3"])
-def test_what_is_not_there_is_refused_in_one_line(bucket, store, name):
-    url = f"{bucket[0].as_uri()}/{name}" if store == "file" else f"s3://drives/{name}"
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("{file}/nowhere.mcap", ""),
+        ("{file}/no/such/directory/run.mcap", ""),
+        ("s3://drives/nowhere.mcap", ""),
+        ("s3://drives/no/such/directory/run.mcap", ""),
+        (f"s3://{FORBIDDEN}/run.mcap", ": it cannot be read (the store requires credentials; set AWS_"),
+        ("gopher://host/run.mcap", ": it cannot be read"),
+        ("s3://", ": it cannot be read"),
+        ("s3:///run.mcap", ": it cannot be read"),
+    ],
+)
+def test_what_is_not_there_is_refused_in_one_line(bucket, url, said):
+    url = url.format(file=bucket[0].as_uri())
     with pytest.raises(LogError) as refused:
         open_log(url)
     (problem,) = refused.value.problems
-    assert name in problem
+    assert url.rpartition("//")[2] + said in problem
     assert "\n" not in problem
-
-
-def test_a_store_that_wants_credentials_is_told_in_one_line(bucket):
-    with pytest.raises(LogError) as refused:
-        open_log(f"s3://{FORBIDDEN}/run.mcap")
-    (problem,) = refused.value.problems
-    assert problem.startswith(f"s3://{FORBIDDEN}/run.mcap: it cannot be read (the store requires credentials; set AWS_")
 
 
 def test_a_log_is_inspected_where_nothing_beside_it_can_be_read(bucket):
@@ -112,12 +116,6 @@ def test_a_folder_by_its_file_url_is_read_by_range_and_copied(bucket):
         (stored,) = by_range.values()
         assert bytes(stored.ranges([(0, stored.size_bytes)])[0]) == (directory / "my run.mcap").read_bytes()
         assert (copy / "bag" / "bag.db3").read_bytes() == (directory / "bag" / "bag.db3").read_bytes()
-
-
-@pytest.mark.parametrize("url", ["gopher://host/run.mcap", "s3://", "s3:///run.mcap"])
-def test_a_url_that_leads_nowhere_is_refused(url):
-    with pytest.raises(LogError, match=f"{url}: it cannot be read"):
-        open_log(url)
 
 
 def test_an_endpoint_that_is_no_address_is_refused(monkeypatch):

@@ -178,17 +178,6 @@ def test_the_nearest_recipe_upward_rules(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_recipe(Path("mine.toml"), deep) == Path("mine.toml")
 
 
-def test_dataset_keys_do_not_rename_runs_but_ingest_keys_do() -> None:
-    default = Recipe()
-    split = parse_recipe({"split": {"seed": 7}, "sample": {"patch_px": 20}}, where="r")
-    fused = parse_recipe({"label": {"velocity": "fused"}}, where="r")
-    assert ingest_key(default) == ingest_key(split) != ingest_key(fused)
-    assert make_recipe_id(default, "husky") == make_recipe_id(split, "husky") != make_recipe_id(default, "warthog")
-    plain = read_key(default, None, definitions="")
-    assert plain == read_key(fused, None, definitions="")
-    assert plain not in (read_key(default, "husky", definitions=""), read_key(default, None, definitions="ab"))
-
-
 def test_the_commented_recipe_is_toml_whatever_its_docstrings_say() -> None:
     text = format_commented_toml()
     assert parse_recipe(tomllib.loads(text), where="init") == Recipe()

@@ -5,7 +5,6 @@ from importlib.resources import files
 import pytest
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.recipe_toml import format_commented_toml, load_profiles, load_shipped_profiles, parse_recipe
 from tcpipe.recipe import Recipe
 from tcpipe.robots import GENERIC, FieldPath, PowerSource, Robot, parse_fields
@@ -98,8 +97,3 @@ def test_a_robot_made_in_python_is_checked_where_a_recipe_takes_it():
     with pytest.raises(RecipeError, match=r"robots\.mine\.width_m"):
         Recipe(robots={"mine": Robot(width_m=-1.0)})
     assert Recipe(robots={"mine": Robot(width_m=1)}).robots["mine"].width_m == 1.0
-
-
-def test_a_recipe_without_tables_of_its_own_is_written_as_before_there_were_any():
-    assert not {"robots", "power_sources"} & set(to_plain(Recipe()))
-    assert to_plain(Recipe(robots={"mine": Robot()}))["robots"]["mine"]["width_m"] is None

@@ -160,9 +160,7 @@ def test_degenerate_input_gives_finite_noise(name, short):
 
 def test_fixes_without_claims_keep_the_prior(short):
     unclaimed = change_fixes(
-        short,
-        unclaimed=np.ones(short.gnss.stamp_ns.size, np.bool_),
-        variance_m2=np.ones_like(short.gnss.variance_m2),
+        short, unclaimed=np.ones(short.gnss.stamp_ns.size, np.bool_), variance_m2=np.ones_like(short.gnss.variance_m2)
     )
     model = drive.estimate_noise(unclaimed)
     assert model.horizontal == make_prior_model(unclaimed).horizontal
@@ -174,10 +172,7 @@ def test_fixes_at_one_hertz_and_of_metres():
     rows = slice(None, None, 10)
     gnss = whole.gnss
     slow = replace(
-        gnss,
-        stamp_ns=gnss.stamp_ns[rows],
-        position_enu_m=gnss.position_enu_m[rows],
-        variance_m2=gnss.variance_m2[rows],
+        gnss, stamp_ns=gnss.stamp_ns[rows], position_enu_m=gnss.position_enu_m[rows], variance_m2=gnss.variance_m2[rows]
     )
     model = drive.estimate_noise(replace(whole, gnss=slow))
     true = np.sqrt(2.0 * 0.2**2 + GaussMarkov(1.2**2, 60.0).difference_variance(np.array(10.0)))

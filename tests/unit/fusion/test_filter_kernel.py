@@ -173,12 +173,12 @@ def test_a_wide_covariance_passes_as_a_cloud_does():
 
 
 class Problem:
-    """A drive of 3 s whose measurements are drawn from the model, with its solution by one least-squares problem over all ticks.
+    """A drive of 2.4 s whose measurements are drawn from the model, with its solution by one least-squares problem over all ticks.
 
     Unknown are the error at the start and the noise of each tick, each over its standard deviation: ``free``.
     """
 
-    def __init__(self, seed, mode, ticks=60):
+    def __init__(self, seed, mode, ticks=48):
         rng = np.random.default_rng(seed)
         free = {*FAULTY} - {*range(state.FIX_OFFSET, state.FIX_OFFSET + 3), state.SHARED_SCALE, state.VISUAL_SLIP}
         free -= {state.TURN_SCALE} if mode >= state.GYRO_TURN else {*range(state.GYRO_BIAS, state.ARM)}

@@ -62,16 +62,8 @@ def measure_with(truth, seed, drawn):
             variance_m2=1.3 * m.gnss.variance_m2,
             lever_arm_m=tuple(np.subtract(drive.LEVER, found["antenna"])),
         ),
-        wheels=replace(
-            m.wheels,
-            stamp_ns=late(m.wheels, "lag of wheels"),
-            velocity_mps=vary(m.wheels, 0),
-        ),
-        visual=replace(
-            m.visual,
-            stamp_ns=late(m.visual, "lag of camera"),
-            velocity_mps=look.apply(vary(m.visual, 1)),
-        ),
+        wheels=replace(m.wheels, stamp_ns=late(m.wheels, "lag of wheels"), velocity_mps=vary(m.wheels, 0)),
+        visual=replace(m.visual, stamp_ns=late(m.visual, "lag of camera"), velocity_mps=look.apply(vary(m.visual, 1))),
         imu=replace(
             m.imu,
             angular_velocity_radps=turn.apply(m.imu.angular_velocity_radps),

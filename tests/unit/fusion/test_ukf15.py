@@ -15,7 +15,7 @@ SETTLED = 100  # rows, 5 s: the start is wrong on purpose
 
 @pytest.fixture(scope="module")
 def truth():
-    return drive(seconds=20.0, seed=3)
+    return drive(seconds=17.0, seed=3)
 
 
 def _measured(truth, seed, **options):
@@ -65,12 +65,7 @@ def test_all_sensors_reach_centimetres_and_know_it(truth, orientation):
 
 
 @pytest.mark.parametrize(
-    ("absent", "within_m"),
-    [
-        (("wheels", "visual"), 0.03),
-        (("imu", "wheels", "visual"), 0.12),
-        (("gnss",), 5.0),
-    ],
+    ("absent", "within_m"), [(("wheels", "visual"), 0.03), (("imu", "wheels", "visual"), 0.12), (("gnss",), 5.0)]
 )
 def test_goes_on_without_a_sensor(truth, absent, within_m):
     trajectory = _run(truth, replace(_measured(truth, 2), **dict.fromkeys(absent)))

@@ -6,8 +6,6 @@ from made_tracks import stamps
 
 from tcpipe.geometry.piecewise_linear import (
     integrate_held_to,
-    integrate_product_to,
-    integrate_to,
     interpolate,
     mean_between,
 )
@@ -17,19 +15,6 @@ SECONDS = stamps(3, step_ns=1_000_000_000)
 
 def at(*seconds):
     return SECONDS[0] + np.round(np.array(seconds) * 1e9).astype(np.int64)
-
-
-def test_integral_of_a_triangle():
-    assert integrate_to(SECONDS, np.array([0.0, 1.0, 0.0]), at(0, 0.5, 1, 1.5, 2)) == pytest.approx(
-        [0, 0.125, 0.5, 0.875, 1]
-    )
-
-
-def test_product_of_two_ramps_is_a_cubic():
-    # t times (2 - t) from 0 to x is x² - x³ / 3.
-    t = np.array([0.0, 1.0, 2.0])
-    got = integrate_product_to(SECONDS, t, 2 - t, at(0.3, 1.0, 1.7, 2.0))
-    assert got == pytest.approx([x**2 - x**3 / 3 for x in (0.3, 1.0, 1.7, 2.0)], rel=1e-12)
 
 
 def test_held_back_takes_the_value_of_the_right_end():

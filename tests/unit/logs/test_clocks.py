@@ -40,28 +40,28 @@ def test_a_header_that_follows_rules_to_the_nanosecond() -> None:
     assert found.dropped == found.notes == {}
 
 
-def test_no_header_and_unset_headers_leave_the_log_time() -> None:
-    log = log_times()
-    for header, why in ((None, "no-header"), (np.zeros_like(log), "header-unset")):
-        found, _ = one(times(log, header))
-        assert found.source == "log"
-        assert found.why == why
-        np.testing.assert_array_equal(found.stamp_ns, log)
+FOLLOWS = "header-follows-log-time"
+HEADERS = {
+    "none": (lambda _: None, "log", "no-header"),
+    "unset": (np.zeros_like, "log", "header-unset"),
+    "of a clock of its own": (lambda log: START + (log - START) * 2, "log", "header-differs-from-log-time"),
+    "whole seconds of new content": (lambda log: log // S * S, "log", "header-repeats"),
+    "step of 0.4 s": (lambda log: log + np.where(log >= START + 30 * S, 400_000_000, 0), "header", FOLLOWS),
+    "drift of 1.5 s in a minute": (lambda log: log + (log - START) // 40, "header", FOLLOWS),
+    "delay that comes back": (
+        lambda log: log - np.where((log >= START + 20 * S) & (log < START + 26 * S), 800_000_000, 0),
+        "header",
+        FOLLOWS,
+    ),
+}
 
 
-def test_a_header_on_a_clock_of_its_own_is_not_believed() -> None:
-    log = log_times()
-    drifting = START + (log - START) * 2  # a minute too far at the end
-    found, steps = one(times(log, drifting))
-    assert (found.source, steps) == ("log", 0)
-    assert found.why == "header-differs-from-log-time"
-
-
-def test_whole_second_stamps_with_new_content_are_not_believed() -> None:
-    log = log_times()
-    found, steps = one(times(log, log // S * S))
-    assert (found.source, steps) == ("log", 0)
-    assert found.why == "header-repeats"
+@pytest.mark.parametrize("name", HEADERS)
+def test_headers_without_a_lasting_step_rule_or_leave_the_log_time(name: str) -> None:
+    log, (make, source, why) = log_times(), HEADERS[name]
+    found, steps = one(times(log, make(log)))
+    assert (found.source, found.why, steps) == (source, why, 0)
+    np.testing.assert_array_equal(found.stamp_ns, (log if source == "log" else make(log))[found.row])
 
 
 def test_simulated_time_is_kept_and_topics_without_a_header_join_it() -> None:
@@ -114,19 +114,6 @@ def test_a_backward_step_keeps_every_row_and_orders_by_epoch_first() -> None:
     assert steps == 1
     assert found.dropped == {}
     np.testing.assert_array_equal(found.stamp_ns, header)
-
-
-def test_a_step_of_0_4_s_and_a_slow_drift_are_no_steps() -> None:
-    log = log_times()
-    assert one(times(log, log + np.where(log >= START + 30 * S, 400_000_000, 0)))[1] == 0
-    assert one(times(log, log + (log - START) // 40))[1] == 0  # 1.5 s in a minute
-
-
-def test_a_delay_that_comes_back_is_no_step() -> None:
-    log = log_times()
-    delayed = (log >= START + 20 * S) & (log < START + 26 * S)
-    found, steps = one(times(log, log - np.where(delayed, 800_000_000, 0)))
-    assert (steps, found.source) == (0, "header")
 
 
 def test_a_stalled_recorder_is_no_step() -> None:

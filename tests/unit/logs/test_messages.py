@@ -241,18 +241,15 @@ def test_an_axis_that_is_zero_throughout_while_the_robot_moves_is_not_measured()
     assert (read_messages(many, "wheel_odometry", roles.ODOMETRY).columns["angular_velocity_z_radps"] == 0.0).all()
 
 
-def test_an_empty_twist_on_a_moving_pose_is_no_standstill() -> None:
-    found = read_messages(odometry(speed_mps=0.0), "visual_odometry", roles.ODOMETRY)
+def test_an_empty_twist_is_standstill_on_a_resting_pose_alone() -> None:
+    columns = odometry(speed_mps=0.0)
+    found = read_messages(columns, "visual_odometry", roles.ODOMETRY)
     assert np.isnan(found.columns["velocity_x_mps"]).all()
     assert np.isnan(found.columns["velocity_var_x_m2ps2"]).all()
     assert np.isfinite(found.columns["quat_w"]).all()
     (zero,) = found.findings
     assert (zero.code, zero.subject.name) == ("twist-zero", "visual_odometry")
     assert zero.numbers["moved_m"] == pytest.approx(0.55)  # 11 steps of 5 cm
-
-
-def test_an_empty_twist_on_a_resting_pose_is_standstill() -> None:
-    columns = odometry(speed_mps=0.0)
     columns["pose.pose.position.x"][:] = 3.0
     found = read_messages(columns, "wheel_odometry", roles.ODOMETRY)
     assert (found.columns["velocity_x_mps"] == 0.0).all()

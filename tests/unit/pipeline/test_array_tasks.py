@@ -90,9 +90,7 @@ def test_a_task_lists_the_store_once_and_a_share_with_nothing_new_writes_nothing
     for verb in ("entries", "folders", "files"):
         true = getattr(Place, verb)
         monkeypatch.setattr(
-            Place,
-            verb,
-            lambda self, *of, true=true, **how: (listed.append(self.where(*of)), true(self, *of, **how))[1],
+            Place, verb, lambda self, *of, true=true, **how: (listed.append(self.where(*of)), true(self, *of, **how))[1]
         )
     found = ingest([drives], store=tmp_path / "store", recipe=Recipe(), shard=(3, 4))
     assert [result.status for result in found.results].count("done") == 6

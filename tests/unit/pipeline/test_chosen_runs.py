@@ -77,8 +77,7 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     found = inspect(store.root, recipe=Recipe())
     assert found.outdated == {"a": "0.9"}
     with pytest.raises(
-        StoreError,
-        match=rf"runs/a: contains no finished run of data model {DATA_MODEL_VERSION}; ingest its log again",
+        StoreError, match=rf"runs/a: contains no finished run of data model {DATA_MODEL_VERSION}; ingest its log again"
     ):
         report(store.root / "runs" / "a")
 

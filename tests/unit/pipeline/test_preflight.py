@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 
-from tcpipe.motion.distance_breakdown import make_loss_code
-from tcpipe.pipeline.preflight import (
-    ExpectedYield,
-    RoleTopic,
-    _compute_hourly_std,
-    find_missing,
-    find_slow,
-)
+from tcpipe.pipeline.preflight import ExpectedYield, RoleTopic, _compute_hourly_std, find_missing, find_slow
 from tcpipe.recipe import ReadConfig
-from tcpipe.tables.bits import DropReason, Loss, flag_name
 from tcpipe.tables.facts import EnergyBudget
-from tcpipe.tables.findings import read_catalogue
 
 
 def promise(segments=50, budget=None):
@@ -55,7 +46,3 @@ def test_the_deviation_of_a_count_is_that_of_its_windows():
     assert _compute_hourly_std((start_s * 1e9).astype(np.int64), 60.0) == pytest.approx(60 * np.sqrt(6) * np.sqrt(30))
     assert _compute_hourly_std(np.zeros(0, np.int64), 60.0) == 0.0
     assert _compute_hourly_std(np.zeros(3, np.int64), 29.0) is None
-
-
-def test_every_loss_stands_in_the_catalogue():
-    assert {make_loss_code(flag_name(bit)) for bit in (*DropReason, *Loss)} <= set(read_catalogue())

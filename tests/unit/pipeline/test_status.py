@@ -210,10 +210,7 @@ def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_n
     gone.unlink()
     found = ask_status(tmp_path / "store", first_night / "logs")
     (group,) = [group for group in found.groups if group.state == "pending"]
-    assert (group.cause, group.logs) == (
-        "files of its run are missing",
-        (str(first_night / "logs" / "whole.mcap"),),
-    )
+    assert (group.cause, group.logs) == ("files of its run are missing", (str(first_night / "logs" / "whole.mcap"),))
     assert [(of.code, of.names["file"]) for of in found.problems] == [("run-incomplete", str(gone))]
     assert found.exit_code == 3
 

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from made_tracks import with_columns
 from map_worlds import World
-from stored_files import manifest, run_document, table
+from stored_files import flip, manifest, run_document, table
 from synthetic_store import WORLD, add_run, box, commit_run, lanes, put_map, region_file, segments, small_store
 
 from tcpipe.dataset import open_dataset
@@ -50,12 +50,6 @@ def made(tmp_path_factory):
 @pytest.fixture
 def copy(made, tmp_path):
     return lambda name: shutil.copytree(made / name, tmp_path / name)
-
-
-def flip(path, place=0.5, *, bit=0):
-    data = bytearray(path.read_bytes())
-    data[min(int(place * len(data)), len(data) - 1)] ^= 1 << bit
-    path.write_bytes(data)
 
 
 def files(directory):
@@ -233,24 +227,26 @@ def test_a_sample_is_explained_and_comes_out_the_same(made, name):
             assert "identical" in text
 
 
+def find_sample(made, run_id):
+    """Return the first sample of a run that trains."""
+    train = open_dataset(made / "zarr")["train"].samples["sample_id"].to_pylist()
+    return next(name for name in train if name.startswith(run_id))
+
+
 def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path):
     store = Store(copy("store"))
     shutil.rmtree(store.root / "runs" / "north")
-    start, end = lanes(1.0 + 2.0 * np.arange(8), -14.0, 14.0)
-    table = segments("north", start, end, start_ns=int(1e18 + 1e12))
+    table = segments("north", *lanes(1.0 + 2.0 * np.arange(8), -14.0, 14.0), start_ns=int(1e18 + 1e12))
     power = table.column("power_watt").to_numpy() + 1.0
     add_run(store, "north", with_columns(table, power_watt=power))
-    sample = next(
-        row for row in open_dataset(made / "zarr")["train"].samples["sample_id"].to_pylist() if "north" in row
-    )
-    found = explain(sample, dataset=made / "zarr", store=store.root)
+    found = explain(find_sample(made, "north"), dataset=made / "zarr", store=store.root)
     assert found.differences[0].startswith("power_watt: ")
     assert found.differences[1:] == ("run north was ingested again later, with other segments",)
 
 
 def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
     store = Store(copy("store"))
-    sample = open_dataset(made / "zarr")["train"].samples["sample_id"][0].as_py()
+    sample = find_sample(made, "north")
     height = WORLD.write(tmp_path, pixel_size_m=0.2)["height"]
     put_map(store, "site", height=height, inputs=MapInputs({"height": {"height.tif": "another"}}))
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
@@ -263,17 +259,13 @@ def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
 
 
 def test_an_unknown_sample_and_an_unknown_run_are_said(made, copy):
-    with pytest.raises(DatasetError, match="did you mean north-"):
-        explain("north", dataset=made / "zarr", store=made / "store")
-    with pytest.raises(DatasetError, match="an example is"):
-        explain("x", dataset=made / "zarr", store=made / "store")
+    for name, said in (("north", "did you mean north-"), ("x", "an example is")):
+        with pytest.raises(DatasetError, match=said):
+            explain(name, dataset=made / "zarr", store=made / "store")
     store = copy("store")
     shutil.rmtree(store / "runs" / "north")
-    sample = next(
-        row for row in open_dataset(made / "zarr")["train"].samples["sample_id"].to_pylist() if "north" in row
-    )
     with pytest.raises(DatasetError, match="is not in this store"):
-        explain(sample, dataset=made / "zarr", store=store)
+        explain(find_sample(made, "north"), dataset=made / "zarr", store=store)
 
 
 ASK = {
@@ -312,8 +304,7 @@ def test_two_formats_hold_the_same_samples(made):
 
 def test_causes_and_effects_are_named(made, copy, tmp_path):
     store = Store(copy("store"))
-    start, end = lanes((18.0,), -14.0, 14.0)
-    add_run(store, "later", segments("later", start, end, start_ns=int(2e18)))
+    add_run(store, "later", segments("later", *lanes((18.0,), -14.0, 14.0), start_ns=int(2e18)))
     recipe = Recipe(sample=SampleConfig(patch_m=0.8))
     build_dataset(tmp_path / "b", store=store.root, recipe=recipe, holdout="sample")
     found = diff(made / "zarr", tmp_path / "b")
@@ -341,8 +332,7 @@ def test_causes_and_effects_are_named(made, copy, tmp_path):
 
 def test_the_shift_of_labels_is_over_all_samples(made, copy, tmp_path):
     store = Store(copy("store"))
-    start, end = lanes((18.0,), -14.0, 14.0)
-    add_run(store, "later", segments("later", start, end + 0.0, start_ns=int(2e18)))
+    add_run(store, "later", segments("later", *lanes((18.0,), -14.0, 14.0), start_ns=int(2e18)))
     build_dataset(tmp_path / "b", store=store.root, recipe=Recipe())
     found = diff(made / "zarr", tmp_path / "b")
     for path, name in ((made / "zarr", "a"), (tmp_path / "b", "b")):

@@ -9,8 +9,10 @@ from tcpipe.power.sources import (
     RailReadings,
     apply_sign,
     count_energy,
+    find_lone_side,
     find_quantity,
     find_rejection,
+    find_unmeasured,
     make_rail_name,
     read_rails,
     sign_by_mean,
@@ -79,7 +81,7 @@ def test_a_voltage_that_is_the_charge_is_refused_unless_one_row_differs(factor):
 
 
 def test_a_current_wraps_beyond_half_of_its_range_and_what_nothing_can_be_is_unknown():
-    columns = {"v": np.full(5, 24.0), "i": np.array([50.0, 51.0, -1.0, 1e6, 1.1e6])}
+    columns = {"log_time_ns": np.arange(5), "v": np.full(5, 24.0), "i": np.array([50.0, 51.0, -1.0, 1e6, 1.1e6])}
     (wrapped,) = read_rails(columns, [source(wraps_amp=100.0)], "/b")
     assert wrapped.current_amp[:3].tolist() == [50.0, -49.0, -1.0]
     (plain,) = read_rails(columns, [source()], "/b")
@@ -88,27 +90,19 @@ def test_a_current_wraps_beyond_half_of_its_range_and_what_nothing_can_be_is_unk
 
 
 def test_a_list_of_currents_must_reach_to_the_last_that_is_wanted_and_be_as_long_as_the_platforms():
-    columns = {"v": np.full(2, 24.0), "i": np.array([[1.0, 2.0, 4.0]] * 2)}
+    columns = {"log_time_ns": np.arange(2), "v": np.full(2, 24.0), "i": np.array([[1.0, 2.0, 4.0]] * 2)}
     (found,) = read_rails(columns, [source(current="i[0] + i[2]", currents_listed=3)], "/b")
     assert found.current_amp.tolist() == [5.0, 5.0]
-    for said, reason, field, counts in (
-        ({"current": "i[3]"}, "values-count-differs", "i", {"values_count": 3.0, "expected_count": 4.0}),
-        (
-            {"current": "i[2]", "currents_listed": 4},
-            "values-count-differs",
-            "i",
-            {"values_count": 3.0, "expected_count": 4.0},
-        ),
-        (
-            {"current": "i[1]", "voltage": "v[0]"},
-            "values-count-differs",
-            "v",
-            {"values_count": 0.0, "expected_count": 1.0},
-        ),
-        ({"current": "j"}, "field-missing", "j", {}),
+    for said, field, counts in (
+        ({"current": "i[3]"}, "i", (3.0, 4.0)),
+        ({"current": "i[2]", "currents_listed": 4}, "i", (3.0, 4.0)),
+        ({"current": "i[1]", "voltage": "v[0]"}, "v", (0.0, 1.0)),
+        ({"current": "j"}, "j", ()),
     ):
         found = read_rails(columns, [source(**said)], "/b")
-        assert (found.names["reason"], found.names["field"], found.numbers) == (reason, field, counts)
+        reason = "values-count-differs" if counts else "field-missing"
+        numbers = dict(zip(("values_count", "expected_count"), counts, strict=False))
+        assert (found.names["reason"], found.names["field"], found.numbers) == (reason, field, numbers)
 
 
 def test_a_sign_is_clear_where_more_than_eight_tenths_flow_one_way():
@@ -183,3 +177,50 @@ def test_time_that_stands_still_and_a_voltage_of_zero_make_no_current():
         np.array([0, 1_000_000_000, 1_000_000_000, 2_000_000_000]), np.array([10.0, 10.0, 10.0, 0.0])
     )
     np.testing.assert_array_equal(amp, [np.nan, 0.1, np.nan, np.nan])
+
+
+AT_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(2000, dtype=np.int64)
+
+
+def draw_currents(seed, step_amp):
+    """Two drives over ground: their currents rise and fall together, with noise of their own; a halt every 20 s."""
+    rng = np.random.default_rng(seed)
+    shared = 4.0 + 2.0 * np.sin(np.arange(2000) / 37.0) + 1.5 * np.sin(np.arange(2000) / 11.0 + seed)
+    drives = (np.arange(2000) % 400 > 60)[:, None] * (shared[:, None] + 0.3 * rng.standard_normal((2000, 2)))
+    return np.round((drives + 0.08 * rng.standard_normal((2000, 2))) / step_amp) * step_amp
+
+
+@pytest.mark.parametrize("step_amp", [0.05, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_currents_that_are_measured_are_neither_clipped_nor_frozen(seed, step_amp):
+    both = draw_currents(seed, step_amp)
+    assert not find_unmeasured(both, AT_NS).any()
+    assert not find_unmeasured(both[:, :1], AT_NS).any()
+    assert not find_unmeasured(np.repeat(both[::20], 20, axis=0), AT_NS).any()  # a reading lasts for 20 messages
+    assert not find_unmeasured(np.abs(both), AT_NS).any()
+
+
+@pytest.mark.parametrize("frozen_amp", [0.0, 3.0])
+def test_a_current_that_stands_still_while_the_other_drives_is_found_where_it_does(frozen_amp):
+    both = draw_currents(1, 0.05)
+    both[700:1500, 1] = frozen_amp
+    found = find_unmeasured(both, AT_NS)
+    assert found[700:1500].all()
+    assert found.sum() <= 801
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_current_at_the_end_of_its_range_is_found(sign):
+    both = draw_currents(2, 0.05)
+    clipped = both.copy()
+    clipped[:, 0] = np.minimum(both[:, 0], 5.0)
+    found = find_unmeasured(sign * clipped, AT_NS)
+    assert np.array_equal(found, clipped[:, 0] == 5.0)
+    assert 100 < found.sum() < 1500
+
+
+def test_the_drives_of_one_side_alone_are_found():
+    both = ("/left_drive/battery_state", "/right_drive/battery_state")
+    assert find_lone_side(both) is None
+    assert find_lone_side(both[:1]) == both[0]
+    assert find_lone_side(("/battery_state", "/left_pocket/battery_state")) is None

@@ -59,6 +59,10 @@ def test_thinning_keeps_every_peak_and_says_how_many_there_were():
         assert set(pair[np.isfinite(pair)]) == ({part.min(), part.max()} if len(part) else set())
     assert (np.diff(shown.t_s) > 0).all()
     assert abs(shown.t_s[np.nanargmax(kept)] - 0.17) < per_bin * 0.01
+    short = np.array([1.0, np.nan, 3.0, 2.0, 5.0])
+    shown = downsample_columns("x", np.arange(5.0), {"y": (2, short)})
+    assert shown.columns["y"][1] == pytest.approx(short, nan_ok=True)
+    assert shown.value_count == len(shown.t_s) == 5
 
 
 def stepped(track, by_ns):
@@ -176,9 +180,3 @@ def test_a_step_of_the_clock_has_its_place_and_its_size():
     assert event["text"] == (describe_finding(step),)
     assert event["left"][0] == pytest.approx((half - 1) * 0.05 + 1.0)
     assert event["left"][0] < event["right"][0]
-
-
-def test_what_is_short_is_carried_whole():
-    shown = downsample_columns("x", np.arange(5.0), {"y": (2, np.array([1.0, np.nan, 3.0, 2.0, 5.0]))})
-    assert shown.columns["y"][1] == pytest.approx([1.0, np.nan, 3.0, 2.0, 5.0], nan_ok=True)
-    assert shown.value_count == len(shown.t_s) == 5

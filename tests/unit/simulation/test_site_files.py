@@ -17,7 +17,6 @@ from tcpipe.errors import UsageError
 from tcpipe.simulation import Faults, find_scenario, make_tiny, read_truth, simulate, simulate_readings
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.scenarios import HUSKY_ROS1, RasterSpec, make_small_world
-from tcpipe.terrain.classes import PAPER_CLASSES
 
 
 @pytest.fixture(scope="module")
@@ -80,14 +79,6 @@ def test_rasters_equal_the_world_at_their_pixel_centres(site):
                 assert (values[0][~mapped] == raster.nodata).all()
                 assert raster.colormap(1)[40] == (150, 200, 90, 255)
     assert len(grids) == 3, "no two share a grid"
-
-
-def test_class_table_names_the_papers_classes(site):
-    lines = site.rasters["classes"].read_text().splitlines()
-    assert lines[0] == "value,id,name,traversable"
-    assert [line.split(",") for line in lines[1:]] == [
-        [str(10 * c.id), str(c.id), c.name, str(c.traversable).lower()] for c in PAPER_CLASSES.classes
-    ]
 
 
 def test_region_is_geojson_in_wgs84_and_covers_a_part(site):

@@ -21,9 +21,7 @@ from tcpipe.simulation.world import (
     Wave,
     World,
     draw_waves,
-    evaluate_field,
     state,
-    sum_waves,
 )
 
 SITE = Site()
@@ -31,10 +29,7 @@ SITE = Site()
 
 def places(count=400, seed=0):
     rng = np.random.default_rng(seed)
-    return (
-        SITE.west_m + rng.uniform(0, SITE.width_m, count),
-        SITE.south_m + rng.uniform(0, SITE.height_m, count),
-    )
+    return (SITE.west_m + rng.uniform(0, SITE.width_m, count), SITE.south_m + rng.uniform(0, SITE.height_m, count))
 
 
 def test_gradient_is_the_slope_of_the_height():
@@ -53,10 +48,10 @@ def test_one_hill_by_hand():
 
 
 def test_rows_and_columns_give_the_same_as_points():
-    world = make_small_world()
-    x, y = SITE.west_m + np.arange(0.5, 120.0, 7.0), SITE.south_m + np.arange(0.5, 80.0, 7.0)
+    world = make_paper_site().world
+    x, y = world.site.west_m + np.arange(0.5, 120.0, 7.0), world.site.south_m + np.arange(0.5, 80.0, 7.0)
     flat_x, flat_y = (values.ravel() for values in np.meshgrid(x, y))
-    for function in (world.height_m, world.terrain_class, world.mapped, world.resistance_factor):
+    for function in (world.height_m, world.mapped_height_m, world.terrain_class, world.mapped, world.resistance_factor):
         grid = function(x[None, :], y[:, None])
         np.testing.assert_allclose(grid.ravel(), function(flat_x, flat_y), atol=1e-9)
     np.testing.assert_allclose(
@@ -111,15 +106,6 @@ def test_local_plane_is_metric_and_returns():
     back = SITE.lonlatalt(enu)
     np.testing.assert_allclose(back[0], lon, atol=1e-12)
     np.testing.assert_allclose(back[2], SITE.datum[2], atol=1e-7)
-
-
-def test_rows_and_columns_are_a_product_of_matrices_with_the_same_values():
-    made = draw_waves(5, count=7, total=0.3, wavelength_m=(0.5, 9.0))
-    u, v = np.arange(0.0, 20.0, 0.7)[None, :], np.arange(0.0, 9.0, 0.9)[:, None]
-    points = (values.ravel() for values in np.broadcast_arrays(u, v))
-    grid = evaluate_field(made, u, v)
-    np.testing.assert_allclose(grid, sum_waves(made, u, v), atol=1e-12)
-    np.testing.assert_allclose(grid.ravel(), evaluate_field(made, *points), atol=1e-12)
 
 
 def test_a_state_is_spread_evenly_between_its_ends():
@@ -179,12 +165,6 @@ def test_what_is_hidden_is_asked_for_by_its_variance(factor):
 
 ROBOT = make_paper_site().robot
 X, Y = SITE.west_m + np.linspace(20.0, 60.0, 4001), np.full(4001, SITE.south_m + 40.0)
-
-
-def test_even_ground_costs_its_class():
-    assert compute_rolling_resistance(World(SITE, 600.0), ROBOT, X, Y, np.zeros(1)) == pytest.approx(
-        ROBOT.ground[GRASS].rolling_resistance
-    )
 
 
 def test_a_wheel_on_the_road_and_one_beside_it():

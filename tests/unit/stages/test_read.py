@@ -164,8 +164,9 @@ def husky(**more: tuple[str, pa.Table]) -> dict[str, tuple[str, pa.Table]]:
     }
 
 
-def read(topics: Mapping[str, tuple[str, pa.Table]], /, robot: str | None = None, **config) -> Streams:
-    return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot, known=load_shipped_profiles())
+def read(topics: Mapping[str, tuple[str, pa.Table]] | MemoryLog, /, **config) -> Streams:
+    log = topics if isinstance(topics, MemoryLog) else MemoryLog(topics)
+    return read_run(log, ReadConfig(**config), robot=None, known=load_shipped_profiles())
 
 
 def codes(found) -> set[str]:
@@ -224,7 +225,7 @@ def test_the_same_log_gives_the_same_bytes() -> None:
 def test_only_the_topics_of_roles_are_read_and_tf_only_where_it_is_needed() -> None:
     moving = transforms(("odom", "base_link", (1.0, 0.0, 0.0), Rotation.identity()))
     log = MemoryLog(husky(**{"/tf": moving, "/image": ("sensor_msgs/msg/Image", message_table(1, 1.0))}))
-    read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
+    read(log)
     assert "/image" not in log.read
     assert "/tf" not in log.read
     assert len(log.read) == len(set(log.read))
@@ -270,41 +271,35 @@ def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell()
         {name: (kind, table.slice(0, 0)) for name, (kind, table) in husky().items()} | {"/odom": odometry()}
     )
     log.topics = {name: replace(topic, message_count=None) for name, topic in log.topics.items()}
-    recipe = ReadConfig(topics={"wheel_odometry": ["/odom"]})
-    assert set(read_run(log, recipe, robot=None, known=load_shipped_profiles()).tables) == {"wheel_odometry"}
+    assert set(read(log, topics={"wheel_odometry": ["/odom"]}).tables) == {"wheel_odometry"}
+
+
+FIXED_NS = START + np.arange(20) * S
+CLOCK = [datetime.fromtimestamp(stamp // S, UTC).strftime("%H%M%S") for stamp in FIXED_NS.tolist()]
+
+
+def read_sentences(others: list[str]) -> Streams:
+    """Read a log of NMEA sentences: a place each second, and another after each."""
+    fixed = [f"$GPGGA,{time},4700.{i:04d},N,01500.0000,E,4,20,0.6,355.0,M,45.0,M,," for i, time in enumerate(CLOCK)]
+    sentences = [sentence for pair in zip(fixed, others, strict=True) for sentence in pair]
+    table = message_table(40, 2.0, delay_ns=60_000_000, frame="gps", sentence=sentences)
+    return read({"/nmea_sentence": ("nmea_msgs/msg/Sentence", table), "/odom": odometry()})
 
 
 def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
-    stamps = START + np.arange(20) * S
-    text = [datetime.fromtimestamp(stamp // S, UTC).strftime("%H%M%S") for stamp in stamps.tolist()]
-    sentences = [f"$GPGGA,{time},4700.{i:04d},N,01500.0000,E,4,20,0.6,355.0,M,45.0,M,," for i, time in enumerate(text)]
-    others = [f"$GPGSV,{i}" for i in range(20)]
-    table = message_table(
-        40,
-        2.0,
-        delay_ns=60_000_000,
-        frame="gps",
-        sentence=[s for pair in zip(sentences, others, strict=True) for s in pair],
-    )
-    found = read({"/nmea_sentence": ("nmea_msgs/msg/Sentence", table), "/odom": odometry()})
+    found = read_sentences([f"$GPGSV,{i}" for i in range(20)])
     gnss = found.tables["gnss"]
-    assert gnss["stamp_ns"].to_pylist() == stamps.tolist()
+    assert gnss["stamp_ns"].to_pylist() == FIXED_NS.tolist()
     assert set(gnss["alt_m"].to_pylist()) == {400.0}
     assert found.report.facts.roles["gnss"].topics["/nmea_sentence"].dropped == {"not_gga": 20}
     assert "messages-unused" not in codes(found)
 
 
 def test_one_topic_of_sentences_plays_two_roles_each_on_its_own_time() -> None:
-    stamps = START + np.arange(20) * S
-    text = [datetime.fromtimestamp(stamp // S, UTC).strftime("%H%M%S") for stamp in stamps.tolist()]
-    places = [f"$GPGGA,{time},4700.{i:04d},N,01500.0000,E,4,20,0.6,355.0,M,45.0,M,," for i, time in enumerate(text)]
-    speeds = [f"$GPRMC,{time}.50,A,,,,,1.944,090.0,,,,R" for time in text]
-    sentences = [s for pair in zip(places, speeds, strict=True) for s in pair]
-    table = message_table(40, 2.0, delay_ns=60_000_000, frame="gps", sentence=sentences)
-    found = read({"/nmea_sentence": ("nmea_msgs/msg/Sentence", table), "/odom": odometry()})
+    found = read_sentences([f"$GPRMC,{time}.50,A,,,,,1.944,090.0,,,,R" for time in CLOCK])
     velocity = found.tables["gnss_velocity"]
-    assert velocity["stamp_ns"].to_pylist() == (stamps + S // 2).tolist()
-    assert found.tables["gnss"]["stamp_ns"].to_pylist() == stamps.tolist()
+    assert velocity["stamp_ns"].to_pylist() == (FIXED_NS + S // 2).tolist()
+    assert found.tables["gnss"]["stamp_ns"].to_pylist() == FIXED_NS.tolist()
     assert velocity["east_velocity_mps"].to_pylist() == pytest.approx([1.00008] * 20)
     assert velocity["north_velocity_mps"].to_pylist() == pytest.approx([0.0] * 20, abs=1e-9)
     assert velocity["up_velocity_mps"].null_count == velocity["east_var_m2ps2"].null_count == 20
@@ -325,18 +320,12 @@ def test_a_receivers_twist_in_the_bodys_frame_stays_out_unless_the_recipe_names_
     found = read(topics)
     assert (found.tables["gnss_velocity"].num_rows if rows else len(set(found.tables) - {"gnss"})) == rows
     assert ("velocity-not-over-ground" in codes(found)) == (not rows)
-    named = ReadConfig(topics={"gnss_velocity": ["/gps/vel"]})
-    told = read_run(MemoryLog(topics), named, robot=None, known=load_shipped_profiles())
+    told = read(topics, topics={"gnss_velocity": ["/gps/vel"]})
     assert told.tables["gnss_velocity"].num_rows == 50
 
 
 def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
-    found = read_run(
-        MemoryLog(husky(), undecodable=["/fix", "/left/battery"]),
-        ReadConfig(),
-        robot=None,
-        known=load_shipped_profiles(),
-    )
+    found = read(MemoryLog(husky(), undecodable=["/fix", "/left/battery"]))
     assert "gnss" not in found.tables
     assert "power" not in found.tables  # one side alone is not the robot's power
     lost = [of.subject.name for of in select_findings(found.report.findings, "topic-not-decoded")]
@@ -551,7 +540,7 @@ def test_reading_takes_room_for_little_more_than_its_tables() -> None:
     def peak_and_tables(rows: int) -> tuple[int, int]:
         log = MemoryLog({"/imu/data": imu(rows), "/husky_velocity_controller/odom": odometry(rows)})
         tracemalloc.start()
-        found = read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
+        found = read(log)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak, sum(table.nbytes for table in found.tables.values())

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from map_worlds import ArrayMap
+from map_worlds import ArrayMap, LeveledMap
 
-from tcpipe.terrain.layers import PAPER_LAYERS
 from tcpipe.terrain.registration import register_track
-from tcpipe.terrain.resampling import iterate_levels, make_overview_grid
 from tcpipe.terrain.target_grid import MapGrid
 
 SIDE, PITCH_M = 1000, 0.1
@@ -21,13 +19,9 @@ def site(ground=rolling, noise_m=0.01, factors=(1,), seed=0):
     j, i = np.meshgrid(np.arange(SIDE, dtype=float), np.arange(SIDE, dtype=float))
     x, y = np.moveaxis(grid.xy_from_px(np.stack([j, i], -1)), -1, 0)
     height = ground(x, y) + np.random.default_rng(seed).normal(0.0, noise_m, x.shape)
-    return Levels(grid, {"height": height.astype(np.float32)}, tile_px=256, height_reference_m=600.0, factors=factors)
-
-
-class Levels(ArrayMap):
-    def at(self, factor):
-        arrays = {"height": dict(iterate_levels(PAPER_LAYERS["height"], self.arrays["height"], self.factors))[factor]}
-        return ArrayMap(make_overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
+    return LeveledMap(
+        grid, {"height": height.astype(np.float32)}, tile_px=256, height_reference_m=600.0, factors=factors
+    )
 
 
 def drive(count=6000, seed=1):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from map_worlds import ArrayMap
+from map_worlds import LeveledMap
 
 from tcpipe.terrain.layers import PAPER_LAYERS
 from tcpipe.terrain.resampling import choose_factor, iterate_levels, list_factors, make_overview_grid
@@ -84,17 +84,6 @@ def test_the_level_nearest_below_the_patchs_pitch_is_taken(pixel_size_m, wanted)
     assert choose_factor((1, 2, 4, 8), 0.02, pixel_size_m) == wanted
 
 
-class Levels(ArrayMap):
-    """A map in memory with overviews."""
-
-    def at(self, factor):
-        arrays = {
-            name: dict(iterate_levels(PAPER_LAYERS[name], layer, self.factors))[factor]
-            for name, layer in self.arrays.items()
-        }
-        return ArrayMap(make_overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
-
-
 def test_a_patch_coarser_than_the_map_shows_means_not_every_nth_pixel():
     """A furrow every 5 cm, 20 cm deep, on a plane of 10 %: pixels of 10 cm cannot show it and must not beat with it."""
     grid = grid_of(800, 800, 0.0125)
@@ -113,7 +102,7 @@ def test_a_patch_coarser_than_the_map_shows_means_not_every_nth_pixel():
     frames, chord_m = make_patch_frames(start, end, np.full(60, 2.0)), np.full(60, 2.0)
 
     def errors(factors):
-        got = sample_patches(Levels(grid, arrays, factors=factors), frames, chord_m, patch_m=2.0, patch_px=20)
+        got = sample_patches(LeveledMap(grid, arrays, factors=factors), frames, chord_m, patch_m=2.0, patch_px=20)
         offset = (np.arange(20) + 0.5) / 20
         along, left = np.meshgrid(offset, 0.5 - offset)
         step = (end - start)[:, None, None]

@@ -143,21 +143,21 @@ def test_a_cut_mcap_gives_everything_before_the_cut(tmp_path, messages, options,
 
 @pytest.mark.parametrize("compression", [None, BagWriter.CompressionFormat.BZ2, BagWriter.CompressionFormat.LZ4])
 def test_a_cut_bag_gives_every_whole_chunk(tmp_path, compression):
-    messages = random_messages(2, count=4000, types=TYPES, store=ROS1)
-    path = write_bag(tmp_path / "run.bag", messages, compression)
+    messages = random_messages(2, count=400, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, compression, chunk_bytes=20_000)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * 0.8)])
     tables, damage = read(path)
     found = {topic: stamps(tables, topic) for topic in tables}
     for topic, log_times in found.items():
         assert log_times == [m.log_time_ns for m in messages if m.topic == topic][: len(log_times)]
-        assert len(log_times) > 1000
+        assert len(log_times) > 100
     assert "index-missing" in {finding.code for finding in damage}
 
 
 def test_a_bag_with_a_destroyed_chunk_head_goes_on_behind_it(tmp_path):
-    messages = random_messages(3, count=6000, types=TYPES, store=ROS1)
-    path = write_bag(tmp_path / "run.bag", messages, BagWriter.CompressionFormat.LZ4)
+    messages = random_messages(3, count=600, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, BagWriter.CompressionFormat.LZ4, chunk_bytes=20_000)
     clean, _ = read(path)
     data = bytearray(path.read_bytes())
     first = data.find(b"op=\x05")
@@ -189,7 +189,7 @@ def test_a_cut_db3_gives_the_rows_before_the_cut(tmp_path):
 def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
     messages = random_messages(7, count=10, types=("std_msgs/msg/String",))
     payload = b"\x00\x01\x00\x00\x03\x00\x00\x00a\xff\x00"
-    odd = [type(m)(m.topic, m.type_name, m.log_time_ns, payload, m.value) for m in messages]
+    odd = [replace(message, payload=payload) for message in messages]
     tables, damage = read(write_mcap(tmp_path / "run.mcap", odd))
     assert tables["/String"]["data"].to_pylist() == ["a\ufffd"] * 10
     assert [(finding.code, finding.subject.name) for finding in damage] == [("text-not-utf8", "/String")]

@@ -5,6 +5,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 
 import pyarrow as pa
 import pytest
@@ -143,20 +144,12 @@ def test_a_definition_the_log_lacks_comes_from_the_bundled_ones(tmp_path):
     assert_log(write_mcap(tmp_path / "run.mcap", messages, define=False), messages, ROS2)
 
 
-def test_an_unknown_type_costs_only_its_own_topic(tmp_path):
+def test_an_unknown_type_costs_only_its_own_topic(tmp_path, monkeypatch):
     messages = random_messages(11, count=10, types=("sensor_msgs/msg/Imu", "std_msgs/msg/ColorRGBA"))
-    renamed = [
-        type(m)(
-            m.topic, m.type_name if m.topic == "/Imu" else "acme_msgs/msg/Secret", m.log_time_ns, m.payload, m.value
-        )
-        for m in messages
-    ]
-    path = tmp_path / "run.mcap"
-    ROS2.fielddefs["acme_msgs/msg/Secret"] = ROS2.fielddefs["std_msgs/msg/ColorRGBA"]
-    try:
-        write_mcap(path, renamed, define=False)
-    finally:
-        del ROS2.fielddefs["acme_msgs/msg/Secret"]
+    renamed = [m if m.topic == "/Imu" else replace(m, type_name="acme_msgs/msg/Secret") for m in messages]
+    with monkeypatch.context() as patch:
+        patch.setitem(ROS2.fielddefs, "acme_msgs/msg/Secret", ROS2.fielddefs["std_msgs/msg/ColorRGBA"])
+        path = write_mcap(tmp_path / "run.mcap", renamed, define=False)
     with open_log(path) as log:
         tables = log.tables(log.topics)
         assert list(tables) == ["/Imu"]
@@ -178,7 +171,7 @@ def test_a_topic_that_changes_its_type_keeps_the_larger_part(tmp_path):
     bag = tmp_path / "run"
     bag.mkdir()
     shutil.copy(write_mcap(tmp_path / "a.mcap", first), bag / "run_0.mcap")
-    renamed = [type(m)("/ColorRGBA", m.type_name, m.log_time_ns, m.payload, m.value) for m in second]
+    renamed = [replace(m, topic="/ColorRGBA") for m in second]
     shutil.copy(write_mcap(tmp_path / "b.mcap", renamed), bag / "run_1.mcap")
     with open_log(bag) as log:
         assert_same(log.table("/ColorRGBA"), expected_columns(first, "/ColorRGBA"))

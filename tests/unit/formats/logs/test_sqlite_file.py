@@ -30,14 +30,13 @@ def database(path, *, page_bytes=4096, count=300, sizes=None, seed=0, table=SCHE
         number += int(rng.choice([1, 1, 1, 200, 70_000]))
         size = int(rng.choice(choices))
         row = (number, int(rng.choice([1, 300])), STAMPS[index % len(STAMPS)], rng.bytes(size))
-        connection.execute("INSERT INTO messages VALUES (?, ?, ?, ?)", row)
+        connection.execute("INSERT INTO messages(id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)", row)
     connection.commit()
     return connection
 
 
-def rows_by_part(path):
-    part = SqlitePart(path, path.name)
-    found = [
+def list_rows(part):
+    return [
         (ordinal, block.channel, log, bytes(block.buffer[at : at + length]))
         for block in part.blocks(frozenset({1, 300}))
         for ordinal, at, length, log in zip(
@@ -48,20 +47,33 @@ def rows_by_part(path):
             strict=True,
         )
     ]
-    channels = {number: (c.message_count, c.start_ns, c.end_ns) for number, c in part.channels.items()}
-    part.close()
-    assert not part.damage
-    return sorted(found), channels
+
+
+def rows_by_part(path):
+    with closing(SqlitePart(path, path.name)) as part:
+        channels = {number: (c.message_count, c.start_ns, c.end_ns) for number, c in part.channels.items()}
+        found = sorted(list_rows(part))
+        assert not part.damage
+        return found, channels
 
 
 def rows_by_sqlite(connection):
     return connection.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
 
 
-@pytest.mark.parametrize("page_bytes", [512, 1024, 4096, 65536])
-def test_every_row_of_every_size_is_what_was_written(tmp_path, page_bytes):
+@pytest.mark.parametrize(
+    ("page_bytes", "table"),
+    [
+        *((page_bytes, SCHEMA[1]) for page_bytes in (512, 1024, 4096, 65536)),
+        (512, SCHEMA[1] + " WITHOUT ROWID"),
+        (1024, SCHEMA[1].replace("id INTEGER PRIMARY KEY", "id INT PRIMARY KEY")),
+        (4096, SCHEMA[1].replace("data BLOB NOT NULL", "data BLOB NOT NULL, note TEXT")),
+        (512, "CREATE TABLE messages(topic_id INTEGER, id INTEGER PRIMARY KEY, timestamp INTEGER, data BLOB)"),
+    ],
+)
+def test_every_row_of_every_size_and_table_is_what_was_written(tmp_path, page_bytes, table):
     path = tmp_path / "a.db3"
-    with closing(database(path, page_bytes=page_bytes)) as connection, connection:
+    with closing(database(path, page_bytes=page_bytes, table=table)) as connection, connection:
         expected = rows_by_sqlite(connection)
     found, channels = rows_by_part(path)
     assert found == expected
@@ -87,34 +99,6 @@ def test_a_file_of_no_messages(tmp_path):
     assert rows_by_part(path) == ([], {1: (0, None, None), 300: (0, None, None)})
 
 
-@pytest.mark.parametrize(
-    "table",
-    [
-        SCHEMA[1] + " WITHOUT ROWID",
-        SCHEMA[1].replace("id INTEGER PRIMARY KEY", "id INT PRIMARY KEY"),
-        SCHEMA[1].replace("data BLOB NOT NULL", "data BLOB NOT NULL, note TEXT"),
-        SCHEMA[1].replace(
-            "id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL", "topic_id INTEGER NOT NULL, id INTEGER PRIMARY KEY"
-        ),
-    ],
-)
-def test_tables_that_ros_2_makes_otherwise_are_read(tmp_path, table):
-    path = tmp_path / "a.db3"
-    connection = sqlite3.connect(path)
-    connection.execute(SCHEMA[0])
-    connection.execute(table)
-    connection.executemany("INSERT INTO topics VALUES (?, ?, 'a/msg/A', 'cdr')", [(1, "/one"), (300, "/two")])
-    connection.executemany(
-        "INSERT INTO messages(id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)",
-        [(n, 1 if n % 2 else 300, n * 10, bytes([n % 256]) * n) for n in range(1, 200)],
-    )
-    connection.commit()
-    expected = rows_by_sqlite(connection)
-    connection.close()
-    found, _ = rows_by_part(path)
-    assert found == expected
-
-
 def rows_of(path, data):
     """The rows that are read of a damaged file, and what is said of it."""
     path.write_bytes(data)
@@ -123,15 +107,9 @@ def rows_of(path, data):
 
 def rows_of_part(path):
     with closing(SqlitePart(path, path.name)) as part:
-        blocks = list(part.blocks(frozenset({1, 300})))
-        found = {
-            number: bytes(block.buffer[at : at + length])
-            for block in blocks
-            for number, at, length in zip(
-                block.ordinal.tolist(), block.offsets.tolist(), block.lengths.tolist(), strict=True
-            )
-        }
-        assert sum(len(block.ordinal) for block in blocks) == len(found)
+        rows = list_rows(part)
+        found = {number: payload for number, _, _, payload in rows}
+        assert len(rows) == len(found)
         return found, part.damage
 
 

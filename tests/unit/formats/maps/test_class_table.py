@@ -133,7 +133,7 @@ def test_very_many_polygons_on_one_place_are_told_without_holding_each_against_e
     corners = rasterio.warp.transform_geom("EPSG:32633", "EPSG:4326", {"type": "Polygon", "coordinates": [[
         [560_000.0, 5_214_900.0], [560_100.0, 5_214_900.0], [560_100.0, 5_215_000.0], [560_000.0, 5_215_000.0], [560_000.0, 5_214_900.0]
     ]]})  # fmt: skip
-    features = [{"type": "Feature", "properties": {"class": 4 + n % 2}, "geometry": corners} for n in range(1000)]
+    features = [{"type": "Feature", "properties": {"class": 4 + n % 2}, "geometry": corners} for n in range(500)]
     (tmp_path / "t.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     summary = build_map(tmp_path / "m.zarr", name="m", height=height, terrain=tmp_path / "t.geojson")
     (overlap,) = [of for of in summary.findings if of.code == "polygons-overlap"]

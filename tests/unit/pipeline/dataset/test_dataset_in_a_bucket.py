@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from object_gateway import in_environment
 from storage_server import object_store
+from stored_files import flip
 from stored_files import read_files as files
 from synthetic_store import add_run, lanes, segments, small_store
 
@@ -208,9 +209,7 @@ def test_what_is_altered_in_the_bucket_is_no_patch(made, bucket):
     put(made, bucket)
     for path in (bucket[0] / "by name" / "ds" / "patches.zarr" / "height" / "c").rglob("0"):
         if path.is_file():
-            data = bytearray(path.read_bytes())
-            data[100] ^= 0xFF
-            path.write_bytes(data)
+            flip(path, 0.1)
     with pytest.raises(tcpipe.errors.DatasetError, match=r"height/c/0/0/0: its sha256 is .*build the dataset again"):
         tcpipe.open_dataset(URL)["train"].patches  # noqa: B018
     checked = verify(URL)
