@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -20,6 +21,8 @@ from tcpipe.robots import GENERIC
 from tcpipe.store import Store
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, Sensor
+
+logger = logging.getLogger("tcpipe")
 
 CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
 """Findings on runs that are excluded though they belong in a dataset."""
@@ -48,6 +51,9 @@ def choose_runs(
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_describe_no_runs(store, found))
+    for problem in found.state.problems:
+        if problem.key not in found.state.acknowledged:
+            logger.warning("%s: is missing or damaged, so that runs may be; see 'tcpipe status'", problem.log[0])
     candidates = _select_one_robot(store, _select_tagged(store, mine, tags), robot)
     damaged = store.prove(candidates)
     logs = {run.run_id: run.facts.log.source for run in candidates if run.facts.log and run.run_id not in damaged}
