@@ -28,6 +28,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.simulation import find_scenario
 from tcpipe.simulation.scenarios import scale_hidden_variance
 from tcpipe.simulation.world import World, draw_waves, sum_waves
+from tcpipe.terrain.target_grid import MapGrid
 
 PIXEL_M = 0.5
 _METRES = 190.0
@@ -57,11 +58,11 @@ def build(out: Path, drives: int, variance: float, bands: int) -> Path:
     rasters = {}
     for name, values in make_bands(made, bands, np.random.default_rng(7)).items():
         rasters[name] = out / f"{name}.tif"
-        affine = (PIXEL_M, 0.0, world.west_m, 0.0, -PIXEL_M, world.south_m + world.height_m)
+        corner = world.west_m, world.south_m + world.height_m
+        grid = MapGrid(f"EPSG:{world.epsg}", *corner, PIXEL_M, *values.shape[1:])
         write_geotiff(
-            rasters[name], lambda first, last, of=values: of[:, first:last], rows=values.shape[1], cols=values.shape[2],
-            affine=affine, crs=f"EPSG:{world.epsg}", dtype="float32", bands=bands,
-        )  # fmt: skip
+            rasters[name], lambda first, last, of=values: of[:, first:last], grid, dtype="float32", bands=bands
+        )
     recipe = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="run", test_fraction=0.34))
     store = make_store(out, site, rasters)
     print(str(build_dataset(out / "dataset", store=store, recipe=recipe)).splitlines()[0])

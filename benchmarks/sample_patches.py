@@ -146,15 +146,11 @@ def with_rasterio(datasets, frames):
 
 def files(source: MemoryMap, directory: Path) -> dict[str, Path]:
     """Write each layer as a deflated GeoTIFF in tiles."""
-    affine = (GRID.pixel_size_m, 0.0, GRID.x_min_m, 0.0, -GRID.pixel_size_m, GRID.y_max_m)
     for layer, values in source.arrays.items():
         write_geotiff(
             directory / f"{layer}.tif",
             lambda first, last, values=values: values[None, first:last],
-            rows=ROWS,
-            cols=COLS,
-            affine=affine,
-            crs=GRID.crs,
+            GRID,
             dtype=values.dtype.name,
         )
     return {layer: directory / f"{layer}.tif" for layer in LAYERS}

@@ -1,6 +1,7 @@
 """Analytic worlds for map tests: closed-form height, grey and class, written as GeoTIFFs, and segments that lie in them."""
 
 from collections.abc import Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pyproj
 import rasterio
 from rasterio import Affine
 
+from tcpipe.formats.maps.geotiff import keep_open
+from tcpipe.formats.maps.layer_building import open_raster
 from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
@@ -120,6 +123,13 @@ def segment_table(
     return LABELLED_SEGMENTS.table(**given, **rest | {"geometry": make_lines(start, end)})
 
 
+@contextmanager
+def open_heights(paths):
+    """Yield heights in many files as `build_map` opens them."""
+    with keep_open() as open_file:
+        yield open_raster(paths, "height", "metres", open_file)
+
+
 @dataclass(frozen=True)
 class ArrayMap:
     """A map in memory, for tests of sampling alone."""
@@ -139,6 +149,9 @@ class ArrayMap:
     @property
     def layers(self):
         return make_paper_layers([name for name in self.arrays if name not in self.more], self.classes) | self.more
+
+    def summary(self):
+        return {"name": self.name}
 
     def select(self, layers):
         assert set(self.layers) <= set(layers)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -323,8 +323,6 @@ def _read_job(place: Path) -> str | None:
 def _write_files(directory: Path, strips: _Strips, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
     """Write all files but the card; return the scales of the Nav2 maps."""
     costs, grid = strips.costs, strips.costs.grid
-    layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}
-    layout["affine"] = (grid.pixel_size_m, 0.0, grid.x_min_m, 0.0, -grid.pixel_size_m, grid.y_max_m)
     for name, unit in _QUANTITIES.items():
         bands = [
             *((band, unit) for band in (*_BAND_NAMES, "min", "mean")),
@@ -332,13 +330,17 @@ def _write_files(directory: Path, strips: _Strips, origin_m: tuple[float, float]
             ("std of a metre", unit),
         ]
         strip = partial(strips.compute, name)
-        write_cog(directory / f"{name}.tif", strip, dtype="float32", nodata=float("nan"), bands=bands, **layout)
+        write_cog(directory / f"{name}.tif", strip, grid, dtype="float32", bands=bands)
     bands = [(band, "bits") for band in (*_BAND_NAMES, "all courses")]
+    write_cog(directory / "reasons.tif", partial(_read_reasons, costs), grid, dtype="uint16", bands=bands)
+    height = [("height", "m")]
     write_cog(
-        directory / "reasons.tif", partial(_read_reasons, costs), dtype="uint16", nodata=None, bands=bands, **layout
+        directory / "height.tif",
+        lambda first, last: costs.height_m[None, first:last],
+        grid,
+        dtype="float32",
+        bands=height,
     )
-    layout |= {"dtype": "float32", "nodata": float("nan"), "bands": [("height", "m")]}
-    write_cog(directory / "height.tif", lambda first, last: costs.height_m[None, first:last], **layout)
     scales = {name: _write_nav2(directory / f"{name}.yaml", strips, name, origin_m) for name in ("duration", "energy")}
     for name, scale in scales.items():
         write_text(directory / f"{name}.qml", make_raster_style(_MEAN_BAND, scale.lowest, scale.highest))

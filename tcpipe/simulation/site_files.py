@@ -26,6 +26,7 @@ from tcpipe.simulation.truth import Truth
 from tcpipe.simulation.world import World
 from tcpipe.terrain.classes import PAPER_CLASSES
 from tcpipe.terrain.layers import Pixels
+from tcpipe.terrain.target_grid import MapGrid
 
 _HEIGHT_NODATA = -9999.0
 _PALETTE = {
@@ -176,15 +177,7 @@ def _write_raster(
         y = (north - (np.arange(first, last) + 0.5) * pixel_size_m).astype(np.float64)
         return pixels(world, x[None, :], y[:, None])
 
-    write_geotiff(
-        path,
-        strip,
-        rows=rows,
-        cols=cols,
-        affine=(pixel_size_m, 0.0, west, 0.0, -pixel_size_m, north),
-        crs=f"EPSG:{site.epsg}",
-        **options,
-    )
+    write_geotiff(path, strip, MapGrid(f"EPSG:{site.epsg}", west, north, pixel_size_m, rows, cols), **options)
 
 
 def _make_height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:

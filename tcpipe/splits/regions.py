@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TypeVar
 
 import numpy as np
 import shapely
@@ -17,6 +18,7 @@ from shapely.geometry.base import BaseGeometry
 
 Floats = NDArray[np.float64]
 Project = Callable[[Floats], Floats]
+Geometries = TypeVar("Geometries", BaseGeometry, NDArray[np.object_])
 
 _EDGE_STEP_DEG = 0.001
 """Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
@@ -64,13 +66,15 @@ def project_regions(regions: Regions, project: Project, *, window_deg: tuple[flo
     project : from lon and lat [deg], shape (N, 2), to x and y [m], shape (N, 2).
     window_deg : west, south, east, north to which regions are cut, since a projection is valid only near its zone.
     """
+    parts = (regions.train_test, regions.unseen, regions.exclude)
+    return Regions(*(project_near(part, project, window_deg) for part in parts))
 
-    def carry(geometry: BaseGeometry) -> BaseGeometry:
-        near = shapely.intersection(geometry, shapely.box(*window_deg))
-        stepped = shapely.segmentize(near, _EDGE_STEP_DEG)
-        return shapely.transform(stepped, project)
 
-    return Regions(carry(regions.train_test), carry(regions.unseen), carry(regions.exclude))
+def project_near(geometry: Geometries, project: Project, window_deg: tuple[float, float, float, float]) -> Geometries:
+    """Return the part of geometries, or one, in a window of lon/lat [deg] in a metric plane [m], edge by edge."""
+    near = shapely.intersection(geometry, shapely.box(*window_deg))
+    placed: Geometries = shapely.transform(shapely.segmentize(near, _EDGE_STEP_DEG), project)
+    return placed
 
 
 def classify_footprints(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,11 +58,9 @@ def format_crs(crs: CRS) -> str:
 
 
 def make_metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
-    """Return the local map from the CRS plane to the ground, at points of the plane.
+    """Return the local map from the CRS plane to the ground, at points of the plane, shape (N, 2, 2).
 
-    Returns
-    -------
-    numpy.ndarray : shape (N, 2, 2): metres east and north on the ellipsoid per CRS unit in x and y; NaN where the CRS is not defined.
+    It is metres east and north on the ellipsoid per CRS unit in x and y; NaN where the CRS is not defined.
     """
     geodetic = CRS(crs.geodetic_crs)
     step = 1e-4 if crs.is_geographic else 10.0
@@ -74,16 +72,10 @@ def make_metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
     a, e2 = _read_ellipsoid(crs)
     w = 1.0 - e2 * np.sin(latitude) ** 2
     per_degree = np.stack([a / np.sqrt(w) * np.cos(latitude), a * (1.0 - e2) / w**1.5]) * (math.pi / 180.0)
-    columns = [
-        _wrap_longitudes(ahead - behind) * per_degree / (2.0 * step) for ahead, behind in ((east, west), (north, south))
-    ]
-    found = np.stack(columns, axis=-1).swapaxes(0, 1)
+    differences = np.stack([east - west, north - south])
+    differences[:, 0] = (differences[:, 0] + 180.0) % 360.0 - 180.0  # the short way around the earth
+    found = (differences * per_degree / (2.0 * step)).T
     return np.where(np.isfinite(found), found, np.nan)
-
-
-def _wrap_longitudes(lonlat_deg: FloatArray) -> FloatArray:
-    """Return differences of longitude and latitude, shape (2, N) [deg], the short way around the earth."""
-    return np.stack([(lonlat_deg[0] + 180.0) % 360.0 - 180.0, lonlat_deg[1]])
 
 
 def _read_ellipsoid(crs: CRS) -> tuple[float, float]:
@@ -156,22 +148,17 @@ class Projection:
 
     def find_rough_shift(self, subject: Subject) -> tuple[Finding, ...]:
         """Return the finding, if any, that the two datums differ and the shift between them is known only roughly."""
-        if _has_same_datum(self.source, self.target):
+        source, target = (CRS(crs.geodetic_crs) for crs in (self.source, self.target))
+        if source.datum == target.datum:
             return ()
         accuracy_m = self._transformer.accuracy
         is_ballpark = "ballpark" in self._transformer.description.lower()
         if not is_ballpark and 0.0 <= accuracy_m <= read_threshold("datum-shift-rough", "max_accuracy_m"):
             return ()
-        source, target = (CRS(crs.geodetic_crs).name for crs in (self.source, self.target))
-        names = {"source": source, "target": target}
+        names = {"source": source.name, "target": target.name}
         if accuracy_m <= 0.0:
             return (make_finding("datum-shift-unknown", subject, names=names),)
         return (make_finding("datum-shift-rough", subject, names=names, accuracy_m=accuracy_m),)
-
-
-@lru_cache(maxsize=64)
-def _has_same_datum(one: CRS, other: CRS) -> bool:
-    return bool(CRS(one.geodetic_crs).datum == CRS(other.geodetic_crs).datum)
 
 
 def compute_area(crs: CRS, bounds: tuple[float, float, float, float]) -> tuple[float, float, float, float]:

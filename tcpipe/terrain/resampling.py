@@ -82,6 +82,14 @@ def mean(
 
 
 @compile_kernel
+def _vote(votes: NDArray[np.int64], found: int, best: int) -> int:
+    """Count a vote; return the commonest class, the lower of two."""
+    votes[found] += 1
+    more = votes[found] - votes[best]
+    return found if more > 0 or (more == 0 and found < best) else best
+
+
+@compile_kernel
 def resample_majority(
     source: NDArray[np.uint8], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.uint8]
 ) -> None:
@@ -96,9 +104,7 @@ def resample_majority(
                     x, y = _position(lattice, step, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
                     a, b = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
                     found = int(source[a, b]) if 0 <= a < rows and 0 <= b < cols else 0
-                    votes[found] += 1
-                    if votes[found] > votes[best] or (votes[found] == votes[best] and found < best) or p + q == 0:
-                        best = found
+                    best = _vote(votes, found, best)
             out[i, j] = best
             if parts == 1:
                 votes[best] = 0
@@ -112,13 +118,10 @@ def reduce_majority(ids: NDArray[np.uint8], factor: int, out: NDArray[np.uint8])
     votes = np.zeros(256, np.int64)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            best = ids[i * factor, j * factor]
+            best = 0
             for a in range(i * factor, (i + 1) * factor):
                 for b in range(j * factor, (j + 1) * factor):
-                    found = ids[a, b]
-                    votes[found] += 1
-                    if votes[found] > votes[best] or (votes[found] == votes[best] and found < best):
-                        best = found
+                    best = _vote(votes, int(ids[a, b]), best)
             out[i, j] = best
             for a in range(i * factor, (i + 1) * factor):
                 for b in range(j * factor, (j + 1) * factor):
@@ -134,14 +137,9 @@ _SLACK = 1.01
 
 def list_factors(grid: MapGrid) -> tuple[int, ...]:
     """Return the factors of a map's levels, rising: 1, 2, 4 … while pixels stay below `COARSEST_M` and two remain each way."""
-    factors = [1]
-    while (
-        (factor := 2 * factors[-1]) <= _WIDEST_FACTOR
-        and factor * grid.pixel_size_m <= COARSEST_M
-        and min(grid.rows, grid.cols) // factor >= 2
-    ):
-        factors.append(factor)
-    return tuple(factors)
+    powers = range(1, _WIDEST_FACTOR.bit_length())
+    fits = (2**n for n in powers if 2**n * grid.pixel_size_m <= COARSEST_M and min(grid.rows, grid.cols) >> n >= 2)
+    return (1, *fits)
 
 
 def make_overview_grid(grid: MapGrid, factor: int) -> MapGrid:

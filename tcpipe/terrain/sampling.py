@@ -23,10 +23,12 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
-from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_STEP_M, STACKS, group_stacks
-from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
+from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
+from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
+
+FloatArray = NDArray[np.float64]
 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -108,7 +110,8 @@ def sample_patches(
     chords = sample_chord_px(frames, level.grid, chord_m=chord_m, points=points)
     boxes = _compute_boxes(pixels, patch_px, chords, points)
     pixel_size_m, stacks = patch_m / patch_px, group_stacks(level.layers)
-    ground = Ground(boxes, pixels, chords, points, _place("terrain", stacks["classes"]), pixel_size_m, HEIGHT_STEP_M)
+    classed = stacks["classes"].index("terrain") if "terrain" in level.layers else -1
+    ground = Ground(boxes, pixels, chords, points, classed, pixel_size_m, HEIGHT_STEP_M)
     shape = (chord_m.size, patch_px, patch_px)
     floats, greys, classes = (
         np.empty((len(stacks[stack]), *shape), STACKS[stack]) for stack in ("floats", "greys", "classes")
@@ -182,10 +185,6 @@ def _interpolate_bands(window: NDArray[np.float32], px: NDArray[np.float64]) -> 
     return np.asarray(np.moveaxis(upper + along * (lower - upper), 3, 1))
 
 
-def _place(name: str, names: Sequence[str]) -> int:
-    return names.index(name) if name in names else -1
-
-
 def _compute_boxes(
     pixels: NDArray[np.float64], patch_px: int, chords: NDArray[np.float64], points: int
 ) -> NDArray[np.int64]:
@@ -210,8 +209,7 @@ def find_classes_at(source: MapReader, xy_m: NDArray[np.float64]) -> NDArray[np.
     xy_m : points in the map's CRS [m], shape (N, 2); what is not finite is off the map.
     """
     found = np.full(len(xy_m), OFF_THE_MAP, np.int16)
-    finite = np.flatnonzero(np.isfinite(xy_m).all(axis=1))
-    on = finite[source.grid.contains(xy_m[finite])]
+    on = np.flatnonzero(source.grid.contains(xy_m))
     px = source.grid.px_from_xy(xy_m[on])
     for group in group_by_tile(px, source):
         col, row = np.floor(px[group] + 0.5).astype(np.int64).T
@@ -221,8 +219,6 @@ def find_classes_at(source: MapReader, xy_m: NDArray[np.float64]) -> NDArray[np.
         found[on[group]] = window[row - top, col - left]
     return found
 
-
-FloatArray = NDArray[np.float64]
 
 _MAX_SCALE_ERROR = 0.02
 _PIXELS_DIFFER = "patch-pixels-unlike-map"
@@ -266,9 +262,8 @@ def compute_footprints(frames: PatchFrames, patch_m: float) -> FloatArray:
 
 
 def count_corners_on(grid: MapGrid, footprint_xy_m: FloatArray) -> NDArray[np.int64]:
-    """Return how many corners of each footprint, shape (N, 4, 2), lie on the map, shape (N,); what is not finite does not."""
-    inside = grid.contains(np.where(np.isfinite(footprint_xy_m), footprint_xy_m, np.inf))
-    return np.asarray(np.count_nonzero(inside, axis=1))
+    """Return how many corners of each footprint, shape (N, 4, 2), lie on the map, shape (N,)."""
+    return np.asarray(np.count_nonzero(grid.contains(footprint_xy_m), axis=1))
 
 
 def check_scale(frames: PatchFrames) -> None:
@@ -283,11 +278,9 @@ def check_scale(frames: PatchFrames) -> None:
 
 
 def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, patch_px: int) -> FloatArray:
-    """Return, for each patch, the map pixel coordinates of its pixel (0, 0) and their steps.
+    """Return where patches begin on the map, and their steps, shape (N, 6) [map px].
 
-    Returns
-    -------
-    numpy.ndarray : shape (N, 6): x and y of patch pixel (0, 0); dx, dy for one column forward; dx, dy for one row to the right [map px].
+    These are x and y of patch pixel (0, 0); dx, dy for one column forward; dx, dy for one row to the right.
     """
     pixel_size_m = patch_m / patch_px
     reach_m = (patch_m - pixel_size_m) / 2.0
@@ -297,11 +290,9 @@ def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, pat
 
 
 def sample_chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points: int) -> FloatArray:
-    """Return map pixel coordinates of evenly spread points on each chord.
+    """Return evenly spread points on each chord: x and y of the first, dx and dy to the next, shape (N, 4) [map px].
 
-    Returns
-    -------
-    numpy.ndarray : shape (N, 4): x and y of the first point, dx and dy to the next [map px]; point k lies at (k + ½) / points of the chord.
+    Point k lies at (k + ½) / points of the chord.
     """
     step_m = chord_m[:, None] / points
     first = frames.centre_xy_m + frames.along_xy * (step_m - chord_m[:, None]) / 2.0

@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
+from tcpipe.terrain.layers import HEIGHT_NODATA
 
 RUN_PX = 16
 """Pixels copied at once; windows are a multiple of it wide."""
-
-HEIGHT_NODATA = np.uint16(65535)
-"""A stored height without data (`tcpipe.terrain.layers.HEIGHT_NODATA`), as kernels compare it."""
 
 
 class Tiles(NamedTuple):
@@ -113,7 +111,7 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
         middle_y = np.int64(np.floor(frame[1] + 0.5 * (side - 1) * (frame[3] + frame[5])))
         reference = _read_height(tiles, middle_y, middle_x)
         _copy_near(tiles, box, near)
-        _lower(near.relative[: rows * width], reference)
+        near.relative[: rows * width] -= reference
         whole = _is_known(near.relative[: rows * width]) and _is_whole(near, rows * width)
         if not whole:
             good[:] = 1
@@ -146,7 +144,7 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
         else:
             along, left = _fit_good_slopes(rise, good, side)
             _clear(out, n, good)
-        entry, share = np.int64(0), 0.0
+        entry, share = 0, 0.0
         if ground.classed >= 0:
             under = near.classes[ground.classed * most :]
             entry, share = _find_class_under(under, width, box, ground.chords[n], ground.chord_points, votes)
@@ -223,19 +221,9 @@ def _fill_blank(near: _Near, first: int, last: int) -> None:
     """Leave a stretch of the window without data."""
     most = near.relative.size
     near.relative[first:last] = np.nan
-    for k in range(near.floats.size // most):
-        near.floats[k * most + first : k * most + last] = np.nan
-    for k in range(near.greys.size // most):
-        near.greys[k * most + first : k * most + last] = 0
-    for k in range(near.classes.size // most):
-        near.classes[k * most + first : k * most + last] = 0
-
-
-@compile_kernel
-def _lower(near: NDArray[np.float32], reference: np.float32) -> None:
-    """Take heights above a reference."""
-    for k in range(near.size):
-        near[k] -= reference
+    near.floats.reshape(-1, most)[:, first:last] = np.nan
+    near.greys.reshape(-1, most)[:, first:last] = 0
+    near.classes.reshape(-1, most)[:, first:last] = 0
 
 
 @compile_kernel
@@ -403,14 +391,8 @@ def _store_height(rise: NDArray[np.float32], step_m: float, out: NDArray[np.uint
 @compile_kernel
 def _fill_gaps(rise: NDArray[np.float32], good: NDArray[np.uint8]) -> None:
     """Set heights without data to the smallest that has some, 0 where none has: it stays the smallest, and none of them is high."""
-    lowest = np.float32(np.inf)
-    for k in range(rise.size):
-        if good[k]:
-            lowest = min(lowest, rise[k])
-    lowest = lowest if np.isfinite(lowest) else np.float32(0.0)
-    for k in range(rise.size):
-        if not good[k]:
-            rise[k] = lowest
+    known = rise[good == 1]
+    rise[good == 0] = known.min() if known.size else np.float32(0.0)
 
 
 @compile_kernel
@@ -480,25 +462,15 @@ def _find_class_under(
     chord: NDArray[np.float64],
     points: int,
     votes: NDArray[np.int64],
-) -> tuple[np.int64, float]:
-    """Return the commonest class at points on the chord and its share of those that have one; ties go low. ``votes`` stay zero."""
+) -> tuple[int, float]:
+    """Return the commonest class at points on the chord and its share of those that have one; ties go low."""
+    votes[:] = 0
     for k in range(points):
         col = np.int64(np.floor(chord[0] + chord[2] * k + 0.5)) - box[1]
         row = np.int64(np.floor(chord[1] + chord[3] * k + 0.5)) - box[0]
         votes[near[row * width + col]] += 1
-    best, missing = np.int64(0), votes[0]
-    for k in range(points):
-        col = np.int64(np.floor(chord[0] + chord[2] * k + 0.5)) - box[1]
-        row = np.int64(np.floor(chord[1] + chord[3] * k + 0.5)) - box[0]
-        entry = np.int64(near[row * width + col])
-        if entry > 0 and (best == 0 or votes[entry] > votes[best] or (votes[entry] == votes[best] and entry < best)):
-            best = entry
-    share = votes[best] / (points - missing) if best > 0 else 0.0
-    for k in range(points):
-        col = np.int64(np.floor(chord[0] + chord[2] * k + 0.5)) - box[1]
-        row = np.int64(np.floor(chord[1] + chord[3] * k + 0.5)) - box[0]
-        votes[near[row * width + col]] = 0
-    return best, share
+    best = int(np.argmax(votes[1:])) + 1
+    return (best, votes[best] / (points - votes[0])) if votes[best] > 0 else (0, 0.0)
 
 
 @compile_kernel

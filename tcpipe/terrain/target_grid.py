@@ -89,20 +89,23 @@ def find_projection(footing: Georeference, crs: CRS) -> Projection | None:
     return Projection(footing.crs, crs, compute_area(footing.crs, bounds))
 
 
+def _project(raster: Georeference, points: FloatArray, crs: CRS) -> FloatArray:
+    """Return points of a raster's CRS in another."""
+    projection = find_projection(raster, crs)
+    return points if projection is None else projection.forward(points)
+
+
 def choose_crs(height: Georeference, wanted: CRS | None) -> CRS:
     """Return the map's CRS: the wanted one, else the height raster's, else the UTM zone of its middle.
 
-    Raises
-    ------
-    MapError : the wanted CRS is not metric over the raster, or the raster is too large for any.
+    `MapError`: the wanted CRS is not metric over the raster, or the raster is too large for any.
     """
-    if wanted is None and is_metric(height.crs, np.vstack([height.outline(), height.centre()])):
+    points = np.vstack([height.outline(), height.centre()])
+    if wanted is None and is_metric(height.crs, points):
         return height.crs
     x, y = height.centre().tolist()
     crs = wanted or find_utm_crs(height.crs, (x, y))
-    points = np.vstack([height.outline(), height.centre()])
-    projection = find_projection(height, crs)
-    placed = points if projection is None else projection.forward(points)
+    placed = _project(height, points, crs)
     if np.isfinite(placed).all() and is_metric(crs, placed):
         return crs
     if wanted is not None:
@@ -128,8 +131,7 @@ def choose_grid(
         pitch = pixel_size_m
     elif not coincide:
         pitch = float(f"{pitch:.3g}")
-    projection = find_projection(height, crs)
-    outline = height.outline() if projection is None else projection.forward(height.outline())
+    outline = _project(height, height.outline(), crs)
     (x_min, y_min), (x_max, y_max) = outline.min(axis=0).tolist(), outline.max(axis=0).tolist()
     x_base, y_base = 0.0, 0.0
     if coincide:
@@ -182,8 +184,7 @@ def _compute_pixel_side(raster: Georeference, crs: CRS) -> float:
         return abs(raster.affine[0])
     middle = np.array([raster.cols / 2.0, raster.rows / 2.0])
     points = raster.xy_from_px(middle + np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
-    projection = find_projection(raster, crs)
-    placed = points if projection is None else projection.forward(points)
+    placed = _project(raster, points, crs)
     side = float(np.linalg.norm(placed[1:] - placed[0], axis=1).min())
     if not math.isfinite(side):
         raise MapError(f"{raster.name}: is outside the area where the map's CRS {crs.name!r} is defined")
@@ -193,12 +194,9 @@ def _compute_pixel_side(raster: Georeference, crs: CRS) -> float:
 def compute_source_lattice(  # noqa: PLR0917
     grid: MapGrid, raster: Georeference, projection: Projection | None, row0: int, rows: int, col0: int, cols: int
 ) -> FloatArray:
-    """Return the raster's pixel coordinates at every `LATTICE_STEP_PX`-th pixel of a block of the grid.
+    """Return the raster's pixel coordinates at every `LATTICE_STEP_PX`-th pixel of a block of the grid, shape (A, B, 2).
 
-    Returns
-    -------
-    numpy.ndarray : shape (A, B, 2), beginning one step above and left of the block and ending at least one step beyond; not finite where
-        the raster's CRS is not defined.
+    They begin one step above and left of the block, end at least one step beyond, and are not finite where the raster's CRS is undefined.
     """
     step = LATTICE_STEP_PX
     i = row0 - step + step * np.arange(-(-rows // step) + 3)
@@ -256,7 +254,7 @@ class MapGrid:
         return xy_m
 
     def contains(self, xy_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether map points, shape (..., 2) [m], lie on the grid, its outer edges included."""
+        """Return whether map points, shape (..., 2) [m], lie on the grid, its outer edges included; what is not finite does not."""
         x_min, y_min, x_max, y_max = self.bounds_m
         x, y = xy_m[..., 0], xy_m[..., 1]
         inside: NDArray[np.bool_] = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)

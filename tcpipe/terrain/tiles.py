@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any, Protocol
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,75 +27,57 @@ _STRIP_TILES = CACHED_TILES // 3 - 3
 """Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
 
 
-class BandReader(Protocol):
-    """A layer of several bands on a grid of its own."""
+@dataclass(frozen=True, slots=True)
+class BandReader:
+    """A layer of several bands on a grid of its own, with tiles as those of `MapReader`."""
 
-    @property
-    def grid(self) -> MapGrid:
-        """Where its pixels lie."""
-
-    @property
-    def tile_px(self) -> int:
-        """As of `MapReader`."""
-
-    @property
-    def layer(self) -> Layer:
-        """What it is."""
-
-    def read(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
-        """Return a window of all bands, shape (bands, rows, columns), NaN without data."""
+    layer: Layer
+    grid: MapGrid
+    tile_px: int
+    read: Callable[[int, int, int, int], NDArray[Any]]
+    """Returns a window (first row, last row, first column, last column) of all bands, (bands, rows, columns), NaN without data."""
 
 
-class MapReader(Protocol):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapReader(ABC):
     """A map: its grid, classes, layers, and windows of each layer."""
 
-    @property
-    def name(self) -> str:
-        """The map's name in the store."""
+    name: str
+    """The map's name in the store."""
+    grid: MapGrid
+    classes: ClassTable
+    layers: Mapping[str, Layer]
+    """Its layers by name; ``height``, the relative one, is always there."""
+    tile_px: int
+    """Side of the square tiles that are cheap to read, aligned with pixel (0, 0)."""
+    height_reference_m: float
+    """What stored heights are above [m]."""
+    factors: tuple[int, ...]
+    """Levels that `at` gives: how many pixels of the full map a pixel of each spans, rising from 1."""
+    banded: Mapping[str, BandReader]
+    """Its layers of several bands by name; the same at every factor."""
 
-    @property
-    def grid(self) -> MapGrid:
-        """Where its pixels lie."""
-
-    @property
-    def classes(self) -> ClassTable:
-        """Its class table."""
-
-    @property
-    def layers(self) -> Mapping[str, Layer]:
-        """Its layers by name; ``height``, the relative one, is always there."""
-
-    @property
-    def tile_px(self) -> int:
-        """Side of the square tiles that are cheap to read, aligned with pixel (0, 0)."""
-
-    @property
-    def height_reference_m(self) -> float:
-        """What stored heights are above [m]."""
-
-    @property
-    def factors(self) -> tuple[int, ...]:
-        """Levels that `at` gives: how many pixels of the full map a pixel of each spans, rising from 1."""
-
-    @property
-    def banded(self) -> Mapping[str, BandReader]:
-        """Its layers of several bands by name."""
-
-    def select(self, layers: Collection[str]) -> MapReader:
+    def select(self, layers: Collection[str]) -> Self:
         """Return the map with these of its layers alone; ``height`` is one of them."""
+        kept = {name: layer for name, layer in self.layers.items() if name in layers}
+        return replace(self, layers=kept, banded={name: bands for name, bands in self.banded.items() if name in layers})
 
+    @abstractmethod
     def at(self, factor: int) -> MapReader:
         """Return the map at one of its ``factors``."""
 
+    @abstractmethod
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
         """Return rows ``row0:row1`` and columns ``col0:col1`` of a layer.
 
         Height is in metres above `height_reference_m`; no data is NaN, or 0 in layers of bytes.
         """
 
+    @abstractmethod
     def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
         """Have tiles (row, column) of all layers at hand that are read soon, where that takes long."""
 
+    @abstractmethod
     def read_tile(self, layer: str, i: int, j: int, out: NDArray[np.generic]) -> None:
         """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
 
@@ -150,7 +134,7 @@ def read_window(  # noqa: PLR0917
 class TilePool:
     """The tiles that are being sampled, side by side in one array for each kind of layer; the least recently used make room."""
 
-    __slots__ = ("_flat", "_held", "_map", "_stacks", "decoded", "slots")
+    __slots__ = ("_flat", "_held", "_map", "_stacks", "slots")
 
     def __init__(self, source: MapReader) -> None:
         grid, side = source.grid, source.tile_px
@@ -162,8 +146,6 @@ class TilePool:
         self._flat: dict[Stack, NDArray[Any]] = {
             stack: np.empty((len(names), 0), STACKS[stack]) for stack, names in self._stacks.items()
         }
-        self.decoded: Counter[tuple[str, int, int]] = Counter()
-        """How often each tile, by layer, row and column, was read."""
         self._grow(min(CACHED_TILES, self.slots.size))
 
     @property
@@ -210,7 +192,6 @@ class TilePool:
         side = self._map.tile_px
         for stack, names in self._stacks.items():
             for row, layer in enumerate(names):
-                self.decoded[layer, *tile] += 1
                 place = self._flat[stack][row, slot * side**2 : (slot + 1) * side**2]
                 self._map.read_tile(layer, *tile, place.reshape(side, side))
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 import csv
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pyproj import CRS
 
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.integrity import write_checksums
-from tcpipe.formats.maps.geotiff import USES, Use
-from tcpipe.formats.maps.layer_building import Raster, RasterLayer, Tally, iterate_shards, open_raster
+from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
+from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs, RasterOrigin
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
@@ -44,7 +44,6 @@ from tcpipe.terrain.layers import (
 from tcpipe.terrain.projection import parse_crs
 from tcpipe.terrain.target_grid import (
     MAX_PIXELS,
-    Georeference,
     MapGrid,
     choose_crs,
     choose_grid,
@@ -110,91 +109,63 @@ def build_map(
     pixel_size_m : side of a map pixel [m]; None takes the finest raster's.
     inputs, origins : what the caller wants to know the map by later, and where its rasters are from; kept in its facts.
 
-    Raises
-    ------
-    MapError : a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line each.
-    StoreError : the map cannot be written.
+    `MapError`: a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line each.
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, **more.files}
     paths = {role: [files] if isinstance(files, Path) else list(files) for role, files in given.items() if files}
     drawn = paths.pop("terrain") if "terrain" in paths and is_drawn(paths["terrain"]) else []
-    with ExitStack() as stack:
-        rasters = _open_all(stack, paths, more)
+    wanted = parse_crs(crs, where="--crs") if crs else None
+    with keep_open() as open_file:
+        rasters = _open_all(open_file, paths, more, wanted)
         scheme, origin = _choose_scheme(classes, agreed, rasters.get("terrain"))
         schemes = {"terrain": scheme} | _read_own_schemes(more, rasters)
-        wanted = parse_crs(crs, where="--crs") if crs else None
-        footings = _place_all(rasters, crs)
-        map_crs = choose_crs(footings["height"], wanted)
-        others = [footings[role] for role in ("ortho", "terrain") if role in footings]
-        grid = choose_grid(footings["height"], others, map_crs, pixel_size_m)
-        layers: dict[str, LayerSource] = {}
-        banded: dict[str, BandedLayer] = {}
-        for role, raster in rasters.items():
-            footing, layer = footings[role], _make_layer(raster, schemes)
-            source = RasterLayer(layer, raster, footing, find_projection(footing, map_crs), schemes.get(role))
-            if role in PAPER_LAYERS or raster.band_count == 1:
-                layers[role] = source
-            else:
-                banded[role] = _place_bands(source, choose_layer_grid(grid, footing, map_crs), name)
+        ground = rasters["height"].place
+        map_crs = choose_crs(ground, wanted)
+        others = [rasters[role].place for role in ("ortho", "terrain") if role in rasters]
+        grid = choose_grid(ground, others, map_crs, pixel_size_m)
+        made = {role: _make_sources(raster, schemes, grid, map_crs, name) for role, raster in rasters.items()}
+        sources: dict[str, Sequence[LayerSource]] = {role: bands for role, bands in made.items() if len(bands) == 1}
         if drawn:
-            layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
-        kinds = {role: source.layer for role, source in layers.items()}
+            sources["terrain"] = (place_polygons(drawn, scheme, map_crs, grid),)
+        sources |= {role: bands for role, bands in made.items() if len(bands) > 1}
+        layers = {role: bands[0].layer for role, bands in sources.items()}
         with write_atomic_directory(out_path) as half:
-            writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
-            _write_layers(writer, layers, grid)
-            for banded_layer in banded.values():
-                banded_layer.write(writer)
-            every = layers | {
-                role: min(banded_layer.bands, key=lambda band: band.tally.pixels)
-                for role, banded_layer in banded.items()
-            }  # of several bands that with the least data counts
-            _refuse_empty(every)
-            sides_m = {role: banded_layer.grid.pixel_size_m for role, banded_layer in banded.items()}
-            facts = _make_facts(grid, every, sides_m, origin, inputs or MapInputs())
-            facts = replace(facts, origins=tuple(origins))
-            ranges = {role: _set_range(source) for role, source in layers.items()}
-            writer.finish(facts, ranges | {role: banded_layer.describe() for role, banded_layer in banded.items()})
+            grids = {role: bands[0].grid for role, bands in sources.items() if layers[role].bands}
+            writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=layers, band_grids=grids)
+            for bands in sources.values():
+                for number, band in enumerate(bands):
+                    _write(writer, band, number)
+            every = {role: min(bands, key=lambda band: band.tally.pixels) for role, bands in sources.items()}
+            _refuse_empty(every)  # of several bands that with the least data counts
+            facts = _make_facts(grid, every, origin, inputs or MapInputs(), tuple(origins))
+            writer.finish(facts, {role: _set_ranges(bands) for role, bands in sources.items()})
             write_checksums(half)
     return facts
 
 
-@dataclass(frozen=True, slots=True)
-class BandedLayer:
-    """A raster of several bands: a layer of each, all on a grid of their own."""
-
-    bands: tuple[RasterLayer, ...]
-    grid: MapGrid
-    dtype: str
-
-    def write(self, writer: MapWriter) -> None:
-        """Write all bands, shard by shard."""
-        writer.add_bands(self.describe(), self.grid)
-        for number, band in enumerate(self.bands):
-            for row0, col0, rows, cols in iterate_shards(self.grid, SHARD_PX):
-                shard = band.shard(self.grid, row0, col0, rows, cols)
-                if band.tally.count(band.layer, band.label, shard):
-                    writer.write_band(band.layer.name, number, row0, col0, shard)
-
-    def describe(self) -> Layer:
-        """Return the layer with the range of each band, as far as they are written."""
-        layer, pixel_size_m = self.bands[0].layer, self.grid.pixel_size_m
-        ranges = [(band.tally.low, band.tally.high) for band in self.bands]
-        return make_banded_layer(layer.name, layer.unit, ranges, self.dtype, pixel_size_m)
-
-
-def _place_bands(source: RasterLayer, grid: MapGrid, name: str) -> BandedLayer:
-    """Return the bands of a raster on a grid of their own; log how large that becomes."""
-    count = source.raster.band_count
-    dtype = "float16" if all(tile.is_half for tile in source.raster.tiles) else "float32"
-    size_mb = count * grid.rows * grid.cols * np.dtype(dtype).itemsize / 1e6
+def _make_sources(
+    raster: Raster, schemes: Mapping[str, ClassScheme], grid: MapGrid, crs: CRS, name: str
+) -> Sequence[RasterLayer]:
+    """Return a raster as a layer, or each of its bands, on a grid of their own; log how large that becomes."""
+    layer, projection, count = (
+        _make_layer(raster, schemes),
+        find_projection(raster.place, crs),
+        len(raster.tiles[0].bands),
+    )
+    if raster.role in PAPER_LAYERS or count == 1:
+        return (RasterLayer(layer, raster, grid, projection, schemes.get(raster.role)),)
+    grid = choose_layer_grid(grid, raster.place, crs)
+    dtype = np.dtype("float16" if all(tile.is_half for tile in raster.tiles) else "float32")
+    values = count * grid.rows * grid.cols
     message = "map %s: layer %s: %d bands, %d x %d px of %g m, %s: up to %.1f MB"
-    logger.info(message, name, source.layer.name, count, grid.cols, grid.rows, grid.pixel_size_m, dtype, size_mb)
-    if count * grid.rows * grid.cols > MAX_PIXELS:
+    sizes = (count, grid.cols, grid.rows, grid.pixel_size_m, dtype, values * dtype.itemsize / 1e6)
+    logger.info(message, name, layer.name, *sizes)
+    if values > MAX_PIXELS:
         raise MapError(
-            f"{source.label}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all"
+            f"{raster.place.name}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all"
         )
-    bands = [replace(source, raster=source.raster.select_band(band), tally=Tally()) for band in range(count)]
-    return BandedLayer(tuple(bands), grid, dtype)
+    layer = make_banded_layer(layer.name, layer.unit, [(0.0, 1.0)] * count, dtype.name, grid.pixel_size_m)
+    return [RasterLayer(layer, raster.select_band(band), grid, projection, None) for band in range(count)]
 
 
 def _make_layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
@@ -206,17 +177,20 @@ def _make_layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
     return make_continuous_layer(raster.role, unit=raster.unit, low=0.0, high=1.0)
 
 
-def _set_range(source: LayerSource) -> Layer:
-    layer = source.layer
-    return replace(layer, low=source.tally.low, high=source.tally.high) if layer.stack == "floats" else layer
+def _set_ranges(bands: Sequence[LayerSource]) -> Layer:
+    """Return a layer with the range of each of its bands, as it was found."""
+    layer, ranges = bands[0].layer, tuple((band.tally.low, band.tally.high) for band in bands)
+    if layer.stack not in {"floats", "bands"}:
+        return layer
+    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+    return replace(layer, low=low, high=high, bands=ranges if layer.bands else ())
 
 
-def _write_layers(writer: MapWriter, layers: Mapping[str, LayerSource], grid: MapGrid) -> None:
-    for role, layer in layers.items():
-        for row0, col0, rows, cols in iterate_shards(grid, SHARD_PX):
-            shard = layer.shard(grid, row0, col0, rows, cols)
-            if layer.tally.count(layer.layer, layer.label, shard):
-                writer.write(role, row0, col0, shard)
+def _write(writer: MapWriter, source: LayerSource, band: int) -> None:
+    for row0, col0, rows, cols in iterate_shards(source.grid, SHARD_PX):
+        shard = source.shard(row0, col0, rows, cols)
+        if source.tally.count(source.layer, source.label, shard):
+            writer.write(source.layer.name, row0, col0, shard, band)
 
 
 def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[str, ClassScheme]:
@@ -226,7 +200,7 @@ def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[s
         for name, table in more.categorical.items()
     }
     if problems := [
-        f"{rasters[name].label}: does not define the meaning of its values (no attribute table, no category names); "
+        f"{rasters[name].place.name}: does not define the meaning of its values (no attribute table, no category names); "
         f"give a table: --categorical {name}=classes.csv"
         for name, scheme in schemes.items()
         if scheme is None
@@ -247,7 +221,7 @@ def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Ra
         theirs = ", ".join(dict.fromkeys(terrain.names.values()))
         ours = ", ".join(entry.name for entry in scheme.table.classes)
         raise MapError(
-            f"{terrain.label}: none of its class names ({theirs}) is in the class table ({ours}); "
+            f"{terrain.place.name}: none of its class names ({theirs}) is in the class table ({ours}); "
             "define them with --classes"
         )
     return named, "names"
@@ -264,7 +238,9 @@ def _read_scheme(classes: Path, agreed: ClassScheme | None) -> ClassScheme:
     return scheme
 
 
-def _open_all(stack: ExitStack, paths: Mapping[str, Sequence[Path]], more: MoreLayers) -> dict[str, Raster]:
+def _open_all(
+    open_file: OpenFile, paths: Mapping[str, Sequence[Path]], more: MoreLayers, crs: CRS | None
+) -> dict[str, Raster]:
     rasters: dict[str, Raster] = {}
     problems: list[str] = []
     uses = {**USES, **more.uses()}
@@ -273,31 +249,12 @@ def _open_all(stack: ExitStack, paths: Mapping[str, Sequence[Path]], more: MoreL
         uses |= dict(zip(COLOURS, _RGB, strict=True))
     for role, files in paths.items():
         try:
-            rasters[role] = stack.enter_context(open_raster(files, role, uses[role]))
+            rasters[role] = open_raster(files, role, uses[role], open_file, crs)
         except MapError as error:
             problems += error.problems
     if problems:
         raise MapError(*dict.fromkeys(problems))
     return rasters
-
-
-def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Georeference]:
-    footings: dict[str, Georeference] = {}
-    problems: list[str] = []
-    for role, raster in rasters.items():
-        text = raster.crs or crs
-        if text is None:
-            problems.append(f"{raster.label}: has no CRS; if you know it, give it with --crs EPSG:n")
-            continue
-        try:
-            found = parse_crs(text, where=raster.label if raster.crs else "--crs")
-        except MapError as error:
-            problems += error.problems
-            continue
-        footings[role] = Georeference(found, raster.affine, raster.rows, raster.cols, raster.label)
-    if problems:
-        raise MapError(*dict.fromkeys(problems))
-    return footings
 
 
 def _refuse_empty(layers: Mapping[str, LayerSource]) -> None:
@@ -328,13 +285,17 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
 
 
 def _make_facts(
-    grid: MapGrid, layers: Mapping[str, LayerSource], sides_m: Mapping[str, float], origin: str, inputs: MapInputs
+    grid: MapGrid,
+    layers: Mapping[str, LayerSource],
+    classes_from: str,
+    inputs: MapInputs,
+    origins: tuple[RasterOrigin, ...],
 ) -> MapFacts:
-    """Return what was found; ``sides_m`` are the pixels of layers that keep their own, which may reach beyond the map."""
-    pixels = {role: (sides_m.get(role, grid.pixel_size_m) / grid.pixel_size_m) ** 2 for role in layers}
-    covered = {
-        role: min(layer.tally.pixels * pixels[role] / (grid.rows * grid.cols), 1.0) for role, layer in layers.items()
-    }
+    """Return what was found; layers that keep their own pixels may reach beyond the map."""
+    covered = {}
+    for role, layer in layers.items():
+        pixels = layer.tally.pixels * (layer.grid.pixel_size_m / grid.pixel_size_m) ** 2
+        covered[role] = min(pixels / (grid.rows * grid.cols), 1.0)
     shares = {name: found for name, layer in layers.items() if (found := _compute_class_shares(layer))}
     return MapFacts(
         sources={role: layer.name for role, layer in layers.items()},
@@ -344,8 +305,9 @@ def _make_facts(
         class_share=shares.pop("terrain", {}),
         class_shares=shares,
         findings=_find_all(layers, covered),
-        classes_from=origin,
+        classes_from=classes_from,
         inputs=inputs,
+        origins=origins,
     )
 
 
@@ -368,12 +330,7 @@ _TRUTH = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0"
 
 
 def read_class_scheme(path: Path) -> ClassScheme:
-    """Read a class table and the raster values of its classes.
-
-    Raises
-    ------
-    MapError : the file cannot be read, or breaks its contract: one problem a wrong line, all at once.
-    """
+    """Read a class table and the raster values of its classes; `MapError`: one problem a wrong line, all at once."""
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:

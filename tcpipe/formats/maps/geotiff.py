@@ -17,7 +17,8 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,6 +38,7 @@ from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.layers import LUMA_RGB, MAX_BANDS
+from tcpipe.terrain.target_grid import MapGrid
 
 Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
 """What is taken of a raster: heights, an orthophoto or one of its colours, class values, or numbers in a unit of their own."""
@@ -102,17 +104,8 @@ _OPAQUE = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """How a file is opened: by its one driver; the files it is made of."""
-
-    path: Path
-    driver: str
-    files: tuple[Path, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Tile:
-    """A raster file that can be used as its role; `RasterTiles.read` reads it.
+    """A raster file that can be used as its role; `read_window` reads it.
 
     ``affine`` is (a, b, c, d, e, f) of x = a·col + b·row + c, y = d·col + e·row + f at pixel *corners*; ``crs`` is WKT, or empty where
     the file has none; ``findings`` are about its bands and tags.
@@ -130,7 +123,7 @@ class Tile:
     findings: tuple[Finding, ...]
     names: Mapping[int, str]
     """Names of values, from the raster attribute table or the category names; empty where there are none."""
-    source: Source = field(repr=False)
+    driver: str
     dtype: str
     """Type of the values that are read: the file's for classes, else float64."""
     bands: tuple[int, ...]
@@ -144,54 +137,50 @@ class Tile:
     """Which indices of a palette can be seen."""
 
 
-@dataclass(slots=True)
-class RasterTiles:
-    """Files that are open: a few of them, those that were read last."""
+OpenFile = Callable[[Path, str], Any]
+"""Returns a raster's dataset by its path and driver."""
 
-    _open: dict[Path, Any] = field(default_factory=dict)
 
-    def read(self, tile: Tile, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return a window inside a tile, and which of its pixels have data.
-
-        Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes.
-
-        Raises
-        ------
-        MapError : the window's pixels are damaged, or the file is gone.
-        """
-        window = Window(col0, row0, col1 - col0, row1 - row0)
-        dataset = self._dataset(tile)
+@contextmanager
+def keep_open() -> Iterator[OpenFile]:
+    """Yield a function that opens rasters, with GDAL set up as `GDAL_CONFIG` says; a few stay open, those that were read last."""
+    kept = lru_cache(_MAX_OPEN)(_open)
+    with rasterio.Env(**GDAL_CONFIG):
         try:
-            raw = dataset.read(tile.bands, window=window)
-            masked = dataset.read_masks(tile.bands[0], window=window) if tile.use == "numbers" else None
-            valid = (dataset.dataset_mask(window=window) if masked is None else masked) >= _OPAQUE
-        except RasterioError as error:
-            raise MapError(
-                f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
-                f"{describe_error(error)}"
-            ) from error
-        if tile.use == "classes":
-            return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
-        weights = _WEIGHTS.get(tile.use)
-        values = (
-            raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _read_grey(dataset, tile.bands, raw, weights)
+            yield kept
+        finally:
+            kept.cache_clear()
+
+
+def read_window(  # noqa: PLR0917
+    open_file: OpenFile, tile: Tile, row0: int, row1: int, col0: int, col1: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Return a window inside a tile, and which of its pixels have data; `MapError`: they are damaged, or the file is gone.
+
+    Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes.
+    """
+    window = Window(col0, row0, col1 - col0, row1 - row0)
+    dataset = open_file(tile.path, tile.driver)
+    try:
+        raw = dataset.read(tile.bands, window=window)
+        mask = (
+            dataset.read_masks(tile.bands[0], window=window)
+            if tile.use == "numbers"
+            else dataset.dataset_mask(window=window)
         )
-        return values, valid & np.isfinite(values)
-
-    def _dataset(self, tile: Tile) -> Any:
-        found = self._open.pop(tile.path, None)
-        if found is None:
-            if len(self._open) >= _MAX_OPEN:
-                self._open.pop(next(iter(self._open))).close()
-            found = _open_as(tile.source)
-        self._open[tile.path] = found
-        return found
-
-    def close(self) -> None:
-        """Close every file."""
-        for dataset in self._open.values():
-            dataset.close()
-        self._open.clear()
+    except RasterioError as error:
+        raise MapError(
+            f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
+            f"{describe_error(error)}"
+        ) from error
+    valid = mask >= _OPAQUE
+    if tile.use == "classes":
+        return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
+    weights = _WEIGHTS.get(tile.use)
+    values = (
+        raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _read_grey(dataset, tile.bands, raw, weights)
+    )
+    return values, valid & np.isfinite(values)
 
 
 def _read_grey(
@@ -203,28 +192,14 @@ def _read_grey(
     return np.asarray(np.tensordot(weights, raw.astype(np.float64), 1))
 
 
-@contextmanager
-def open_raster_tiles() -> Iterator[RasterTiles]:
-    """Read tiles, with GDAL set up as `GDAL_CONFIG` says."""
-    pool = RasterTiles()
-    with rasterio.Env(**GDAL_CONFIG):
-        try:
-            yield pool
-        finally:
-            pool.close()
+def read_tile(path: Path, role: str, use: Use) -> Tile:
+    """Return a raster file as the tile of a role.
 
-
-def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
-    """Return a raster file as the tile of a role; ``use`` is that of `USES` unless another is given.
-
-    Raises
-    ------
-    MapError : it is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
+    `MapError`: it is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
     """
-    use = use or USES[role]
     with rasterio.Env(**GDAL_CONFIG):
-        source = _check_source(path)
-        with _open_as(source) as dataset:
+        driver, _ = _list_plain_files(path)
+        with _open(path, driver) as dataset:
             _refuse_unplaced(dataset, path)
             bands, unusual = _choose_bands(dataset, path, role, use)
             scale, ignored = _read_scaling(dataset, path, role, use, bands)
@@ -243,7 +218,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
                 kind=f"{many}{dataset.dtypes[bands[0] - 1]} ({colours[:80]}{', ' if unit else ''}{unit})",
                 findings=(*unusual, *ignored),
                 names=read_value_names(_describe_as_vrt(dataset), bands[0]) if use == "classes" else {},
-                source=source,
+                driver=driver,
                 dtype=dataset.dtypes[bands[0] - 1] if use == "classes" else "float64",
                 bands=bands,
                 scale=scale,
@@ -254,23 +229,12 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
 
 
 def list_raster_files(path: Path) -> tuple[Path, ...]:
-    """Return every file that a raster is made of: itself, and what lies beside it (masks, world files, statistics).
-
-    Raises
-    ------
-    MapError : it is no raster of a kind that is read.
-    """
+    """Return every file that a raster is made of: itself, and what lies beside it (masks, world files, statistics)."""
     with rasterio.Env(**GDAL_CONFIG):
-        return _check_source(path).files
+        return _list_plain_files(path)[1]
 
 
-def _check_source(path: Path) -> Source:
-    """Return how a user's file is opened, once neither it nor what lies beside it reaches elsewhere."""
-    driver = _find_driver(path, raster=path)
-    return Source(path, driver, _list_plain_files(path, driver))
-
-
-def _find_driver(path: Path, *, raster: Path) -> str:
+def _find_driver(path: Path, raster: Path) -> str:
     """Return the driver of a file by what it begins with, which GDAL goes by; ``raster`` is the one that it is or lies beside."""
     head = _read_beginning(path)
     for start, driver in _DRIVERS.items():
@@ -283,10 +247,10 @@ def _find_driver(path: Path, *, raster: Path) -> str:
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     known = next((name for start, name in _OTHERS.items() if text.startswith(start)), None)
     what = known or ("something else" if head else "empty")
-    rewrite = f" ({_rewrite(raster)})" if known else ""
-    raise MapError(
-        f"{path}: is {what}, not a raster that is read; expected GeoTIFF, JPEG 2000 or ERDAS Imagine{rewrite}{_suggest_polygons(path)}"
-    )
+    more = f" ({_rewrite(raster)})" if known else ""
+    if path.suffix.lower() in {".shp", ".gpkg", ".kml", ".geojson", ".json"}:
+        more += "; terrain may also be polygons, exported as .geojson"
+    raise MapError(f"{path}: is {what}, not a raster that is read; expected GeoTIFF, JPEG 2000 or ERDAS Imagine{more}")
 
 
 def _read_beginning(path: Path) -> bytes:
@@ -299,16 +263,20 @@ def _read_beginning(path: Path) -> bytes:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _list_plain_files(path: Path, driver: str) -> tuple[Path, ...]:
-    """Return a raster's files, itself first; refuse one that names others elsewhere, has such beside it, or does not fit into memory."""
+def _list_plain_files(path: Path, raster: Path | None = None) -> tuple[str, tuple[Path, ...]]:
+    """Return a raster's driver and files, itself first, once neither it nor what lies beside it reaches elsewhere or is too large.
+
+    ``raster`` is the one that it lies beside, if any.
+    """
+    driver = _find_driver(path, raster or path)
     _refuse_beside(path)
-    with _open_as(Source(path, driver, ())) as dataset:
+    with _open(path, driver) as dataset:
         check_layout(dataset, str(path), f"write it again: {_rewrite(path)}")
         files = {Path(name) for name in dataset.files}
-    strangers = sorted(str(file) for file in files if file.parent != _make_absolute(path).parent)
+    strangers = sorted(str(file) for file in files if file.parent != path.absolute().parent)
     if strangers:
         raise MapError(f"{path}: refers to {strangers[0]}, which is not in the same directory; {_rewrite(path)}")
-    return (path, *sorted(path.with_name(file.name) for file in files if file.name != path.name))
+    return driver, (path, *sorted(path.with_name(file.name) for file in files if file.name != path.name))
 
 
 def check_layout(dataset: Any, where: str, remedy: str) -> None:
@@ -334,7 +302,7 @@ def _refuse_beside(path: Path) -> None:
     for beside in (path.with_name(name) for name in names if name != path.name):
         if not beside.is_file() or (beside.suffix.lower() == ".aux" and not _read_beginning(beside).startswith(_HFA)):
             continue
-        _list_plain_files(beside, _find_driver(beside, raster=path))
+        _list_plain_files(beside, path)
     statistics = path.with_name(f"{path.name}.aux.xml")
     if statistics.is_file() and statistics.stat().st_size > _MAX_STATISTICS_BYTES:
         size = f"{statistics.stat().st_size / 1e6:.0f} MB"
@@ -351,31 +319,21 @@ def _rewrite(path: Path) -> str:
     )
 
 
-def _open_as(source: Source) -> Any:
+def _open(path: Path, driver: str) -> Any:
     logging.getLogger("rasterio").addHandler(logging.NullHandler())  # GDAL's own lines come with our error
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            return rasterio.open(_make_absolute(source.path), driver=source.driver)
+            return rasterio.open(path.absolute(), driver=driver)  # from the root on: no GDAL prefix, no address
         except RasterioError as error:
             raise MapError(
-                f"{source.path}: not a raster that GDAL can read; the file is damaged: {describe_error(error)}"
+                f"{path}: not a raster that GDAL can read; the file is damaged: {describe_error(error)}"
             ) from error
-
-
-def _make_absolute(path: Path) -> Path:
-    """Return a path that begins at the root: no GDAL prefix, no address."""
-    return path.absolute()
 
 
 def describe_error(error: BaseException) -> str:
     """Return the first line of what GDAL says."""
     return str(error.__cause__ or error).splitlines()[0][:200]
-
-
-def _suggest_polygons(path: Path) -> str:
-    vector = path.suffix.lower() in {".shp", ".gpkg", ".kml", ".geojson", ".json"}
-    return "; terrain may also be polygons, exported as .geojson" if vector else ""
 
 
 def _refuse_unplaced(dataset: Any, path: Path) -> None:
@@ -479,19 +437,13 @@ def _describe_as_vrt(dataset: Any) -> str:
         return str(memory.read().decode("utf-8", "replace"))
 
 
-def burn_polygons(
-    polygons: NDArray[np.object_],
-    ids: NDArray[np.uint8],
-    *,
-    affine: tuple[float, float, float, float, float, float],
-    rows: int,
-    cols: int,
-) -> NDArray[np.uint8]:
+def burn_polygons(polygons: NDArray[np.object_], ids: NDArray[np.uint8], grid: MapGrid) -> NDArray[np.uint8]:
     """Return the id of the last polygon that each pixel's centre lies in, shape (rows, cols); 0 where there is none."""
+    shape = grid.rows, grid.cols
     if not len(polygons):
-        return np.zeros((rows, cols), np.uint8)
+        return np.zeros(shape, np.uint8)
     shapes = zip(polygons.tolist(), ids.tolist(), strict=True)
-    return np.asarray(rasterize(shapes, (rows, cols), transform=rasterio.Affine(*affine), dtype=np.uint8))
+    return np.asarray(rasterize(shapes, shape, transform=rasterio.Affine.from_gdal(*grid.geotransform), dtype=np.uint8))
 
 
 def _read_palette_grey(
@@ -511,11 +463,8 @@ _STRIP_ROWS = 512
 def write_geotiff(
     path: Path,
     strip: Callable[[int, int], NDArray[Any]],
+    grid: MapGrid,
     *,
-    rows: int,
-    cols: int,
-    affine: tuple[float, float, float, float, float, float],
-    crs: str,
     dtype: str,
     bands: int = 1,
     nodata: float | None = None,
@@ -523,56 +472,43 @@ def write_geotiff(
 ) -> None:
     """Write a tiled, deflated GeoTIFF strip by strip, whole or not at all.
 
-    ``strip(first_row, last_row)`` returns (bands, rows, cols); ``affine`` is of pixel corners; four bands are RGB and alpha.
+    ``strip(first_row, last_row)`` returns (bands, rows, cols); four bands are RGB and alpha.
     """
-    profile = {
-        "driver": "GTiff",
-        "height": rows,
-        "width": cols,
-        "count": bands,
-        "dtype": dtype,
-        "crs": crs,
-        "nodata": nodata,
-    }
+    profile = {"driver": "GTiff", "height": grid.rows, "width": grid.cols, "count": bands, "dtype": dtype}
     profile |= {
-        "transform": rasterio.Affine(*affine),
-        "tiled": True,
-        "blockxsize": 256,
-        "blockysize": 256,
+        "crs": grid.crs,
+        "transform": rasterio.Affine.from_gdal(*grid.geotransform),
+        "nodata": nodata,
         "BIGTIFF": "IF_SAFER",
     }
+    profile |= {"tiled": True, "blockxsize": 256, "blockysize": 256}
     profile |= {"compress": "deflate", "zlevel": 1, "predictor": 3 if dtype == "float32" else 2}
     if bands == 4:
         profile |= {"photometric": "RGB", "alpha": "YES"}
     with write_atomic_file(path) as temporary, rasterio.open(temporary, "w", **profile) as dataset:
         if palette is not None:  # before the first pixel: GDAL cannot change what is on disk already
             dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
-        for first in range(0, rows, _STRIP_ROWS):
-            last = min(first + _STRIP_ROWS, rows)
-            dataset.write(strip(first, last), window=Window(0, first, cols, last - first))
+        for first in range(0, grid.rows, _STRIP_ROWS):
+            last = min(first + _STRIP_ROWS, grid.rows)
+            dataset.write(strip(first, last), window=Window(0, first, grid.cols, last - first))
 
 
 def write_cog(
     path: Path,
     strip: Callable[[int, int], NDArray[Any]],
+    grid: MapGrid,
     *,
-    rows: int,
-    cols: int,
-    affine: tuple[float, float, float, float, float, float],
-    crs: str,
     dtype: str,
-    nodata: float | None,
     bands: Sequence[tuple[str, str]],
 ) -> None:
-    """Write a Cloud-Optimised GeoTIFF strip by strip, whole or not at all; overviews hold every second pixel, nothing is averaged.
+    """Write a Cloud-Optimised GeoTIFF as `write_geotiff`; overviews hold every second pixel, nothing is averaged.
 
-    ``strip`` and ``affine`` as in `write_geotiff`; ``bands`` are names and units.
+    ``bands`` are names and units.
     """
     with write_atomic_file(path) as temporary:
         plain = temporary.with_name("plain.tif")
-        write_geotiff(
-            plain, strip, rows=rows, cols=cols, affine=affine, crs=crs, dtype=dtype, bands=len(bands), nodata=nodata
-        )
+        nodata = float("nan") if np.dtype(dtype).kind == "f" else None
+        write_geotiff(plain, strip, grid, dtype=dtype, bands=len(bands), nodata=nodata)
         with rasterio.open(plain, "r+") as dataset:
             dataset.descriptions = [name for name, _ in bands]
             dataset.units = [unit for _, unit in bands]
@@ -583,7 +519,8 @@ def write_cog(
 def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
     """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols). `MapError`: it cannot be read."""
     try:
-        with rasterio.Env(**GDAL_CONFIG), _open_as(_check_source(path)) as dataset:
+        with keep_open() as open_file:
+            dataset = open_file(path, _list_plain_files(path)[0])
             return np.asarray(dataset.read(list(bands)))
     except RasterioError as error:
         raise MapError(f"{path}: cannot be read; the file is damaged ({describe_error(error)})") from error

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,14 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
-from pyproj.exceptions import CRSError
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.geotiff import RasterTiles, Tile, Use, open_raster_tiles, read_tile
+from tcpipe.formats.maps.geotiff import OpenFile, Tile, Use, read_tile, read_window
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.layers import Layer, Pixels
-from tcpipe.terrain.projection import Projection
+from tcpipe.terrain.projection import Projection, parse_crs
 from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
 from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, MapGrid, compute_source_lattice
 
@@ -39,28 +37,19 @@ _SHOWN = 4
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """Tiles that are used as a role together; ``affine``, ``crs`` and ``names`` as of `tcpipe.formats.maps.geotiff.Tile`."""
+    """Tiles that are used as a role together; ``names`` as of `tcpipe.formats.maps.geotiff.Tile`."""
 
-    label: str
-    """What it is called in a message: the path, and how many more there are."""
     role: str
     unit: str
-    crs: str
-    affine: tuple[float, float, float, float, float, float]
-    rows: int
-    cols: int
+    place: Georeference
+    """Where it lies; its name, for messages, is the path, and how many more there are."""
     findings: tuple[Finding, ...]
     """One a code, of the first tile that has it."""
     names: Mapping[int, str]
     tiles: tuple[Tile, ...]
     _corners: NDArray[np.int64] = field(repr=False)
     """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
-    _pool: RasterTiles = field(repr=False)
-
-    @property
-    def band_count(self) -> int:
-        """How many bands each tile has."""
-        return len(self.tiles[0].bands)
+    _open_file: OpenFile = field(repr=False)
 
     def select_band(self, number: int) -> Raster:
         """Return one band, by its number from 0."""
@@ -68,11 +57,11 @@ class Raster:
 
     @property
     def name(self) -> str:
-        """The label without its folder."""
+        """What it is called without its folder."""
         return _label([tile.path for tile in self.tiles], name_path=lambda path: path.name)
 
     def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.RasterTiles.read` does of one tile."""
+        """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.read_window` does of one tile."""
         low = np.maximum(self._corners[:, ::2], (row0, col0))
         high = np.minimum(self._corners[:, 1::2], (row1, col1))
         values = np.zeros((row1 - row0, col1 - col0), self.tiles[0].dtype)
@@ -80,7 +69,7 @@ class Raster:
         for n in np.flatnonzero((low < high).all(axis=1)).tolist():
             (top, left), (bottom, right) = low[n].tolist(), high[n].tolist()
             row, _, col, _ = self._corners[n].tolist()
-            part, there = self._pool.read(self.tiles[n], top - row, bottom - row, left - col, right - col)
+            part, there = read_window(self._open_file, self.tiles[n], top - row, bottom - row, left - col, right - col)
             if part.shape == values.shape and len(self.tiles) == 1:
                 return part, there
             window = slice(top - row0, bottom - row0), slice(left - col0, right - col0)
@@ -89,17 +78,15 @@ class Raster:
         return values, valid
 
 
-@contextmanager
-def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Iterator[Raster]:
-    """Open the tiles of a role, in the order in which they are laid, the last on top; ``use`` as `read_tile`.
+def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile, crs: CRS | None = None) -> Raster:
+    """Return the tiles of a role, in the order in which they are laid, the last on top; ``crs`` is that of tiles that carry none.
 
-    Raises
-    ------
-    MapError : one of them cannot play the role, or they are not of one kind and one grid.
+    `MapError`: one of them cannot play the role, or they are not of one kind and one grid, or have no CRS.
     """
+    label = _label(paths)
     if len(paths) > MAX_FILES:
         raise MapError(
-            f"{_label(paths)}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: gdalwarp part*.tif joined.tif"
+            f"{label}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: gdalwarp part*.tif joined.tif"
         )
     tiles: list[Tile] = []
     problems: list[str] = []
@@ -110,26 +97,24 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
             problems += error.problems
     if problems:
         raise MapError(*_shorten_list(problems))
+    known = {text: parse_crs(text, where=label) for text in dict.fromkeys(tile.crs for tile in tiles) if text}
     _refuse_odd(tiles, "CRS", _find_crs_keys(tiles), "gdalwarp -t_srs EPSG:n in.tif out.tif")
     _refuse_odd(tiles, "type and bands", [tile.kind for tile in tiles], "gdal_translate -ot T -b n in.tif out.tif")
+    found = known.get(tiles[0].crs, crs)
+    if found is None:
+        raise MapError(f"{label}: has no CRS; if you know it, give it with --crs EPSG:n")
     affine, corners = _lay_out_tiles(tiles)
-    with open_raster_tiles() as pool:
-        yield Raster(
-            label=_label(paths),
-            role=role,
-            unit=tiles[0].unit,
-            crs=tiles[0].crs,
-            affine=affine,
-            rows=int(corners[:, 1].max()),
-            cols=int(corners[:, 3].max()),
-            findings=tuple(
-                {finding.code: finding for tile in reversed(tiles) for finding in reversed(tile.findings)}.values()
-            ),
-            names=_join_value_names(tiles),
-            tiles=tuple(tiles),
-            _corners=corners,
-            _pool=pool,
-        )
+    findings = {finding.code: finding for tile in reversed(tiles) for finding in reversed(tile.findings)}
+    return Raster(
+        role=role,
+        unit=tiles[0].unit,
+        place=Georeference(found, affine, int(corners[:, 1].max()), int(corners[:, 3].max()), label),
+        findings=tuple(findings.values()),
+        names=_join_value_names(tiles),
+        tiles=tuple(tiles),
+        _corners=corners,
+        _open_file=open_file,
+    )
 
 
 def _label(paths: Sequence[Path], name_path: Callable[[Path], str] = str) -> str:
@@ -142,24 +127,11 @@ def _shorten_list(lines: list[str]) -> list[str]:
 
 def _find_crs_keys(tiles: Sequence[Tile]) -> list[str]:
     """Return by tile the first WKT that says the same as its own."""
-    first: dict[str, str] = {}
-    for text in dict.fromkeys(tile.crs for tile in tiles):
-        first[text] = next((known for known in first.values() if _is_same_crs(known, text)), text)
+    first: dict[str, str] = {"": ""}
+    for text in dict.fromkeys(tile.crs for tile in tiles if tile.crs):
+        same = (known for known in first if known and CRS(known).equals(CRS(text), ignore_axis_order=True))
+        first[text] = next(same, text)
     return [first[tile.crs] for tile in tiles]
-
-
-def _is_same_crs(one: str, other: str) -> bool:
-    try:
-        return bool(one and other) and CRS(one).equals(CRS(other), ignore_axis_order=True)
-    except CRSError:
-        return False
-
-
-def _is_geographic(text: str) -> bool:
-    try:
-        return bool(text) and bool(CRS(text).is_geographic)
-    except CRSError:
-        return False
 
 
 def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: str) -> None:
@@ -168,19 +140,11 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
     odd = [(tile, key) for tile, key in zip(tiles, keys, strict=True) if key != usual]
     if odd:
         names = ", ".join(_shorten_list([str(tile.path) for tile, _ in odd]))
-        got, wanted = (_shorten_crs(key) for key in (odd[0][1], usual))
+        got, wanted = (CRS(key).name if "[" in key else key or "none" for key in (odd[0][1], usual))
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, expected {wanted}): {names}; "
             f"write them like the rest: {mended}"
         )
-
-
-def _shorten_crs(key: str) -> str:
-    """Return a CRS by its name, anything else as it is."""
-    try:
-        return CRS(key).name if "[" in key else key or "none"
-    except CRSError:
-        return key[:40]
 
 
 def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.int64]]:
@@ -212,7 +176,7 @@ def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[NDArray[np.f
     affines = np.array([tile.affine for tile in tiles], np.float64).reshape(-1, 2, 3)
     sizes = np.array([(tile.cols, tile.rows) for tile in tiles])
     starts = affines[:, :, 2] - affines[base, :, 2]
-    if _is_geographic(tiles[base].crs):  # tiles across the antimeridian count on beyond 180°
+    if tiles[base].crs and CRS(tiles[base].crs).is_geographic:  # tiles across the antimeridian count on beyond 180°
         starts[:, 0] -= 360.0 * np.round(starts[:, 0] / 360.0)
     ends = starts + np.einsum("nij,nj->ni", affines[:, :, :2], sizes)
     first, last = (np.linalg.solve(affines[base, :, :2], xy.T).T for xy in (starts, ends))
@@ -282,11 +246,11 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class RasterLayer:
-    """A raster as a layer; ``projection`` is from its CRS to the map's, None where they are the same."""
+    """A raster, or one band of it, as a layer; ``projection`` is from its CRS to the grid's, None where they are the same."""
 
     layer: Layer
     raster: Raster
-    footing: Georeference
+    grid: MapGrid
     projection: Projection | None
     scheme: ClassScheme | None
     """Of a categorical layer."""
@@ -295,20 +259,21 @@ class RasterLayer:
     @property
     def label(self) -> str:
         """The raster's files, for messages."""
-        return self.raster.label
+        return self.raster.place.name
 
     @property
     def name(self) -> str:
         """The same without their folder."""
         return self.raster.name
 
-    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> Pixels:
-        """Resample a part of the map, block by block, so that the raster's window stays small."""
+    def shard(self, row0: int, col0: int, rows: int, cols: int) -> Pixels:
+        """Resample a part of the grid, block by block, so that the raster's window stays small."""
         shard: Pixels = np.empty((rows, cols), np.uint8 if self.layer.kind == "categorical" else np.float64)
-        block = self._block_px(grid, row0, col0)
+        ratio = _compute_source_px_per_px(self._compute_lattice(row0, col0, 1, 1))
+        block = _BLOCK_PX if not ratio > 2.0 else max(int(2 * _BLOCK_PX / ratio), LATTICE_STEP_PX)
         for i in range(0, rows, block):
             for j in range(0, cols, block):
-                self._fill(shard[i : i + block, j : j + block], grid, row0 + i, col0 + j)
+                self._fill(shard[i : i + block, j : j + block], row0 + i, col0 + j)
         if self.layer.stack == "greys":
             return np.where(np.isfinite(shard), np.clip(np.rint(shard), 1.0, 255.0), 0.0).astype(np.uint8)
         return shard
@@ -319,7 +284,10 @@ class RasterLayer:
             return None
         option = "--classes" if self.layer.name == "terrain" else f"--categorical {self.layer.name}=FILE"
         named = ", ".join(str(value) for value in list(self.scheme.id_by_value)[:_LISTED])
-        return f"{self.label}: none of its values {self._unnamed()} is in the class table (which names {named}); give one with {option}"
+        unnamed, names = sorted(self.tally.unnamed), self.raster.names
+        values = ", ".join(f"{v} ({names[v]})" if v in names else str(v) for v in unnamed[:_LISTED])
+        values += " …" if len(unnamed) > _LISTED else ""
+        return f"{self.label}: none of its values {values} is in the class table (which names {named}); give one with {option}"
 
     def list_findings(self) -> tuple[Finding, ...]:
         """Return the raster's findings, a datum shift that is known only roughly, and values that are no class."""
@@ -337,25 +305,20 @@ class RasterLayer:
         )
         return (*self.raster.findings, *rough, finding)
 
-    def _unnamed(self) -> str:
-        names = self.raster.names
-        first = [f"{v} ({names[v]})" if v in names else str(v) for v in sorted(self.tally.unnamed)[:_LISTED]]
-        return ", ".join(first) + (" …" if len(self.tally.unnamed) > _LISTED else "")
+    def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
+        return compute_source_lattice(self.grid, self.raster.place, self.projection, row0, rows, col0, cols)
 
-    def _block_px(self, grid: MapGrid, row0: int, col0: int) -> int:
-        """Return the side of the blocks a shard is made in, small where the raster is so much finer that its window would not fit."""
-        ratio = _compute_source_px_per_px(compute_source_lattice(grid, self.footing, self.projection, row0, 1, col0, 1))
-        return _BLOCK_PX if not ratio > 2.0 else max(int(2 * _BLOCK_PX / ratio), LATTICE_STEP_PX)
-
-    def _fill(self, part: Pixels, grid: MapGrid, row0: int, col0: int) -> None:
-        """Resample one block of the map from the raster."""
-        lattice = compute_source_lattice(grid, self.footing, self.projection, row0, part.shape[0], col0, part.shape[1])
+    def _fill(self, part: Pixels, row0: int, col0: int) -> None:
+        """Resample one block of the grid from the raster."""
+        lattice = self._compute_lattice(row0, col0, *part.shape)
         part[...] = 0 if self.layer.kind == "categorical" else np.nan
         flat = lattice.reshape(-1, 2)
         if not np.isfinite(flat).all():
             return
         low = np.maximum(np.floor(flat.min(axis=0)).astype(np.int64) - 1, 0)
-        high = np.minimum(np.ceil(flat.max(axis=0)).astype(np.int64) + 2, (self.footing.cols, self.footing.rows))
+        high = np.minimum(
+            np.ceil(flat.max(axis=0)).astype(np.int64) + 2, (self.raster.place.cols, self.raster.place.rows)
+        )
         if (low >= high).any():
             return
         values, valid = self.raster.read(int(low[1]), int(high[1]), int(low[0]), int(high[0]))

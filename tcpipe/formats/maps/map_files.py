@@ -21,10 +21,13 @@ so does GDAL from 3.13 on, the first that reads shards.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -45,6 +48,7 @@ from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
 from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, find_no_data_value
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
+from tcpipe.terrain.tiles import BandReader, MapReader
 
 TILE_PX = 512
 """Side of a tile: the unit that is decoded."""
@@ -78,54 +82,21 @@ class _Attributes:
     facts: MapFacts
 
 
-@dataclass(frozen=True, slots=True)
-class BandFile:
-    """A layer of several bands; satisfies `tcpipe.terrain.tiles.BandReader`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapFile(MapReader):
+    """An open map; `read` and `read_tile` raise `MapError` where a tile is damaged."""
 
-    name: str
-    """Of the map."""
-    layer: Layer
-    grid: MapGrid
-    tile_px: int
-    _array: ShardedArray
-
-    def read(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
-        """Return a window of all bands, shape (bands, rows, columns), NaN without data; `MapError`: a tile is damaged."""
-        try:
-            bands = range(self._array.shape[0])
-            return np.stack([self._array.window(row0, row1, col0, col1, lead=(band,)) for band in bands])
-        except StoreError as error:
-            raise MapError(f"map {self.name}: {self.layer.name} cannot be read ({error}); add the map again") from error
-
-
-@dataclass(frozen=True, slots=True)
-class MapFile:
-    """An open map; satisfies `tcpipe.terrain.tiles.MapReader`."""
-
-    name: str
-    grid: MapGrid
-    classes: ClassTable
-    layers: Mapping[str, Layer]
-    tile_px: int
-    height_reference_m: float
     facts: MapFacts
     id_by_value: Mapping[int, int]
     """Which values of its terrain raster stood for which class ids."""
     factors: tuple[int, ...]
     _levels: Mapping[int, Mapping[str, ShardedArray]]
     """The arrays of each factor."""
-    banded: Mapping[str, BandFile]
-    """Layers of several bands, at their own resolution; the same at every factor."""
     _factor: int = 1
 
     def at(self, factor: int) -> MapFile:
         """Return the map at one of its ``factors``, which are the full map's."""
         return replace(self, grid=make_overview_grid(self.grid, factor), factors=(1,), _factor=factor)
-
-    def select(self, layers: Collection[str]) -> MapFile:
-        """Return the map with these of its layers alone."""
-        kept = {name: layer for name, layer in self.layers.items() if name in layers}
-        return replace(self, layers=kept, banded={name: bands for name, bands in self.banded.items() if name in layers})
 
     @property
     def all_layers(self) -> dict[str, Layer]:
@@ -151,8 +122,8 @@ class MapFile:
         )
 
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
-        """Return a window of a layer as stored: NaN or, of bytes, 0 where there is no data. `MapError`: a tile of the window is damaged."""
-        with self._told(layer, row0, row1, col0, col1):
+        """Return a window of a layer as stored."""
+        with _name_damage(f"map {self.name}: {layer}, rows {row0} to {row1}, columns {col0} to {col1}"):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
 
     def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
@@ -161,32 +132,38 @@ class MapFile:
             array.expect(tiles)
 
     def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
-        """Decode the tile in row i and column j into ``out``, contiguous, `tile_px` each way; `MapError` as `read`."""
+        """Decode the tile in row i and column j into ``out``."""
         grid, side = self.grid, self.tile_px
-        with self._told(layer, i * side, (i + 1) * side, j * side, (j + 1) * side):
+        where = f"rows {i * side} to {(i + 1) * side}, columns {j * side} to {(j + 1) * side}"
+        with _name_damage(f"map {self.name}: {layer}, {where}"):
             array = self._levels[self._factor][layer]
             array.chunk((i, j), out=out)
         out[max(grid.rows - i * side, 0) :] = array.fill  # what a file holds beyond its array is nobody's promise
         out[:, max(grid.cols - j * side, 0) :] = array.fill
 
-    @contextmanager
-    def _told(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> Iterator[None]:
-        """Say which part of the map it was that could not be read."""
-        try:
-            yield
-        except StoreError as error:
-            raise MapError(
-                f"map {self.name}: {layer}, rows {row0} to {row1}, columns {col0} to {col1} cannot be read ({error}); add the map again"
-            ) from error
+
+@contextmanager
+def _name_damage(what: str) -> Iterator[None]:
+    """Say which part of a map it was that could not be read."""
+    try:
+        yield
+    except StoreError as error:
+        raise MapError(f"{what} cannot be read ({error}); add the map again") from error
+
+
+def _read_bands(  # noqa: PLR0917
+    what: str, array: ShardedArray, row0: int, row1: int, col0: int, col1: int
+) -> NDArray[Any]:
+    """Return a window of all bands, shape (bands, rows, columns); `MapError`: a tile is damaged."""
+    with _name_damage(what):
+        return np.stack([array.window(row0, row1, col0, col1, lead=(band,)) for band in range(array.shape[0])])
 
 
 def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool = True) -> MapFile:
     """Open a map for reading; its shards lie beside their descriptions, or are ``fetched``.
 
-    Raises
-    ------
-    MapError : there is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were
-        written or a file is gone: lost tiles would read as ground without data.
+    `MapError`: there is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were
+    written or a file is gone: lost tiles would read as ground without data.
     """
     if not (path / DESCRIPTION).is_file():
         raise MapError(f"{path}: not a map, it has no {DESCRIPTION}; add one with: tcpipe add-map")
@@ -204,24 +181,20 @@ def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool =
         every = read_layers(described, kept.class_table, path)
         layers = {name: every[name] for name in kept.layers}
         _refuse_sizes(kept, path)
-    except StoreError as error:
-        raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
-    wanted = [f"{_level_path(factor)}{layer}" for factor in kept.factors for layer in kept.layers]
-    wanted += [f"{BANDS}/{name}/{name}" for name in kept.band_grids]
-    missing = [array for array in wanted if not (path / array / DESCRIPTION).is_file()]
-    if missing:
-        raise MapError(f"{path}: the map's {', '.join(missing)} is missing; add the map again")
-    if proved:
-        _prove(path, fetched)
-    try:
+        if proved:
+            _prove(path, fetched)
         levels = {
-            factor: {name: _open_array(path, layer, kept.grid, factor, fetched) for name, layer in layers.items()}
+            factor: {
+                name: _open_array(path / _level_path(factor), layer, kept.grid, factor, fetched)
+                for name, layer in layers.items()
+            }
             for factor in kept.factors
         }
-        banded = {
-            name: BandFile(kept.name, every[name], grid, TILE_PX, _open_bands(path, every[name], grid, fetched))
-            for name, grid in kept.band_grids.items()
-        }
+        banded = {}
+        for name, grid in kept.band_grids.items():
+            array = _open_array(path / BANDS / name, every[name], grid, 1, fetched)
+            read = partial(_read_bands, f"map {kept.name}: {name}", array)
+            banded[name] = BandReader(every[name], grid, TILE_PX, read)
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
     classes = ClassTable(kept.class_table)
@@ -242,45 +215,35 @@ def _refuse_sizes(kept: _Attributes, path: Path) -> None:
 
 
 def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: FetchedShards | None) -> ShardedArray:
-    grid, shard_px = make_overview_grid(whole, factor), _compute_shard_px(factor)
+    shape, chunk_shape, shard_shape = _shape_array(layer, whole, factor)
+    fill = find_no_data_value(layer.mapped)
     return open_sharded(
-        path / f"{_level_path(factor)}{layer.name}",
-        shape=(grid.rows, grid.cols),
-        chunk_shape=(TILE_PX, TILE_PX),
-        shard_shape=(shard_px, shard_px),
-        dtype=np.dtype(layer.mapped),
-        fill=find_no_data_value(layer.mapped),
-        sparse=True,
-        fetched=fetched,
-    )
-
-
-def _open_bands(path: Path, layer: Layer, grid: MapGrid, fetched: FetchedShards | None) -> ShardedArray:
-    return open_sharded(
-        path / BANDS / layer.name / layer.name,
-        shape=(len(layer.bands), grid.rows, grid.cols),
-        chunk_shape=(1, TILE_PX, TILE_PX),
-        shard_shape=(1, SHARD_PX, SHARD_PX),
+        path / layer.name,
+        shape=shape,
+        chunk_shape=chunk_shape,
+        shard_shape=shard_shape,
         dtype=layer.mapped,
-        fill=float("nan"),
+        fill=fill,
         sparse=True,
         fetched=fetched,
     )
 
 
-def _compute_shard_px(factor: int) -> int:
-    """Return the side of a shard at a level."""
-    return max(SHARD_PX // factor, TILE_PX)
+Shape = tuple[int, ...]
+
+
+def _shape_array(layer: Layer, whole: MapGrid, factor: int) -> tuple[Shape, Shape, Shape]:
+    """Return the shapes of a layer's array at a level, of its tiles and of its shards."""
+    grid, shard_px = make_overview_grid(whole, factor), max(SHARD_PX // factor, TILE_PX)
+    bands, one = ((len(layer.bands),), (1,)) if layer.bands else ((), ())
+    return (*bands, grid.rows, grid.cols), (*one, TILE_PX, TILE_PX), (*one, shard_px, shard_px)
 
 
 def _prove(path: Path, fetched: FetchedShards | None) -> None:
     """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
-    try:
-        listed = read_checksums(path)
-        prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
-    except StoreError as error:
-        raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
-    size_of = fetched.size if fetched else _measure_size_on_disk
+    listed = read_checksums(path)
+    prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
+    size_of = fetched.size if fetched else os.path.getsize
     lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry.size_bytes, size_of)]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
@@ -294,10 +257,6 @@ def _has_size(path: Path, size_bytes: int, size_of: Callable[[Path], int]) -> bo
         return False
 
 
-def _measure_size_on_disk(path: Path) -> int:
-    return path.stat().st_size
-
-
 def _level_path(factor: int) -> str:
     return "" if factor == 1 else f"overviews/{factor}/"
 
@@ -305,65 +264,43 @@ def _level_path(factor: int) -> str:
 class MapWriter:
     """Writes a map and its overviews shard by shard into a directory; `finish` makes it complete."""
 
-    __slots__ = (
-        "_banded",
-        "_factors",
-        "_grid",
-        "_group",
-        "_layers",
-        "_levels",
-        "_name",
-        "_scheme",
-        "height_reference_m",
-    )
-
     def __init__(
-        self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: Mapping[str, Layer]
+        self,
+        directory: Path,
+        *,
+        name: str,
+        grid: MapGrid,
+        scheme: ClassScheme,
+        layers: Mapping[str, Layer],
+        band_grids: Mapping[str, MapGrid] = MappingProxyType({}),
     ) -> None:
         self._name, self._grid, self._scheme, self._layers = name, grid, scheme, layers
-        self._factors = list_factors(grid)
+        self._band_grids, self._factors = band_grids, list_factors(grid)
         self._group = create_group(directory)
-        self._levels = {factor: self._add_level(factor) for factor in self._factors}
-        self._banded: dict[str, tuple[Any, MapGrid]] = {}
+        plain = [layer for name, layer in layers.items() if name not in band_grids]
+        self._levels: dict[int, dict[str, Any]] = {}
+        for factor in self._factors:
+            group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
+            self._levels[factor] = {layer.name: _add_layer(group, layer, grid, factor) for layer in plain}
+        for layer_name, own in band_grids.items():
+            group = self._group.create_group(f"{BANDS}/{layer_name}")
+            _place(group, own, f"{name}, {layer_name}")
+            self._levels[1][layer_name] = _add_layer(group, layers[layer_name], own, 1)
         self.height_reference_m: float | None = None
         """What stored heights are above [m]: the floor of the smallest of the first shard that has any."""
 
-    def _add_level(self, factor: int) -> dict[str, Any]:
-        group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
-        grid = make_overview_grid(self._grid, factor)
-        return {name: _add_layer(group, layer, grid, _compute_shard_px(factor)) for name, layer in self._layers.items()}
-
-    def write(self, layer: str, row0: int, col0: int, values: Pixels) -> None:
-        """Write a shard whose corner is at a multiple of `SHARD_PX`; floats with NaN, bytes with 0, as no data."""
+    def write(self, layer: str, row0: int, col0: int, values: Pixels, band: int = 0) -> None:
+        """Write a shard of a layer or band; its corner is at a multiple of `SHARD_PX`, no data are NaN in floats and 0 in bytes."""
         if self._layers[layer].kind == "relative":
             if self.height_reference_m is None and np.isfinite(values).any():
                 self.height_reference_m = float(np.floor(np.nanmin(values)))
             values = values - (self.height_reference_m or 0.0)
+        if layer in self._band_grids:
+            _put(self._levels[1][layer], row0, col0, values, band)
+            return
         _put(self._levels[1][layer], row0, col0, values)
         for factor, level in iterate_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
-
-    def add_bands(self, layer: Layer, grid: MapGrid) -> None:
-        """Add a layer of several bands on a grid of its own, whose bands `write_band` writes."""
-        group = self._group.create_group(f"{BANDS}/{layer.name}")
-        _place(group, grid, f"{self._name}, {layer.name}")
-        array = add_array(
-            group,
-            layer.name,
-            shape=(len(layer.bands), grid.rows, grid.cols),
-            dtype=layer.mapped,
-            chunks=(1, TILE_PX, TILE_PX),
-            shards=(1, SHARD_PX, SHARD_PX),
-            dimensions=("band", "y", "x"),
-            fill_value=float("nan"),
-            attributes={"long_name": layer.long_name, "units": layer.unit, "grid_mapping": "spatial_ref"},
-        )
-        self._banded[layer.name] = array, grid
-
-    def write_band(self, layer: str, band: int, row0: int, col0: int, values: Pixels) -> None:
-        """Write a shard of one band, as `write`."""
-        array, (rows, cols) = self._banded[layer][0], values.shape
-        array[band, row0 : row0 + rows, col0 : col0 + cols] = values.astype(array.dtype)
 
     def finish(self, facts: MapFacts, layers: Mapping[str, Layer]) -> None:
         """Write coordinates and attributes; ``layers`` are all those of before, with the range that was found."""
@@ -371,20 +308,17 @@ class MapWriter:
         for factor, arrays in self._levels.items():
             arrays["height"].attrs.update({"add_offset": reference_m})
             group = self._group if factor == 1 else self._group[_level_path(factor).rstrip("/")]
-            _place(
-                group,
-                make_overview_grid(self._grid, factor),
-                f"{self._name}, {factor} x coarser" if factor > 1 else self._name,
-            )
+            title = f"{self._name}, {factor} x coarser" if factor > 1 else self._name
+            _place(group, make_overview_grid(self._grid, factor), title)
         kept = _Attributes(
-            version=MAP_VERSION if self._banded else PAPER_VERSION if set(layers) <= set(LAYERS) else OWN_VERSION,
+            version=MAP_VERSION if self._band_grids else PAPER_VERSION if set(layers) <= set(LAYERS) else OWN_VERSION,
             name=self._name,
             grid=self._grid,
             class_table=self._scheme.table.classes,
             id_by_value=self._scheme.id_by_value,
-            layers=tuple(name for name in layers if name not in self._banded),
+            layers=tuple(name for name in layers if name not in self._band_grids),
             described=_describe_layers(layers),
-            band_grids={name: grid for name, (_, grid) in self._banded.items()},
+            band_grids=self._band_grids,
             factors=self._factors,
             tile_px=TILE_PX,
             height_reference_m=reference_m,
@@ -394,9 +328,10 @@ class MapWriter:
         consolidate_metadata(self._group)
 
 
-def _put(array: Any, row0: int, col0: int, values: Pixels) -> None:
+def _put(array: Any, row0: int, col0: int, values: Pixels, *band: int) -> None:
     if values.size:
-        array[row0 : row0 + values.shape[0], col0 : col0 + values.shape[1]] = values.astype(array.dtype)
+        rows, cols = values.shape
+        array[*band, row0 : row0 + rows, col0 : col0 + cols] = values.astype(array.dtype)
 
 
 def _place(group: Any, grid: MapGrid, title: str) -> None:
@@ -437,21 +372,24 @@ def _describe_layers(layers: Mapping[str, Layer]) -> dict[str, Description]:
     return {name: describe_layer(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
 
 
-def _add_layer(group: Any, layer: Layer, grid: MapGrid, shard_px: int) -> Any:
+def _add_layer(group: Any, layer: Layer, whole: MapGrid, factor: int) -> Any:
+    """Add the array of a layer at a level."""
     attributes: dict[str, Any] = {"long_name": _LONG_NAMES.get(layer.name, layer.long_name)}
     if layer.kind == "categorical":
         attributes |= {**make_cf_flags(layer.classes), "_FillValue": 0}
     else:
-        attributes |= {"units": layer.unit, "scale_factor": layer.step if layer.stack == "greys" else 1.0}
+        attributes |= {"units": layer.unit}
+        attributes |= {} if layer.bands else {"scale_factor": layer.step if layer.stack == "greys" else 1.0}
         attributes |= {"_FillValue": 0} if layer.stack == "greys" else {}
+    shape, chunks, shards = _shape_array(layer, whole, factor)
     return add_array(
         group,
         layer.name,
-        shape=(grid.rows, grid.cols),
+        shape=shape,
         dtype=layer.mapped,
-        chunks=(TILE_PX, TILE_PX),
-        shards=(shard_px, shard_px),
-        dimensions=("y", "x"),
+        chunks=chunks,
+        shards=shards,
+        dimensions=("band", "y", "x")[-len(shape) :],
         fill_value=find_no_data_value(layer.mapped),
         attributes={**attributes, "grid_mapping": "spatial_ref"},
     )

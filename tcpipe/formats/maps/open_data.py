@@ -78,12 +78,7 @@ class Item:
 
 
 def find_catalogue(stac: str) -> Catalogue:
-    """Return a catalogue by its name, its URL or its TOML file.
-
-    Raises
-    ------
-    UsageError, RecipeError : nothing is known of it, or the file is wrong.
-    """
+    """Return a catalogue by its name, its URL or its TOML file; `UsageError`: it is not known, or the file is wrong."""
     if stac.endswith(".toml"):
         try:
             with Path(stac).open(encoding="utf-8") as file:
@@ -118,12 +113,7 @@ def make_area(tracks: Sequence[NDArray[np.float64]], margin_m: float) -> Geometr
 
 
 def find_items(client: HttpsClient, catalogue: Catalogue, collection: str, area: Geometry) -> list[Item]:
-    """Return the items of a collection with a GeoTIFF that touch an area.
-
-    Raises
-    ------
-    MapError : the catalogue cannot be asked, replies something else, or has none.
-    """
+    """Return the items of a collection with a GeoTIFF that touch an area; `MapError`: there are none, or no catalogue replies."""
     query = urlencode({"bbox": ",".join(f"{bound:.7f}" for bound in area.bounds), "limit": _PAGE_ITEMS})
     url = f"{catalogue.stac.rstrip('/')}/collections/{collection}/items?{query}"
     found: dict[str, Item] = {}

@@ -151,11 +151,8 @@ class RemoteWindow:
 def open_window(client: HttpsClient, url: str, area: Geometry, *, crs: str | None) -> Iterator[RemoteWindow | None]:
     """Yield what an area [deg] takes of a raster, of which only the head is read; None where they do not meet.
 
-    ``crs`` is what the catalogue says.
-
-    Raises
-    ------
-    MapError : the raster cannot be read by ranges, is none, is damaged, is elsewhere than the catalogue says, or the window is too large.
+    ``crs`` is what the catalogue says. `MapError`: the raster cannot be read by ranges, is none, is damaged, is elsewhere than the
+    catalogue says, or the window is too large.
     """
 
     def open_handle(path: str, mode: str = "rb") -> _Handle:  # noqa: ARG001  rasterio names it
@@ -188,8 +185,7 @@ def _find_window(dataset: Any, url: str, area: Geometry, stated_crs: str | None)
         )
     if not np.isfinite(xy).all():
         return None  # far outside the area of its CRS
-    inverse = ~dataset.transform
-    pixels = affine_transform(placed, (inverse.a, inverse.b, inverse.d, inverse.e, inverse.c, inverse.f))
+    pixels = affine_transform(placed, (~dataset.transform).to_shapely())
     on_raster = shapely.intersection(pixels, shapely.box(0, 0, dataset.width, dataset.height))
     if not on_raster.area:
         return None
@@ -221,23 +217,13 @@ def _iterate_blocks(dataset: Any, window: Window, url: str) -> Iterator[tuple[in
             yield int(found[0]), int(found[1])
 
 
-def _move(affine: rasterio.Affine, window: Window) -> rasterio.Affine:
-    """Return an affine for the pixels of a window."""
-    col, row = window.col_off, window.row_off
-    return rasterio.Affine(
-        affine.a,
-        affine.b,
-        affine.a * col + affine.b * row + affine.c,
-        affine.d,
-        affine.e,
-        affine.d * col + affine.e * row + affine.f,
-    )
-
-
 def _copy_pixels(dataset: Any, window: Window, path: Path) -> None:
     """Write a window as a GeoTIFF of the same pixels, with what the raster says of them, some rows at a time."""
+    move, col, row = dataset.transform, window.col_off, window.row_off
+    corner = move.a * col + move.b * row + move.c, move.d * col + move.e * row + move.f
+    affine = rasterio.Affine(move.a, move.b, corner[0], move.d, move.e, corner[1])
     profile = {"width": window.width, "height": window.height, "count": dataset.count, "dtype": dataset.dtypes[0]}
-    profile |= {"crs": dataset.crs, "transform": _move(dataset.transform, window), "nodata": dataset.nodata}
+    profile |= {"crs": dataset.crs, "transform": affine, "nodata": dataset.nodata}
     profile |= {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate", "BIGTIFF": "IF_SAFER"}
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "w", driver="GTiff", **profile) as out:
         out.colorinterp = dataset.colorinterp

@@ -8,7 +8,7 @@ centre lies in; ground outside all polygons has no data.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_problems, shorten_value
 from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
+from tcpipe.splits.regions import project_near
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import ClassScheme, name_key
 from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
@@ -33,8 +34,8 @@ PROPERTY = "class"
 SUFFIXES = (".geojson", ".json")
 """A terrain file that ends so is polygons."""
 
-_EDGE_STEP_DEG = 0.001
-"""Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
+_MARGIN_DEG = 0.001
+"""Polygons are cut no nearer than this to a map."""
 
 _TERRAIN = Subject("layer", "terrain")
 
@@ -55,25 +56,25 @@ class PolygonLayer:
     layer: Layer
     label: str
     name: str
+    grid: MapGrid
     polygons: NDArray[np.object_]
     ids: NDArray[np.uint8]
     findings: tuple[Finding, ...]
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
 
-    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> Pixels:
+    def shard(self, row0: int, col0: int, rows: int, cols: int) -> Pixels:
         """Return class ids of a part of the map, shape (rows, cols); 0 where no polygon is."""
-        left, top = grid.x_min_m + col0 * grid.pixel_size_m, grid.y_max_m - row0 * grid.pixel_size_m
-        box = shapely.box(left, top - rows * grid.pixel_size_m, left + cols * grid.pixel_size_m, top)
+        side_m = self.grid.pixel_size_m
+        left, top = self.grid.x_min_m + col0 * side_m, self.grid.y_max_m - row0 * side_m
+        part = replace(self.grid, x_min_m=left, y_max_m=top, rows=rows, cols=cols)
+        box = shapely.box(*part.bounds_m)
         drawn = np.sort(self._tree.query(box))
-        affine = (grid.pixel_size_m, 0.0, left, 0.0, -grid.pixel_size_m, top)
         polygons = self.polygons[drawn].copy()
         detailed = shapely.get_num_coordinates(polygons) > _DETAILED
-        polygons[detailed] = shapely.intersection(
-            polygons[detailed], shapely.buffer(box, grid.pixel_size_m, join_style="mitre")
-        )
+        polygons[detailed] = shapely.intersection(polygons[detailed], shapely.buffer(box, side_m, join_style="mitre"))
         kept = ~shapely.is_empty(polygons)
-        return burn_polygons(polygons[kept], self.ids[drawn][kept], affine=affine, rows=rows, cols=cols)
+        return burn_polygons(polygons[kept], self.ids[drawn][kept], part)
 
     def list_findings(self) -> tuple[Finding, ...]:
         """Return what was observed when they were placed."""
@@ -89,15 +90,11 @@ def is_drawn(paths: Sequence[Path]) -> bool:
     return bool(drawn)
 
 
-def place_polygons(
-    paths: Sequence[Path], scheme: ClassScheme, crs: CRS, bounds_m: tuple[float, float, float, float]
-) -> PolygonLayer:
-    """Read terrain polygons and project them to a CRS; ``bounds_m`` are x min, y min, x max, y max of the map; later features lie on top.
+def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: MapGrid) -> PolygonLayer:
+    """Read terrain polygons and project them to the CRS of a map's grid; later features lie on top.
 
-    Raises
-    ------
-    MapError : not GeoJSON, another CRS, invalid geometry, a class that the table does not have, or nothing on the map: all problems at
-        once.
+    `MapError`: not GeoJSON, another CRS, invalid geometry, a class that the table does not have, or nothing on the map: all problems at
+    once.
     """
     features, problems = _read_all(paths)
     label = f"{paths[0]}" if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
@@ -109,13 +106,13 @@ def place_polygons(
         raise MapError(*shorten_problems(problems))
     flat = [polygon for feature in features for polygon in feature.polygons]
     id_of_each = np.repeat(np.array(ids, np.uint8), [len(feature.polygons) for feature in features])
-    projection = Projection(CRS.from_epsg(4326), crs, compute_area(crs, bounds_m))
-    polygons = _project_polygons(label, np.array(flat, dtype=object), projection, bounds_m)
+    projection = Projection(CRS.from_epsg(4326), crs, compute_area(crs, grid.bounds_m))
+    polygons = _project_polygons(label, np.array(flat, dtype=object), projection, grid.bounds_m)
     on_map = ~shapely.is_empty(polygons)
     polygons, id_of_each = polygons[on_map], id_of_each[on_map]
     findings = (*projection.find_rough_shift(_TERRAIN), *_find_overlaps(polygons, id_of_each, scheme))
     terrain = make_paper_layers(["terrain"], scheme.table)["terrain"]
-    return PolygonLayer(terrain, label, name, polygons, id_of_each, findings, shapely.STRtree(polygons))
+    return PolygonLayer(terrain, label, name, grid, polygons, id_of_each, findings, shapely.STRtree(polygons))
 
 
 def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
@@ -165,10 +162,9 @@ def _project_polygons(
 ) -> NDArray[np.object_]:
     """Return the polygons in the map's CRS, empty where they are not on the map; `MapError` if none is."""
     west, south, east, north = projection.area_deg
-    margin_deg = max(east - west, north - south, _EDGE_STEP_DEG)
-    near = shapely.box(west - margin_deg, south - margin_deg, east + margin_deg, north + margin_deg)
-    cut = shapely.segmentize(shapely.intersection(polygons, near), _EDGE_STEP_DEG)
-    placed = shapely.transform(cut, projection.forward)
+    margin_deg = max(east - west, north - south, _MARGIN_DEG)
+    window_deg = (west - margin_deg, south - margin_deg, east + margin_deg, north + margin_deg)
+    placed = project_near(polygons, projection.forward, window_deg)
     on_map = shapely.intersects(placed, shapely.box(*bounds_m))
     if on_map.any():
         return np.asarray(np.where(on_map, placed, shapely.Polygon()))

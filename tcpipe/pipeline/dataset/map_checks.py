@@ -163,7 +163,7 @@ def _register(run: RunDirectory, source: MapFile, projection: Projection, config
     map_error_m = read_threshold("map-heights-differ", "map_error_m")
     expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[certain] ** 2)), map_error_m)) if certain.any() else map_error_m
     xy_m, height_m = projection.forward(lonlat), height_m[certain]
-    is_on = source.grid.contains(np.where(np.isfinite(xy_m), xy_m, np.inf))
+    is_on = source.grid.contains(xy_m)
     track_std_m = float(np.median(std_m[certain][is_on])) if is_on.any() else float("nan")
     found = register_track(source, xy_m, height_m)
     (thin,) = thin_tracks([(xy_m[is_on], height_m[is_on])])

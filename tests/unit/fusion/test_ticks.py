@@ -195,20 +195,13 @@ S = 1_000_000_000
 
 
 def wheels(stamp):
-    stamp = np.asarray(stamp, np.int64)
     three = np.zeros((stamp.size, 3))
     return BodyVelocities(stamp, three, three + 1, three[:, 0], three[:, 0] + 1)
 
 
 def imu(stamp):
-    stamp = np.asarray(stamp, np.int64)
     three = np.zeros((stamp.size, 3))
     return InertialMeasurements(stamp, three, three, np.zeros((stamp.size, 4)), 0.003, 0.1)
-
-
-def gnss(stamp):
-    stamp = np.asarray(stamp, np.int64)
-    return Positions(stamp, np.zeros((stamp.size, 3)), np.ones((stamp.size, 3)))
 
 
 def grid(a, b, step):
@@ -218,7 +211,7 @@ def grid(a, b, step):
 def test_epochs_and_long_pauses_cut():
     first = Measurements(wheels=wheels(np.concatenate((grid(0, 10 * S, S // 10), grid(100 * S, 110 * S, S // 10)))))
     # The clock was set back: stamps of the second epoch overlap those of the first.
-    second = Measurements(wheels=wheels(grid(5 * S, 9 * S, S // 10)), gnss=gnss([6 * S]))
+    second = Measurements(wheels=wheels(grid(5 * S, 9 * S, S // 10)), gnss=fixes(np.array([6 * S])))
     found = cut_sections({1: second, 0: first})
     assert [(s.clock_epoch, s.start_ns // S, -(-s.end_ns // S)) for s in found] == [
         (0, 0, 10),
@@ -260,5 +253,5 @@ def test_stamps_are_multiples_of_the_period_and_gaps_are_left_out():
 
 
 def test_a_slow_sensor_has_no_gaps_of_its_own_making():
-    (stretch,) = cut_sections({0: Measurements(gnss=gnss(grid(0, 60 * S, 2 * S)), imu=imu(grid(0, 60 * S, S // 50)))})
+    (stretch,) = cut_sections({0: Measurements(gnss=fixes(grid(0, 60 * S, 2 * S)), imu=imu(grid(0, 60 * S, S // 50)))})
     assert (np.diff(make_track_stamps(stretch, period_ns=50_000_000, max_gap_ns=S)) == 50_000_000).all()

@@ -23,15 +23,17 @@ def seconds(mask):
     return np.flatnonzero(mask) * PERIOD
 
 
+STANDING = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
+
+
 def test_standing_needs_both_limits():
-    limits = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
-    assert masks.find_stationary(rows([0.04] * 3), **limits).all()
-    assert not masks.find_stationary(rows([0.04] * 3, yaw_rate=0.06), **limits).any()
-    assert not masks.find_stationary(rows([0.06] * 3), **limits).any()
+    assert masks.find_stationary(rows([0.04] * 3), **STANDING).all()
+    assert not masks.find_stationary(rows([0.04] * 3, yaw_rate=0.06), **STANDING).any()
+    assert not masks.find_stationary(rows([0.06] * 3), **STANDING).any()
 
 
 def test_a_change_of_direction_stands_for_an_instant():
-    got = masks.find_stationary(rows([0.6, 0.3, -0.2, -0.6]), below_velocity_mps=0.05, below_yaw_rate_radps=0.05)
+    got = masks.find_stationary(rows([0.6, 0.3, -0.2, -0.6]), **STANDING)
     assert got.tolist() == [False, False, True, False]
 
 
@@ -146,23 +148,13 @@ def test_below_limit_follows_the_command_not_its_jitter():
 
 def test_reversing_at_full_speed_is_not_below_the_limit():
     assert not masks.find_below_full_speed(rows([-1.0] * 20, commanded=-1.0), limit_mps=0.95, window_s=0.5).any()
-    assert masks.find_reversing(rows([-0.06, -0.04, 0.3]), stationary_velocity_mps=0.05).tolist() == [
-        True,
-        False,
-        False,
-    ]
-
-
-STANDING = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
+    reversing = masks.find_reversing(rows([-0.06, -0.04, 0.3]), stationary_velocity_mps=0.05)
+    assert reversing.tolist() == [True, False, False]
 
 
 def test_a_limit_itself_is_not_below_nor_above_it():
-    assert not masks.find_stuck(
-        rows([0.05], wheel=0.5), stationary_velocity_mps=0.05, wheel_velocity_above_mps=0.2
-    ).any()
-    assert not masks.find_stuck(
-        rows([0.01], wheel=0.2), stationary_velocity_mps=0.05, wheel_velocity_above_mps=0.2
-    ).any()
+    for stuck in (rows([0.05], wheel=0.5), rows([0.01], wheel=0.2)):
+        assert not masks.find_stuck(stuck, stationary_velocity_mps=0.05, wheel_velocity_above_mps=0.2).any()
     assert not masks.find_stationary(rows([0.05]), **STANDING).any()
     assert not masks.find_stationary(rows([0.0], yaw_rate=0.05), **STANDING).any()
     assert not masks.find_turning_in_place(rows([0.1] * 9, yaw_rate=0.15), **TURNING).any()

@@ -6,6 +6,7 @@ import numpy as np
 import rasterio
 
 from tcpipe.formats.maps.geotiff import write_geotiff
+from tcpipe.terrain.target_grid import MapGrid
 
 
 def test_a_palette_is_written_before_the_pixels_and_gdal_has_nothing_to_say(tmp_path, caplog):
@@ -16,10 +17,7 @@ def test_a_palette_is_written_before_the_pixels_and_gdal_has_nothing_to_say(tmp_
         write_geotiff(
             tmp_path / "terrain.tif",
             lambda first, last: pixels[:, first:last],
-            rows=side,
-            cols=side,
-            affine=(0.05, 0.0, 500_000.0, 0.0, -0.05, 5_200_000.0),
-            crs="EPSG:32633",
+            MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.05, side, side),
             dtype="uint8",
             nodata=0,
             palette=palette,

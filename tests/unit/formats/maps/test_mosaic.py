@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.merge
-from map_worlds import write_tif
+from map_worlds import open_heights, write_tif
 from rasterio import Affine
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps import geotiff
 from tcpipe.formats.maps.building import build_map
-from tcpipe.formats.maps.layer_building import open_raster
 from tcpipe.formats.maps.map_files import open_map
 
 LEFT, TOP, PITCH_M = 560_000.0, 5_215_000.0, 0.25
@@ -91,8 +90,8 @@ def test_tiles_in_degrees_lie_side_by_side_also_across_the_antimeridian(tmp_path
     east = write_tif(
         tmp_path / "e.tif", np.full((1, 50, 60), 9.0, np.float32), "EPSG:4326", corner(0, 0, pitch, -180.0, -16.5)
     )
-    with open_raster([west, east], "height") as raster:
-        assert (raster.rows, raster.cols) == (50, 120)
+    with open_heights([west, east]) as raster:
+        assert (raster.place.rows, raster.place.cols) == (50, 120)
         values, valid = raster.read(10, 12, 50, 70)
     assert valid.all()
     assert values[0].tolist() == [7.0] * 10 + [9.0] * 10
@@ -101,9 +100,9 @@ def test_tiles_in_degrees_lie_side_by_side_also_across_the_antimeridian(tmp_path
 def test_few_files_are_open_however_many_there_are(tmp_path):
     paths = tiles(tmp_path, rows=8, cols=8, without=())["height"]
     before = len(list(Path("/dev/fd").iterdir()))
-    with open_raster(paths, "height") as raster:
-        for row in range(0, raster.rows, STEP):
-            raster.read(row, min(row + STEP, raster.rows), 0, raster.cols)
+    with open_heights(paths) as raster:
+        for row in range(0, raster.place.rows, STEP):
+            raster.read(row, min(row + STEP, raster.place.rows), 0, raster.place.cols)
             assert len(list(Path("/dev/fd").iterdir())) - before <= geotiff._MAX_OPEN
         assert raster.name == "t_0_0.tif … t_7_7.tif (64 files)"
 
@@ -122,7 +121,7 @@ def test_tiles_that_are_odd_are_named_in_one_line(tmp_path):
     for name, (crs, affine, wanted) in ODD.items():
         values = np.ones((1, SIDE, SIDE), np.int16 if name == "type.tif" else np.float32)
         path = write_tif(tmp_path / name, values, crs, affine)
-        with pytest.raises(MapError, match=wanted) as caught, open_raster([path, *rest], "height"):
+        with pytest.raises(MapError, match=wanted) as caught, open_heights([path, *rest]):
             pass
         (line,) = caught.value.problems
         assert path.name in line
@@ -132,7 +131,7 @@ def test_tiles_that_are_odd_are_named_in_one_line(tmp_path):
 def test_a_damaged_tile_is_named_by_its_own_rows(tmp_path):
     paths = tiles(tmp_path)["height"]
     whole = paths[4].read_bytes()
-    with open_raster(paths, "height") as raster:
+    with open_heights(paths) as raster:
         paths[4].write_bytes(whole[:3000])
         with pytest.raises(MapError, match=r"t_1_1.tif: .*damaged"):
-            raster.read(0, raster.rows, 0, raster.cols)
+            raster.read(0, raster.place.rows, 0, raster.place.cols)

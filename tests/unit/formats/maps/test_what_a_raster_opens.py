@@ -6,12 +6,11 @@ import socket
 import numpy as np
 import pytest
 import rasterio
-from map_worlds import write_tif
+from map_worlds import open_heights, write_tif
 from rasterio import Affine
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.geotiff import list_raster_files, read_tile
-from tcpipe.formats.maps.layer_building import open_raster
 
 PLACE = Affine(1.0, 0.0, 560_000.0, 0.0, -1.0, 5_215_000.0)
 HEIGHTS = np.arange(64 * 64, dtype=np.float32).reshape(1, 64, 64) / 64
@@ -43,8 +42,8 @@ def address():
 
 
 def read(path):
-    with open_raster([path], "height") as raster:
-        return raster.read(0, raster.rows, 0, raster.cols)
+    with open_heights([path]) as raster:
+        return raster.read(0, raster.place.rows, 0, raster.place.cols)
 
 
 def hostile(site, secret, address):
@@ -158,4 +157,4 @@ def test_a_raster_in_one_huge_block_is_refused(tmp_path):
     ):
         pass
     with pytest.raises(MapError, match="kept in blocks of 648 MB, at most 256"):
-        read_tile(tmp_path / "h.tif", "height")
+        read_tile(tmp_path / "h.tif", "height", "metres")
