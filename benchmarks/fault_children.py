@@ -15,6 +15,7 @@ import pickle
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -217,7 +218,8 @@ def _be_the_child(
     except BaseException as error:  # noqa: BLE001  a traceback is a finding
         os.write(2, f"Traceback: {error!r}".encode())
     finally:
-        atexit._run_exitfuncs()  # noqa: SLF001  os._exit does not
+        threading._shutdown()  # noqa: SLF001  threads end before a process does, which os._exit does not wait for
+        atexit._run_exitfuncs()  # noqa: SLF001
         with suppress(OSError):
             sys.stdout.flush()
         os._exit(code)

@@ -150,6 +150,9 @@ class ArrayMap:
     def layers(self):
         return make_paper_layers([name for name in self.arrays if name not in self.more], self.classes) | self.more
 
+    def summary(self):
+        return {"name": self.name}
+
     def select(self, layers):
         assert set(self.layers) <= set(layers)
         return self

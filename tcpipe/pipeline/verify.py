@@ -203,7 +203,9 @@ def _verify_log(place: Place) -> Iterator[CheckResult]:
             yield f"{log.where(name.removeprefix(SNAPSHOT).removesuffix('.zst'))}: is missing"
             lost += 1
     if lost:
-        yield Repair(f"{log.where()}: copy its commits again; a snapshot with a higher number has what they say")
+        yield Repair(
+            f"{log.where()}: copy the store again, or ingest all logs again and acknowledge the commits; a later snapshot has them, too"
+        )
     for name in log.files():
         if name in snapshots:
             repair = Repair(f"{log.where(name)}: remove it; the commits say the same")

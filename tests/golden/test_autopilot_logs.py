@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from autopilot_files import AMP, ANTENNA_FRD, SPEED_MPS, VOLT, DataFlash, Drive, Ulog, write_dataflash, write_ulog
 from installed_command import tcpipe as run_tcpipe
+from object_gateway import in_environment
 from shared_data import shared_data
 from storage_server import object_store
 
@@ -348,8 +349,7 @@ def test_logs_of_autopilots_lie_in_object_storage(logs, tmp_path, monkeypatch):
     folder = tmp_path / "store" / "drives"
     folder.mkdir(parents=True)
     with object_store(tmp_path / "store") as (settings, _):
-        for name, value in settings.items():
-            monkeypatch.setenv(name, value)
+        in_environment(monkeypatch, settings, tmp_path / "cache")
         for kind, suffix in (("ulog", "ulg"), ("dataflash", "BIN")):
             shutil.copyfile(logs[kind], folder / f"run.{suffix}")
             with tcpipe.read_log(f"s3://drives/run.{suffix}") as there, tcpipe.read_log(logs[kind]) as here:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, list_first
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.index_files import KnownSensor, RunFacts
@@ -20,6 +21,8 @@ from tcpipe.robots import GENERIC
 from tcpipe.store import Store
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, Sensor
+
+logger = logging.getLogger("tcpipe")
 
 CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
 """Findings on runs that are excluded though they belong in a dataset."""
@@ -48,6 +51,9 @@ def choose_runs(
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_describe_no_runs(store, found))
+    for problem in found.state.problems:
+        if problem.key not in found.state.acknowledged:
+            logger.warning("%s: is missing or damaged, so that runs may be; see 'tcpipe status'", problem.log[0])
     candidates = _select_one_robot(store, _select_tagged(store, mine, tags), robot)
     damaged = store.prove(candidates)
     logs = {run.run_id: run.facts.log.source for run in candidates if run.facts.log and run.run_id not in damaged}
@@ -110,7 +116,7 @@ def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; expected one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
-            *(f"{_format_names(names)}: {format_robot(sensors)}" for names, sensors in groups),
+            *(f"{list_first(sorted(names), 3)}: {format_robot(sensors)}" for names, sensors in groups),
         )
 
 
@@ -147,11 +153,6 @@ def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[s
     """Return whether a run has the requested robot and tags, as far as they are known."""
     its_robot = robot is None or known.robot == robot
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
-
-
-def _format_names(names: Sequence[str]) -> str:
-    """Return the first three names, and how many more there are."""
-    return ", ".join(sorted(names)[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _suggest_logs(found: Ingestions, run_ids: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """The best predictor of simulated costs, against the simulator's own truth where nothing is hidden."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,13 +10,6 @@ from tcpipe.experiment.simulation_floor import compute_true_costs
 from tcpipe.simulation.route import Leg, Pause, simulate_drive
 from tcpipe.simulation.scenarios import make_paper_site, make_paper_surface, make_small_world
 from tcpipe.simulation.truth import compute_true_cost
-
-
-class _Chords:
-    """Samples by the ends of their chords."""
-
-    def __init__(self, **columns):
-        self.column = columns.__getitem__
 
 
 @pytest.mark.parametrize("surface", [None, make_paper_surface()], ids=["even", "uneven"])
@@ -28,11 +22,11 @@ def test_without_hidden_effects_the_truth_is_what_it_says(surface):
     start = truth.stamp_ns[steady]
     cost = compute_true_cost(truth, start)
     end = truth.at(cost.end_ns.astype(np.int64))
-    chords = _Chords(
-        start_lon_deg=truth.lon_deg[steady], start_lat_deg=truth.lat_deg[steady],
-        end_lon_deg=end.lon_deg, end_lat_deg=end.lat_deg, mean_abs_yaw_rate_radps=np.zeros(len(steady)),
-    )  # fmt: skip
-    told = compute_true_costs(world, robot, chords)
+    chords = {
+        "start_lon_deg": truth.lon_deg[steady], "start_lat_deg": truth.lat_deg[steady],
+        "end_lon_deg": end.lon_deg, "end_lat_deg": end.lat_deg, "mean_abs_yaw_rate_radps": np.zeros(len(steady)),
+    }  # fmt: skip
+    told = compute_true_costs(world, robot, SimpleNamespace(column=chords.__getitem__))
     assert len(start) > 40
     assert np.ptp(np.degrees(truth.slope_rad[steady])) > 20.0
     assert told["v"] == pytest.approx(cost.velocity_mps, rel=0.02)

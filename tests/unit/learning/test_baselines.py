@@ -1,6 +1,7 @@
 """What a model is shown beside: fitted on its samples, measured on the same, and said in words."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -108,21 +109,12 @@ def test_the_best_baseline_is_named_with_the_ratio_and_its_interval():
     assert describe_ratios([made_comparison("physics", Ratio(None, None, None), rmse=5.0)]) == []
 
 
-class Places:
-    """Columns of samples 30 m apart along a parallel, of two runs with frames of their own."""
-
-    def column(self, name):
-        east_m = np.array([1.0, 31.0, 31.5, 61.0]) / (111_320.0 * np.cos(np.radians(47.0)))
-        known = {
-            "run_id": np.array(["a", "a", "b", "b"]),
-            "start_lat_deg": np.full(4, 47.0),
-            "end_lat_deg": np.full(4, 47.0),
-        }
-        return (known | {"start_lon_deg": 15.0 + east_m})[name]
-
-
 def test_blocks_are_of_ground_whatever_the_runs_frames():
-    kind, groups = _group_samples(Places(), 10.0)
+    """Samples 30 m apart along a parallel, of two runs."""
+    east_m = np.array([1.0, 31.0, 31.5, 61.0]) / (111_320.0 * np.cos(np.radians(47.0)))
+    known = {f"{end}_lat_deg": np.full(4, 47.0) for end in ("start", "end")} | {"start_lon_deg": 15.0 + east_m}
+    columns = known | {"run_id": np.array(["a", "a", "b", "b"])}
+    kind, groups = _group_samples(SimpleNamespace(column=columns.__getitem__), 10.0)
     assert kind == "blocks"
     assert groups[1] == groups[2]
     assert len(set(groups.tolist())) == 3

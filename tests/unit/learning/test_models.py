@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_models import CARD, made_model
+from stored_files import flip
 
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.formats.integrity import write_sealed
@@ -123,9 +124,7 @@ def test_without_torch_there_is_one_line(place, monkeypatch):
 def test_a_changed_byte_is_found_and_its_file_is_named(tmp_path, place, name):
     model = Path(shutil.copytree(place, tmp_path / "model"))
     assert (verify(model).kind, verify(model).problems) == ("model", ())
-    data = bytearray((model / name).read_bytes())
-    data[len(data) // 2] ^= 1
-    (model / name).write_bytes(data)
+    flip(model / name)
     (problem,) = verify(model).problems
     assert str(model / name) in problem
 

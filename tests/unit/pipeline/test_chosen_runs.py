@@ -49,6 +49,12 @@ def test_a_run_needs_all_of_the_tags(store, tmp_path):
     assert runs(store, tmp_path, weather="dry", driver="Eva") == ["c"]
 
 
+def test_runs_that_may_be_missing_with_a_commit_are_said(store, tmp_path, caplog):
+    (lost := store.root / "log" / "0000000003.json").unlink()
+    assert runs(store, tmp_path)
+    assert f"{lost}: is missing or damaged, so that runs may be; see 'tcpipe status'" in caplog.messages
+
+
 def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path):
     with pytest.raises(DatasetError) as caught:
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tags={"weather": "snow"})

@@ -15,6 +15,7 @@ from map_worlds import ArrayMap
 from physics_model import PhysicsModel, energy_joule, power_watt, velocity_mps
 from planning_worlds import plane
 from ruamel.yaml import YAML
+from stored_files import flip
 
 from tcpipe.errors import MapError, ModelError, UsageError
 from tcpipe.formats.bucket_directories import fetch_directory
@@ -28,16 +29,13 @@ MODEL = PhysicsModel()
 
 @dataclass(frozen=True)
 class CountingMap(ArrayMap):
-    """Counts what is read, and says what it is, as a map in a store does."""
+    """Counts what is read."""
 
     reads: Counter = None
 
     def read(self, layer, row0, row1, col0, col1):
         self.reads[layer, row0, col0] += 1
         return super().read(layer, row0, row1, col0, col1)
-
-    def summary(self):
-        return {"name": self.name}
 
 
 def _map(**options):
@@ -216,9 +214,7 @@ def test_a_damaged_file_is_named_by_verify_and_by_who_reads_it_and_a_second_call
     card = make_cost_map(MODEL, source, out, cell_size_m=2.0).card
     assert (verify(out).kind, verify(out).problems) == ("cost map", ())
     (out / "energy.tif.aux.xml").write_text("statistics that a viewer left")
-    data = bytearray((out / "power.tif").read_bytes())
-    data[-20] ^= 1
-    (out / "power.tif").write_bytes(data)
+    flip(out / "power.tif", 0.99)
     (problem,) = verify(out).problems
     assert str(out / "power.tif") in problem
     with pytest.raises(MapError, match=r"power\.tif: its sha256 is"):

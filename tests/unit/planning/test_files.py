@@ -1,7 +1,7 @@
 """What predict-path and plan-path write: once, whole, and again only when something changed."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.csv
@@ -21,18 +21,9 @@ from tcpipe.planning.path_options import PlanPathOptions
 MODEL = PhysicsModel(patch_px=8)
 
 
-@dataclass(frozen=True)
-class StoredMap(ArrayMap):
-    """A map that says what it is, as one in a store does."""
-
-    def summary(self):
-        return {"name": self.name}
-
-
 @pytest.fixture
-def source() -> StoredMap:
-    made = plane(24.0, rise_east=0.1)
-    return StoredMap(made.grid, made.arrays, made.tile_px)
+def source() -> ArrayMap:
+    return plane(24.0, rise_east=0.1)
 
 
 @pytest.fixture

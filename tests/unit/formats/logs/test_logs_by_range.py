@@ -1,5 +1,8 @@
 """Logs in a bucket: what is fetched of them is counted; they are the same recording wherever they lie."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mcap.writer import CompressionType
@@ -15,6 +18,7 @@ from random_messages import (
     write_mcap,
 )
 from rosbags.rosbag1 import Writer as BagWriter
+from stored_files import flip
 from wheel_drives import drive_at
 
 from tcpipe.errors import LogError
@@ -83,7 +87,7 @@ def test_only_the_index_and_the_chunks_that_are_wanted_are_fetched(drives, kind)
 def test_a_recording_is_one_run_wherever_it_lies(drives, tmp_path):
     bucket, _fetched = drives
     here = drive_at(tmp_path / "here" / "run.mcap")
-    (bucket / "run.mcap").write_bytes(here.read_bytes())
+    shutil.copy(here, bucket / "run.mcap")
     for first, then in (("s3://drives/run.mcap", here), (here, "s3://drives/run.mcap")):
         store = Store(tmp_path / f"store of {first != here}")
         (made,) = ingest([first], store=store.root, recipe=Recipe()).results
@@ -101,9 +105,7 @@ def test_a_recording_is_one_run_wherever_it_lies(drives, tmp_path):
 def test_what_is_broken_in_one_copy_is_read_from_another(drives, tmp_path):
     bucket, _ = drives
     here = drive_at(tmp_path / "run.mcap")
-    broken = bytearray(here.read_bytes())
-    broken[len(broken) // 2] ^= 0xFF
-    (bucket / "run.mcap").write_bytes(broken)
+    flip(Path(shutil.copy(here, bucket / "run.mcap")))
     store = tmp_path / "store"
     (damaged,) = ingest(["s3://drives/run.mcap"], store=store, recipe=Recipe()).results
     (whole,) = ingest([here], store=store, recipe=Recipe()).results

@@ -9,6 +9,7 @@ import pytest
 import rasterio
 import xarray
 from map_worlds import World
+from stored_files import flip
 
 from tcpipe.errors import MapError
 from tcpipe.formats.bucket_directories import fetch_files
@@ -151,9 +152,7 @@ def test_one_flipped_byte_is_an_error_not_a_number(path, tmp_path, layer):
     copy = tmp_path / "copy.zarr"
     shutil.copytree(path, copy)
     shard = next(p for p in (copy / layer / "c").rglob("*") if p.is_file())
-    raw = bytearray(shard.read_bytes())
-    raw[len(raw) // 3] ^= 0x10
-    shard.write_bytes(raw)
+    flip(shard, 1 / 3)
     with pytest.raises(MapError, match=rf"{layer}, rows 0 to 200.*cannot be read"):
         open_map(copy).read(layer, 0, 200, 0, 200)
 

@@ -19,7 +19,7 @@ from tcpipe.formats.https import HttpsClient
 from tcpipe.formats.maps import remote_geotiff
 from tcpipe.formats.maps.remote_geotiff import open_window
 
-SIDE, LEFT, TOP = 1500, 2_600_000.0, 1_201_000.0
+SIDE, LEFT, TOP = 1200, 2_600_000.0, 1_201_000.0
 RNG = np.random.default_rng(7)
 HEIGHT = (500 + np.cumsum(RNG.normal(size=(1, SIDE, SIDE)), axis=2)).astype(np.float32)
 HEIGHT[0, :40, :50] = -9999.0
