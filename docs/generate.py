@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import IntFlag
+from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
 from typing import cast
@@ -24,7 +25,7 @@ from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
 from tcpipe.planning.path_cost import PATH_SEGMENTS
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.tables.findings import Entry, read_catalogue, read_sections
+from tcpipe.tables.findings import Entry, read_catalogue
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     LABELLED_SEGMENTS,
@@ -263,8 +264,12 @@ def _findings() -> str:
     """Return the catalogue of findings, section by section, each code as a heading."""
     catalogue = read_catalogue()
     parts = [_NOTE, _TROUBLESHOOTING]
-    for section, codes in read_sections().items():
-        parts += [f"## {section}\n", *(_finding(code, catalogue[code]) for code in codes)]
+    for line in files("tcpipe.tables").joinpath("catalogue.toml").read_text(encoding="utf-8").splitlines():
+        if line.startswith("# ---- "):
+            parts.append(f"## {line.strip('# -')}\n")
+        elif line.startswith("[") and "." not in line:
+            code = line.strip("[]")
+            parts.append(_finding(code, catalogue[code]))
     return "\n".join(parts)
 
 

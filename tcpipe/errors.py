@@ -7,7 +7,7 @@ The command line prints them; a traceback is a bug.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 _URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
@@ -48,6 +48,12 @@ def clean_line(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def list_first(names: Sequence[str], most: int = 1) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
 
 
 def clean_lines(lines: Iterable[str]) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, list_first
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
@@ -206,8 +206,7 @@ class Split:
         table = read_samples(self._columns.directory, ["sample_id", "split"])
         others = table.filter(pc.is_in(table.column("sample_id"), value_set=ids)).column("split").value_counts()
         where = "".join(f"; {group['counts']} of them in {group['values']}" for group in others.to_pylist())
-        more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
-        return f"{self._columns.directory}: no sample {', '.join(ids[:_NAMED].to_pylist())}{more} in {self.name}{where}"
+        return f"{self._columns.directory}: no sample {list_first(ids.to_pylist(), _NAMED)} in {self.name}{where}"
 
     def clean(
         self,

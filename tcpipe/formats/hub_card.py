@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from tcpipe.errors import clean_line
 from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_files import OVERVIEW, SAMPLES, SHARDS
 from tcpipe.formats.finding_lines import format_verdict
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json, to_json
@@ -29,16 +30,16 @@ _SIZES = {10**3: "n<1K", 10**4: "1K<n<10K", 10**5: "10K<n<100K", 10**6: "100K<n<
 _SHOWN_LAYERS = 12
 
 
-def format_hub_card(card: DatasetCard, *, samples_file: str, picture: str) -> str:
+def format_hub_card(card: DatasetCard) -> str:
     """Return the document: a YAML head (as JSON, which is YAML) and what a reader wants to know."""
-    text = "\n".join(_iterate_lines(card, picture))
-    head = _make_head(card, samples_file)
+    text = "\n".join(_iterate_lines(card))
+    head = _make_head(card)
     yaml = "".join(f"{key}: {json.dumps(value, ensure_ascii=True)}\n" for key, value in head.items())
     return f"---\n{yaml}---\n\n{text}\n"
 
 
-def _make_head(card: DatasetCard, samples_file: str) -> dict[str, Json]:
-    configs: list[Json] = [{"config_name": "samples", "data_files": [{"split": "full", "path": samples_file}]}]
+def _make_head(card: DatasetCard) -> dict[str, Json]:
+    configs: list[Json] = [{"config_name": "samples", "data_files": [{"split": "full", "path": SAMPLES}]}]
     if card.shards:
         files: dict[str, list[str]] = {}
         for shard in card.shards:
@@ -63,7 +64,7 @@ def _escape_markdown(value: str) -> str:
     return "".join(f"\\{c}" if c in "\\`*_[]|#{}" else c for c in escaped)
 
 
-def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
+def _iterate_lines(card: DatasetCard) -> Iterator[str]:
     """Yield the lines of what a reader wants to know."""
     splits = ", ".join(f"{count} {split}" for split, count in card.splits.items())
     side = f"{card.patch_px} × {card.patch_px} pixels of {card.patch_m:g} m × {card.patch_m:g} m"
@@ -75,7 +76,7 @@ def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
         f"({', '.join(map(_escape_markdown, card.robots)) or 'none'}): power, velocity, duration and energy, "
         f"each with its standard deviation, beside a patch of the ground under it: {side}."
     )
-    yield from ("", f"![the maps from above]({picture})", "", "## Labels, over train alone", "")
+    yield from ("", f"![the maps from above]({OVERVIEW})", "", "## Labels, over train alone", "")
     yield from ("| label | mean | standard deviation | least | most |", "|---|---|---|---|---|")
     for name, statistics in card.label_statistics_of_train.items():
         figures = (statistics.mean, statistics.std, statistics.min, statistics.max)
@@ -171,19 +172,13 @@ _ENCODING_BY_SUFFIX = {
 }
 
 
-def format_croissant(
-    card: DatasetCard, samples: pa.Schema, files: Mapping[str, Checksum], *, samples_file: str, shards: str
-) -> str:
-    """Return the document as JSON-LD.
-
-    ``samples`` is the schema of the table of samples, whose fields' metadata give their meanings; ``shards`` the pattern of Parquet files
-    that hold the patches, where they are Parquet.
-    """
-    source = {"fileObject": {"@id": samples_file}}
+def format_croissant(card: DatasetCard, samples: pa.Schema, files: Mapping[str, Checksum]) -> str:
+    """Return the document as JSON-LD; ``samples`` is the schema of the table of samples, whose fields' metadata give their meanings."""
+    source = {"fileObject": {"@id": SAMPLES}}
     records = [_describe_records("samples", "One record a sample, in the order of the patches.", samples, source)]
     sets = []
     if card.shards:
-        kind = {"name": "shards", "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"], "includes": shards}
+        kind = {"name": "shards", "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"], "includes": f"{SHARDS}/*.parquet"}
         sets.append({"@type": "cr:FileSet", "@id": "shards", **kind})
         layers = read_layers(card.layers, card.classes, Path())
         patches = [

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any, Literal
 
-from tcpipe.errors import RecipeError
+from tcpipe.errors import RecipeError, list_first
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.robots import GENERIC, Robot
 from tcpipe.tables.findings import Finding, Severity, Subject, make_finding
@@ -162,8 +162,7 @@ def _describe_topic(topic: Topic) -> str:
 
 def format_topic_names(topics: Sequence[Topic]) -> str:
     """Return the topics' names, the longest lists cut."""
-    shown = ", ".join(topic.name for topic in topics[:LISTED])
-    return f"{shown} and {len(topics) - LISTED} more" if len(topics) > LISTED else shown
+    return list_first([topic.name for topic in topics], LISTED)
 
 
 def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, StoreError, UsageError, clean_line
+from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
 from tcpipe.execution import Executor, run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here
@@ -157,13 +157,12 @@ _MOST_RUNS = 5
 def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> None:
     """Log a line for each pattern of time windows that fits no run of the store."""
     run_ids = sorted({row.run_id for row in state.runs.values()})
-    more = f" and {len(run_ids) - _MOST_RUNS} more" if len(run_ids) > _MOST_RUNS else ""
     for pattern, window in {time_window.run: time_window for time_window in windows}.items():
         if run_ids and not any(map(window.is_for, run_ids)):
             text = (
-                "recipe mask.windows (or its CSV file): run = %r fits no run, so its windows have no effect; runs: %s%s"
+                "recipe mask.windows (or its CSV file): run = %r fits no run, so its windows have no effect; runs: %s"
             )
-            logger.warning(text, pattern, ", ".join(run_ids[:_MOST_RUNS]), more)
+            logger.warning(text, pattern, list_first(run_ids, _MOST_RUNS))
 
 
 def find_broken(store: Store, state: State, sources: Iterable[LogSource]) -> set[tuple[str, str]]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import UsageError
+from tcpipe.errors import UsageError, list_first
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commits import Entries, Problem, State, find_lineage
 from tcpipe.formats.index_files import RunFacts
@@ -163,6 +163,4 @@ def _describe_no_match(
 
 
 def _format_list(problems: Sequence[Problem]) -> str:
-    names = sorted({problem.name for problem in problems})
-    more = f" and {len(names) - _MOST_CANDIDATES} more" if len(names) > _MOST_CANDIDATES else ""
-    return ", ".join(names[:_MOST_CANDIDATES]) + more
+    return list_first(sorted({problem.name for problem in problems}), _MOST_CANDIDATES)

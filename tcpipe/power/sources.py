@@ -304,9 +304,9 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
         current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)
-    parts = [_read_values(columns, field).reshape(len(current), -1) for field in parse_fields(source.current)]
+    sides = [_read_values(columns, field).reshape(len(current), -1) for field in parse_fields(source.current)]
     unmeasured = (
-        find_unmeasured(np.hstack(parts), _choose_stamps(columns)) if parts else np.zeros(len(current), np.bool_)
+        find_unmeasured(np.hstack(sides), _choose_stamps(columns)) if sides else np.zeros(len(current), np.bool_)
     )
     current = np.where(unmeasured, np.nan, current)
     return RailReadings(name, voltage, current, unmeasured_count=int(unmeasured.sum()))

@@ -36,13 +36,9 @@ _TYPES = {
 
 
 def validate_fields(made: Any, section: str) -> None:
-    """Check every field of a frozen dataclass and keep it as a plain value; its ``__post_init__``.
+    """Check every field of a frozen dataclass and keep it as a plain value; `RecipeError` has a line for every wrong one.
 
     ``section`` is the name of its keys before the dot, "" where they have none.
-
-    Raises
-    ------
-    RecipeError : one line for every wrong value.
     """
     problems: list[str] = []
     cls: type = type(made)
@@ -55,9 +51,7 @@ def validate_fields(made: Any, section: str) -> None:
 def from_values(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
     """Return a checked dataclass of nested plain values, as TOML gives them.
 
-    Raises
-    ------
-    RecipeError : one line for every wrong or unknown key, beginning with ``where``.
+    `RecipeError` has a line for every wrong or unknown key, which begins with ``where``.
     """
     problems: list[str] = []
     made: T = _check_value(cls, values, "", problems)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shlex
+import tomllib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import isfinite
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from tcpipe.errors import RecipeError, clean_line
 from tcpipe.recipe import Recipe
@@ -22,11 +23,7 @@ Keys: TypeAlias = Mapping[str, TomlValue]
 class RecipeFragment:
     """A part of a recipe: the keys of each table by its dotted name, as ``read.time_offset_s``; an array of tables as a list of them.
 
-    ``is_checked``: this recipe, or that of the version which wrote it, has accepted it.
-
-    Raises
-    ------
-    RecipeError : a key is unknown, or the recipe refuses its value.
+    ``is_checked``: this recipe, or that of the version which wrote it, has accepted it. `RecipeError`: the recipe rejects it.
     """
 
     tables: Mapping[str, Keys | Sequence[Keys]]
@@ -34,16 +31,11 @@ class RecipeFragment:
 
     def __post_init__(self) -> None:
         """Check it as a recipe that holds nothing else."""
-        if self.is_checked:
-            return
-        values: dict[str, Any] = {}
-        for name, keys in self.tables.items():
-            *above, last = name.split(".")
-            inner = values
-            for part in above:
-                inner = inner.setdefault(part, {})
-            inner[last] = keys if not isinstance(keys, Mapping) else {**inner.get(last, {}), **keys}
-        from_values(Recipe, values, where="suggested recipe")
+        if not self.is_checked:
+            try:
+                from_values(Recipe, tomllib.loads(self.toml()), where="suggested recipe")
+            except tomllib.TOMLDecodeError as error:
+                raise RecipeError(f"suggested recipe: {error}") from None
 
     def inline(self) -> str:
         """Return it inside a sentence, as ``[read] imu_units = "deg"``."""
@@ -159,12 +151,7 @@ def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Rem
 
 @cache
 def format_recipe_key(name: str) -> str:
-    """Return the dotted name of a key whose value only the reader knows, as a message names it.
-
-    Raises
-    ------
-    RecipeError : the recipe has no such key.
-    """
+    """Return the dotted name of a key whose value only the reader knows, as a message names it; `RecipeError` if there is none."""
     section, _, key = name.partition(".")
     known = read_annotations(Recipe)
     if section not in known or (key and key not in read_annotations(known[section])):

@@ -25,7 +25,6 @@ page.start(async () => {
   });
   const digits = (value, name) => page.quantity(value, ...kinds[name].slice(1));
 
-  // The colours of all samples by a quantity; the legend says what they mean.
   function coloured(name) {
     const entryOf = {
       split: (s) => [`${facts.splits[s].name} (${facts.splits[s].count})`, facts.splits[s].colour],
@@ -130,7 +129,6 @@ page.start(async () => {
   let drawing = false;
   source.selected.change.connect(() => { if (!drawing) pick([...source.selected.indices]); });
 
-  // What shows it.
   const bins = 40;
   const histogram = page.model("histogram"), bars = page.model("bars").data_source, here = page.model("here").data_source;
   function drawHistogram() {

@@ -109,7 +109,6 @@ const page = (() => {
     }
     return [room, make("p", "Travel is to the right; height uses the range of the patch.", { className: "note" })];
   }
-  // Colours by name.
   const legend = (entries) => entries.map(([text, colour]) => {
     const dot = make("i"), entry = make("span");
     dot.style.background = colour;
@@ -175,9 +174,9 @@ const page = (() => {
   // What is chosen, below a short summary or the first row of figures, and buttons that go through `count()` rows from row `current(by)`.
   function stepThrough(count, current, choose) {
     const summary = document.querySelector(".summary"), room = make("div", "", { className: "selection" });
-    const figures = [...at("chosen").closest("section").querySelectorAll("figure")];
+    const figures = [...at("chosen").closest("section").querySelectorAll("figure")], bottom = (part) => part.getBoundingClientRect().bottom;
     room.append(at("chosen"), at("stepping"));
-    if (matchMedia("(min-width: 64rem)").matches && summary.getBoundingClientRect().bottom < innerHeight / 2) summary.append(room);
+    if (matchMedia("(min-width: 64rem)").matches && bottom(summary) < bottom(figures[0])) summary.append(room);
     else figures.findLast((one) => one.offsetTop === figures[0].offsetTop).after(room);
     const step = (by) => { const n = count(); if (n) choose((current(by) + by + n) % n); };
     at("before").onclick = () => step(-1);
@@ -207,7 +206,7 @@ const page = (() => {
     });
   }
   const fixed = (value, digits) => (Number(value.toFixed(digits)) + 0).toFixed(digits);  // no -0.0
-  // A value with its unit, to as many decimals as two digits of its σ have; to `digits` at most, and without a σ.
+  // A value with its unit, to two digits of its σ; to `digits` decimals at most, and without a σ.
   function quantity(value, unit, digits, std = NaN) {
     if (!Number.isFinite(value)) return "none";
     const places = std > 0 ? Math.max(0, Math.min(digits, 1 - Math.floor(Math.log10(std)))) : digits;

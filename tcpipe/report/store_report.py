@@ -294,6 +294,7 @@ def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
             x_axis_type="datetime",
             **({"x_range": plots[0].figure.x_range} if plots else {}),
         )
+        plot.figure.x_range.default_span = 86_400_000  # of a single time: a day, in milliseconds
         points = plot.figure.scatter(
             "start_ms",
             name,

@@ -23,12 +23,12 @@ from tcpipe.power.audit import (
 from tcpipe.power.rails import Rail, Rule, integrate_energy, sum_power
 from tcpipe.power.sampling import find_smoothing
 from tcpipe.recipe import LabelConfig
-from tcpipe.recipe.suggestions import suggest
+from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
 from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import LabelFacts, PowerSensorFacts, PowerSign, Smoothing, StageFacts
+from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, Smoothing, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import Streams, TrackInfo
 
@@ -155,6 +155,38 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
         )  # fmt: skip
     if facts.lost_signs:
         yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
+
+
+_FEWEST_UNPOWERED = 5
+"""Segments in a row: fewer may be chance."""
+_IDLE_FRACTION = 0.1
+"""Of the median net power."""
+_MISSING_RESIDUALS = 3.0
+
+
+def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInfo, start_ns: int) -> Iterator[Finding]:
+    """Yield where the robot moves over several segments with the power of rest, though speed and slope need clearly more."""
+    watt, needed_watt = to_floats(table, "power_watt"), to_floats(table, "physics_power_watt")
+    idle_watt, residual_watt = physics.idle_watt, physics.residual_watt
+    if idle_watt is None or residual_watt is None or not table.num_rows:
+        return
+    is_idle = np.abs(watt - idle_watt) < _IDLE_FRACTION * (np.nanmedian(watt) - idle_watt)
+    for first, last in find_runs(is_idle, to_integers(table, "clock_epoch")).tolist():
+        missing_watt = float(np.mean((needed_watt - watt)[first : last + 1]))
+        if last + 1 - first < _FEWEST_UNPOWERED or missing_watt < _MISSING_RESIDUALS * residual_watt:
+            continue
+        begin_s, end_s = (
+            (table[name][row].as_py() - start_ns) * 1e-9 for name, row in (("start_ns", first), ("end_ns", last))
+        )
+        window: Keys = {"run": info.run_id, "start": float(np.floor(begin_s)), "end": float(np.ceil(end_s))}
+        yield make_finding(
+            "motion-without-power",
+            _POWER,
+            remedies=suggest("drop", {"mask.windows": [window]}),
+            span_s=(begin_s, end_s),
+            segments_count=last + 1 - first,
+            missing_watt=missing_watt,
+        )
 
 
 def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts, *, rule: Rule) -> SensorError:

@@ -65,13 +65,8 @@ class TableSchema:
 
     def table(self, **arrays: object) -> pa.Table:
         """Make a checked table from one array (numpy or Arrow) a column; NaN in nullable float columns becomes null."""
-        unknown = set(arrays) - set(self.names())
-        missing = set(self.names()) - set(arrays)
-        if unknown or missing:
-            raise TableError(
-                *(f"table {self.name}: column {name} is not in its schema" for name in sorted(unknown)),
-                *(f"table {self.name}: column {name} is missing" for name in sorted(missing)),
-            )
+        if wrong := arrays.keys() ^ set(self.names()):
+            raise TableError(f"table {self.name}: columns {', '.join(sorted(wrong))} are missing or not in its schema")
         columns = [_to_arrow(arrays[column.name], column) for column in self.columns]
         table = pa.Table.from_arrays(columns, schema=self.arrow())
         self.check(table)
@@ -101,11 +96,12 @@ class TableSchema:
 
     def check(self, table: pa.Table, *, more: bool = False) -> None:
         """Raise `TableError` naming every column that is missing, extra (unless ``more`` is welcome), of a wrong type, or null in vain."""
-        problems = list(self._problems(table, more=more))
+        problems = list(self.find_problems(table, more=more))
         if problems:
             raise TableError(*problems)
 
-    def _problems(self, table: pa.Table, *, more: bool) -> Iterable[str]:
+    def find_problems(self, table: pa.Table, *, more: bool = False) -> Iterable[str]:
+        """Yield a line for each wrong column, as `check`."""
         for column in self.columns:
             if column.name not in table.column_names:
                 yield f"table {self.name}: column {column.name} is missing (expected {column.dtype}, {column.unit})"

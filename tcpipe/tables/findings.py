@@ -80,18 +80,6 @@ def read_catalogue() -> Mapping[str, Entry]:
     return entries
 
 
-def read_sections() -> dict[str, list[str]]:
-    """Return the codes by section, in the order of the file."""
-    sections: dict[str, list[str]] = {}
-    codes: list[str] = []
-    for line in _read_text().splitlines():
-        if line.startswith("# ---- "):
-            codes = sections.setdefault(line.strip("# -"), [])
-        elif line.startswith("[") and "." not in line:
-            codes.append(line.strip("[]"))
-    return sections
-
-
 @cache
 def _read_text() -> str:
     return files("tcpipe.tables").joinpath("catalogue.toml").read_text(encoding="utf-8")
@@ -182,9 +170,7 @@ def make_finding(
 ) -> Finding:
     """Return a finding that the catalogue knows, with the catalogue's severity and action unless they are given.
 
-    Raises
-    ------
-    ValueError : the catalogue lacks the code or a remedy, or the template needs a number or a name that is missing. This is a bug.
+    `ValueError` is a bug: the catalogue lacks the code or a remedy, or the template needs a number or a name that is missing.
     """
     entry = read_catalogue().get(code)
     if entry is None:

@@ -475,14 +475,7 @@ class Streams:
 
     def __post_init__(self) -> None:
         """Check every table against its role's schema."""
-        problems = [f"streams: unknown role {role}" for role in self.tables if role not in STREAMS]
-        for role, table in self.tables.items():
-            if role in STREAMS:
-                try:
-                    STREAMS[role].check(table)
-                except TableError as error:
-                    problems += error.problems
-        if problems:
+        if problems := [line for role, table in self.tables.items() for line in STREAMS[role].find_problems(table)]:
             raise TableError(*problems)
 
 

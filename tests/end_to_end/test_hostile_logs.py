@@ -197,12 +197,12 @@ HOSTILE = {
     "formats.ulg": (ulog(*(f"a{n}:uint64_t timestamp;b b;" for n in range(3000)), "b:" + "int8_t[9] " + "x;"), ""),
     "columns.ulg": (ulog(*(f"a{n}:" + "".join(f"int8_t x{i};" for i in range(5000)) for n in range(60))), "200000 columns"),
     "topics.ulg": (ulog(*MANY, data=b"".join(map(ulog_data, range(11_000)))), "more than 10000 topics"),
-    "pieces.ulg": (ulog("a:uint64_t timestamp;", data=(ulog_data(0) + b"D") * 300_000), "a record is damaged"),
+    "pieces.ulg": (ulog("a:uint64_t timestamp;", data=(ulog_data(0) + b"D") * 100_000), "a record is damaged"),
     "heads.ulg": (ulog("a:uint64_t timestamp;", data=b"D" * 10_000_000), "the file ends inside"),
-    "unknown.ulg": (ulog(*(["a:uint64_t timestamp;"] * 2), names=[f"b{n}" for n in range(100_000)]), "is damaged"),
+    "unknown.ulg": (ulog(*(["a:uint64_t timestamp;"] * 2), names=[f"b{n}" for n in range(30_000)]), "is damaged"),
     "heads.bin": (dataflash(b"\xa3\x95\x81" * 3_000_000), "no valid time"),
-    "pieces.bin": (dataflash((b"\xa3\x95\x81" + bytes(9) + b"\xa3\x95\x81" + bytes(9) + b"x") * 150_000), "a record is damaged"),
-    "formats.bin": (dataflash(b"".join(map(dataflash_format, range(30_000)))), ""),
+    "pieces.bin": (dataflash((b"\xa3\x95\x81" + bytes(9) + b"\xa3\x95\x81" + bytes(9) + b"x") * 50_000), "a record is damaged"),
+    "formats.bin": (dataflash(b"".join(map(dataflash_format, range(10_000)))), ""),
 }  # fmt: skip
 
 

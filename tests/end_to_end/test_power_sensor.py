@@ -21,7 +21,7 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import MASKED_TRACK, STREAMS
 
 NOISY = Faults.only("gnss_noise", "imu_noise", "wheel_noise", "visual_noise", "power_noise")
-CODES = {"current-offset", "current-gain-changes", "current-sign-lost", "power-smoothed"}
+CODES = {"current-offset", "current-gain-changes", "current-sign-lost", "power-smoothed", "motion-without-power"}
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +105,20 @@ def test_the_line_that_a_finding_suggests_removes_it_and_keeps_the_uncertainty(d
         assert not find_codes(after)
         std = [to_floats(of.table, "energy_std_joule") for of in (before, after)]
         assert std[1] == pytest.approx(std[0], rel=0.02)
+
+
+def test_motion_with_the_power_of_rest_is_named_with_its_span_and_a_line_that_drops_it(drive):
+    """Pushed for a seventh of the drive; a robot that rolls downhill without power is driven."""
+    pushed = lambda amp, share: np.where((share > 0.40) & (share < 0.55), amp[:40].mean(), amp)  # noqa: E731
+    found = find_codes(label(drive, pushed))
+    stamp_ns = to_integers(drive[0].tables["power"], "stamp_ns")
+    whole_s = (stamp_ns[-1] - stamp_ns[0]) * 1e-9
+    assert set(found) == {"motion-without-power"}
+    begin_s, end_s = found["motion-without-power"].span_s
+    assert 0.38 * whole_s < begin_s < 0.50 * whole_s < end_s < 0.58 * whole_s
+    (remedy,) = found["motion-without-power"].remedies
+    assert remedy.recipe["mask.windows"] == [{"run": "run", "start": np.floor(begin_s), "end": np.ceil(end_s)}]
+    assert not find_codes(label(drive, lambda amp, _: np.maximum(amp, amp[:40].mean())))
 
 
 def test_a_change_of_gain_has_its_time_and_ratio(drive):

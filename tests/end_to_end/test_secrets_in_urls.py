@@ -106,7 +106,7 @@ def test_a_signature_is_in_nothing_that_is_written_or_printed(site, tmp_path):
             run(command, url + SIGNED, codes=(0, 3))
             run(command, url + SIGNED, "--json", codes=(0, 3))
         run("export", url + SIGNED, "exported")
-        first = told(run("ingest", url + SIGNED, gone, wrong, "--jobs", "2", "--json", codes=(3,)))["results"]
+        first = told(run("ingest", url + SIGNED, gone, wrong, "--json", codes=(3,)))["results"]
         again = told(run("ingest", url + AGAIN, "--json"))["results"]
         run("status", url + AGAIN, codes=(0, 3))
         run("--debug", "ingest", url + SIGNED, "--force", codes=(0, 3))

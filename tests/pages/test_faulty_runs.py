@@ -41,3 +41,6 @@ def test_the_first_screen_names_the_fault_and_its_remedy(chromium, runs, name):
         for purpose, changes in remedies:
             assert purpose in said
             assert all(" ".join(change.split()) in said for change in changes)
+        tops = {name: tab.locator(name).first.bounding_box()["y"] for name in (".figures figure", "#chosen")}
+        assert tops[".figures figure"] < 300.0
+        assert tops["#chosen"] < 700.0  # the selected segment, below a short verdict or the map

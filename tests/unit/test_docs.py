@@ -10,6 +10,7 @@ from pathlib import Path
 
 import click
 import pytest
+from PIL import Image
 from synthetic_store import box, region_file, small_store
 
 from tcpipe.cli import cli
@@ -60,6 +61,19 @@ def test_the_pages_stay_short() -> None:
     assert sum(len(page.read_text(encoding="utf-8").split()) for page in (ROOT / "docs").rglob("*.md")) <= 65_000
     below_first_screen = (ROOT / "README.md").read_text(encoding="utf-8").split("\n## ", 1)[1]
     assert len(below_first_screen.split()) <= 600
+
+
+def test_the_tour_is_small_and_short() -> None:
+    path = ROOT / "docs/images/tour.webp"
+    assert path.stat().st_size <= 2_000_000
+    with Image.open(path) as tour:
+        durations_ms = []
+        for frame in range(tour.n_frames):
+            tour.seek(frame)
+            tour.load()
+            durations_ms.append(tour.info["duration"])
+        assert tour.info["loop"] == 0
+    assert 15_000 <= sum(durations_ms) <= 25_000
 
 
 def test_every_decision_stands_once_in_the_index() -> None:

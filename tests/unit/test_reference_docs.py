@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tcpipe.tables.findings import read_catalogue
+
 DOCS = Path(__file__).parents[2] / "docs"
 BEFORE = {"commands": ["ingest", "ingest --store"], "recipe": ["read.topics"]}
 NOW = (BEFORE | {"recipe": ["fuse.gate", "read.topics"]}, BEFORE | {"commands": ["ingest"]})
@@ -23,6 +25,7 @@ def test_committed_reference_is_what_the_code_says_and_a_lost_name_is_an_error()
     committed = {name: (DOCS / "reference" / name).read_text(encoding="utf-8") for name in pages}
     before, now = (json.loads(of.pop("stable.json")) for of in (committed, pages))
     assert not lost
+    assert [code for code in read_catalogue() if f"`[{code}]`" not in pages["findings.md"]] == []
     assert before == now, "an addition to what is stable: a minor version; run 'make docs' and commit the result"
     assert committed == pages, "run 'make docs' and commit the result"
     assert not none, "a new name is no error"

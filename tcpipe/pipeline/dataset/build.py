@@ -15,7 +15,7 @@ from pyarrow.csv import write_csv
 
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
-from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
+from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines, list_first
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
@@ -31,7 +31,6 @@ from tcpipe.formats.dataset_files import (
     RELIEF,
     REPORT,
     SAMPLES,
-    SHARDS,
     read_card,
     read_intact_card,
 )
@@ -313,8 +312,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     ours = {*card.checksums, CARD, CROISSANT, REPORT}
     others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
     if others:
-        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        raise UsageError(f"{place}: contains {others[0]}{more}, not of the dataset; move it or give another OUT")
+        raise UsageError(f"{place}: contains {list_first(others)}, not of the dataset; move it or give another OUT")
     files = ((place / name, entry.size_bytes) for name, entry in card.checksums.items())
     is_whole = all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
     return card, proved and is_whole
@@ -365,11 +363,9 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     card = make_dataset_card(figures, options, inputs, content, balance=balance, shards=shards)
     card = card if redaction is None else redact_card(card, redaction)
     shutil.rmtree(waiting)
-    write_text(directory / HUB_CARD, format_hub_card(card, samples_file=SAMPLES, picture=OVERVIEW))
+    write_text(directory / HUB_CARD, format_hub_card(card))
     files = compute_checksums(directory)
-    shards_pattern = f"{SHARDS}/*.parquet"
-    croissant = format_croissant(card, content.samples.schema, files, samples_file=SAMPLES, shards=shards_pattern)
-    write_text(directory / CROISSANT, croissant)
+    write_text(directory / CROISSANT, format_croissant(card, content.samples.schema, files))
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
     write_text(directory / REPORT, seal_page(render_dataset_report(directory, samples=figures)))

@@ -19,7 +19,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, MapError, StoreError
+from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_range
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
@@ -163,9 +163,9 @@ def _map_digest(name: str, path: Path) -> str:
     except StoreError as error:
         wrong = list(error.problems)
     if wrong:
-        what = f"{wrong[0]}{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}"
         raise MapError(
-            f"map {name}: changed since it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
+            f"map {name}: changed since it was written: {list_first(wrong)} ('tcpipe verify {path}' lists everything); "
+            "add the map again with --force"
         )
     return _digest_of(found)
 
@@ -331,10 +331,7 @@ class _SegmentPositions:
 def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, str]) -> UniqueRuns:
     """Return the runs, by id, without second recordings, and a finding for each of those; of two, the first by id stays.
 
-    Parameters
-    ----------
-    runs : runs to choose from, all of one recipe.
-    sha256_by_run : hash of each run's log.
+    ``runs`` are all of one recipe; ``sha256_by_run`` is the hash of each run's log.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
     start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T

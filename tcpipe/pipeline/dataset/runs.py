@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, list_first
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.index_files import KnownSensor, RunFacts
@@ -116,7 +116,7 @@ def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; expected one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
-            *(f"{_format_names(names)}: {format_robot(sensors)}" for names, sensors in groups),
+            *(f"{list_first(sorted(names), 3)}: {format_robot(sensors)}" for names, sensors in groups),
         )
 
 
@@ -153,11 +153,6 @@ def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[s
     """Return whether a run has the requested robot and tags, as far as they are known."""
     its_robot = robot is None or known.robot == robot
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
-
-
-def _format_names(names: Sequence[str]) -> str:
-    """Return the first three names, and how many more there are."""
-    return ", ".join(sorted(names)[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _suggest_logs(found: Ingestions, run_ids: Iterable[str]) -> str:

@@ -48,7 +48,7 @@ def test_names_are_text(built):
     card = read_card(built)
     hostile = '<script>a</script>](x)\n---\n"b: [c]\x1b[31m'
     card = replace(card, name=hostile, description=hostile, licence=hostile, creator=hostile + "}")
-    text = format_hub_card(card, samples_file="samples.parquet", picture="overview.png")
+    text = format_hub_card(card)
     head = head_of(text)
     assert (head["pretty_name"], head["license"], head["license_name"]) == (hostile, "other", hostile)
     body, citation = text.split("---\n", 2)[2].split("```bibtex")
@@ -62,6 +62,6 @@ def test_names_are_text(built):
 def test_a_known_licence_is_told_by_the_name_the_hub_has_for_it(built):
     card = read_card(built)
     for given, told in (("CC-BY-4.0", "cc-by-4.0"), ("", "unknown")):
-        text = format_hub_card(replace(card, licence=given), samples_file="samples.parquet", picture="p")
+        text = format_hub_card(replace(card, licence=given))
         assert head_of(text)["license"] == told
         assert "license_name" not in head_of(text)

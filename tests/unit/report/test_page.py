@@ -141,6 +141,12 @@ def test_only_columns_of_numbers_are_aligned_to_the_right():
     assert right == ["13", "3.8 %", "+12 ms", "0.81 (0.70 to 0.95)", "0.061 s, 3.4 %", 7]
 
 
+def test_one_of_a_kind_is_called_so():
+    numbers = [Number("1", "runs"), Number("2", "datasets"), Number("1", "test")]
+    text = "".join(Seen(render_page(title="t", lead="", numbers=numbers, sections=[])).text)
+    assert "1run2datasets1test" in text
+
+
 def test_parts_without_figures_are_folded_and_long_texts_from_the_second_line():
     plot = make_plot("small", alt="small", axes=("x", "y"))
     plot.figure.line([0.0, 1.0], [0.0, 1.0])
