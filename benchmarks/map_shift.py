@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from map_worlds import ArrayMap
 
-from tcpipe.terrain.registration import Registration, register_track, register_tracks, share_shift, thin_tracks
+from tcpipe.terrain.registration import Registration, register_tracks, share_shift, thin_tracks
 from tcpipe.terrain.target_grid import MapGrid
 
 Floats = NDArray[np.float64]
@@ -113,7 +113,7 @@ def measure_site(
     fits = [
         (found, run)
         for run in runs
-        if (found := register_track(source, *run[:2])) and not found.at_reach and found.shape_misfit_m < MOST_MISFIT_M
+        if (found := register_tracks(source, [run[:2]])) and not found.at_reach and found.shape_misfit_m < MOST_MISFIT_M
     ]
     rows: dict[str, list[tuple[Floats, Floats, int]]] = {"alone": [], "mean": [], "shared": [], "differ": []}
     if len(fits) < 2:

@@ -119,10 +119,10 @@ def shorten_value(value: object) -> str:
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
 
 
-def shorten_problems(problems: list[str]) -> list[str]:
+def shorten_problems(problems: list[str], shown: int = _SHOWN) -> list[str]:
     """Return the first few problems, and how many more there are."""
-    more = len(problems) - _SHOWN
-    return problems if more <= 0 else [*problems[:_SHOWN], f"… and {more} more"]
+    more = len(problems) - shown
+    return problems if more <= 0 else [*problems[:shown], f"… and {more} more"]
 
 
 def _parse_document(path: Path) -> Mapping[str, Json]:

@@ -264,8 +264,9 @@ class Trainer:
     def write_state(self, path: Path, parts: Mapping[str, Any]) -> None:
         """Write weights, the optimiser's memory and other parts of a training, whole or not at all."""
         state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), **parts}
+        torch.save(state, memory := io.BytesIO())  # of a full disk it would say where it stands in the file
         with write_atomic_file(path) as temporary:
-            torch.save(state, temporary)
+            temporary.write_bytes(memory.getbuffer())
 
     def read_state(self, path: Path) -> dict[str, Any]:
         """Go on from what `write_state` wrote, and return the other parts; `ModelError` where it is damaged."""

@@ -97,7 +97,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
             options.ortho_bands,
         )
         if before and not options.force:
-            return _check_unchanged(opened, name, inputs)
+            return _find_unchanged(opened, name, inputs)
         opened.check_writable()
         try:
             with opened.new_map(name, after=before) as path:
@@ -118,7 +118,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
         except StoreError:
             if before or opened.map_number(name) == before:
                 raise
-            return _check_unchanged(opened, name, inputs)  # another process was faster, or its own answer was lost
+            return _find_unchanged(opened, name, inputs)  # another process was faster, or its own answer was lost
         return _make_added(opened, name, "done")
 
 
@@ -141,12 +141,6 @@ def _refuse_layers(
         problems.append("--ortho-bands rgb: no orthophoto is given; add --ortho")
     if problems:
         raise UsageError(*problems)
-
-
-def _check_unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
-    """Return the map that is there; `MapError` if it is made from something else."""
-    _refuse_other(store, name, inputs)
-    return _make_added(store, name, "unchanged")
 
 
 def _make_added(store: Store, name: str, status: Literal["done", "unchanged"]) -> AddedMap:
@@ -208,8 +202,8 @@ def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[st
     return checksums
 
 
-def _refuse_other(store: Store, name: str, inputs: MapInputs) -> None:
-    """Raise `MapError` that says what differs, unless the map that is there is made from the same."""
+def _find_unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
+    """Return the map that is there; `MapError` that says what differs, unless it is made from the same."""
     try:
         found = open_map(*store.map_files(name))
     except (MapError, StoreError) as error:
@@ -227,6 +221,7 @@ def _refuse_other(store: Store, name: str, inputs: MapInputs) -> None:
             f"map {name}: is in the store already, made from something else: {'; '.join(changes)}; "
             "replace it with --force, or choose another name"
         )
+    return _make_added(store, name, "unchanged")
 
 
 def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:

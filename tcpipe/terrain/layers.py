@@ -110,12 +110,8 @@ class Layer:
             ids = np.arange(1, self.classes.count + 1)
             return np.stack([np.mean(pixels == class_id, axis=(1, 2)) for class_id in ids], axis=1)
         values = pixels.reshape(len(pixels), max(len(self.bands), 1), -1).astype(np.float64)
-        has_data = self.has_stored_data(values)
+        has_data = np.isfinite(values) if np.isnan(self.nodata) else values != self.nodata
         return np.asarray(np.where(has_data, values, 0.0).sum(axis=2) / np.maximum(has_data.sum(axis=2), 1))
-
-    def has_stored_data(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels of a patch have data."""
-        return np.isfinite(values) if np.isnan(self.nodata) else np.asarray(values != self.nodata)
 
     @property
     def signature(self) -> str:
@@ -233,8 +229,7 @@ def make_paper_layers(names: Iterable[str], classes: ClassTable) -> dict[str, La
 
 def sort_layers(layers: Mapping[str, Layer]) -> dict[str, Layer]:
     """Return layers in the order of channels: the paper's first, then the others as they come."""
-    rest = [name for name in layers if name not in LAYERS]
-    return {name: layers[name] for name in (*(name for name in LAYERS if name in layers), *rest)}
+    return {name: layers[name] for name in LAYERS if name in layers} | dict(layers)
 
 
 def join_layers(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:

@@ -165,11 +165,6 @@ class Registration:
         return self.shifted_misfit_m if self.significant else self.misfit_m
 
 
-def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) -> Registration | None:
-    """Find the horizontal shift at which the map's ground fits the track's heights best, as `register_tracks`."""
-    return register_tracks(source, [(xy_m, height_m)])
-
-
 def register_tracks(source: MapReader, tracks: Sequence[tuple[FloatArray, FloatArray]]) -> Registration | None:
     """Find the one horizontal shift at which the map's ground fits the heights of tracks best.
 
@@ -179,8 +174,6 @@ def register_tracks(source: MapReader, tracks: Sequence[tuple[FloatArray, FloatA
     tracks : of each track the positions in the map's CRS, in the order driven, shape (N, 2) [m], of which what is not finite or not on the
         map is passed over, and their heights above any surface, shape (N,) [m].
 
-    Returns
-    -------
     None where fewer than `_FEWEST_POINTS` points, half a metre apart, lie well inside the map and on its ground.
     """
     level = choose_level(source, _STEP_M)
@@ -292,8 +285,8 @@ def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
     squares, products = np.einsum("nij,nij->ij", ground, ground), np.einsum("nij,n->ij", ground, height)
     explained = np.maximum(products, 0.0) ** 2 / (squares * (height @ height) + _RIDGE)
     i, j = np.unravel_index(int(explained.argmax()), explained.shape)
-    along = ground[:, i, j]
-    parts = [(along[block] @ along[block], along[block] @ height[block]) for block in _cut_stretches(len(height))]
+    along, blocks = ground[:, i, j], np.array_split(np.arange(len(height)), _BLOCKS)
+    parts = [(along[block] @ along[block], along[block] @ height[block]) for block in blocks]
     without = [(products[i, j] - product) / (squares[i, j] - square + _RIDGE) for square, product in parts]
     std = float(np.sqrt(_estimate_covariance(np.array(without)[:, None])[0, 0]))
     return HeightScale(float(products[i, j] / (squares[i, j] + _RIDGE)), std, float(explained[i, j]))
@@ -435,10 +428,6 @@ def _compute_gain(unshifted: FloatArray, shifted: FloatArray, blocks: Sequence[R
     sums = squares.sum(axis=1, keepdims=True) - parts
     std = np.sqrt(_estimate_covariance(np.log(sums[0] / sums[1])[:, None])[0, 0])
     return float(gain), float(gain / max(std, 1e-12))
-
-
-def _cut_stretches(count: int) -> list[Rows]:
-    return np.array_split(np.arange(count), _BLOCKS)
 
 
 def _estimate_covariance(without: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 A raster as coarse as the grid or coarser is interpolated bilinearly, a finer one averaged (classes: nearest or majority). A bilinear tap
 or a part of a mean without data leaves the pixel without data. A tap of weight zero does not count, so a raster on the grid passes
-unchanged. The kernels take a *lattice* of positions: source pixel coordinates (centres are integers) of every ``step``-th pixel of the
+unchanged. The kernels take a *lattice* of positions: source pixel coordinates (centres are integers) of every 16th pixel of the
 grid, beginning one step outside; they interpolate positions between.
 
 A pixel of a level spans ``factor`` x ``factor`` map pixels: their mean, or their commonest class (ties go to the lower id; no data votes).
@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.terrain.layers import Layer, Pixels
-from tcpipe.terrain.target_grid import MapGrid
+from tcpipe.terrain.target_grid import LATTICE_STEP_PX, MapGrid
 
 SNAP_PX = 1e-4
 """A position nearer than this to a source pixel's centre is at the centre [source px]."""
 
 
 @compile_kernel
-def _position(lattice: NDArray[np.float64], step: int, row: float, col: float) -> tuple[float, float]:
-    i, j = row / step + 1.0, col / step + 1.0
+def _position(lattice: NDArray[np.float64], row: float, col: float) -> tuple[float, float]:
+    i, j = row / LATTICE_STEP_PX + 1.0, col / LATTICE_STEP_PX + 1.0
     a, b = min(int(i), lattice.shape[0] - 2), min(int(j), lattice.shape[1] - 2)
     v, u = i - a, j - b
     x = (1 - v) * ((1 - u) * lattice[a, b, 0] + u * lattice[a, b + 1, 0]) + v * (
@@ -40,14 +40,12 @@ def _position(lattice: NDArray[np.float64], step: int, row: float, col: float) -
 
 
 @compile_kernel
-def resample_bilinear(
-    source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, out: NDArray[np.float64]
-) -> None:
+def resample_bilinear(source: NDArray[np.float64], lattice: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Interpolate ``source`` (NaN: no data), shape (H, W), at every pixel of ``out``; NaN where a tap has no data or lies outside."""
     rows, cols = source.shape
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            x, y = _position(lattice, step, i, j)
+            x, y = _position(lattice, i, j)
             near_x, near_y = np.floor(x + 0.5), np.floor(y + 0.5)
             x = near_x if abs(x - near_x) < SNAP_PX else x
             y = near_y if abs(y - near_y) < SNAP_PX else y
@@ -65,9 +63,7 @@ def resample_bilinear(
 
 
 @compile_kernel
-def mean(
-    source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.float64]
-) -> None:
+def mean(source: NDArray[np.float64], lattice: NDArray[np.float64], parts: int, out: NDArray[np.float64]) -> None:
     """Average ``source`` (NaN: no data) over every pixel of ``out``, taken at parts x parts points; NaN where any has no data."""
     rows, cols = source.shape
     for i in range(out.shape[0]):
@@ -75,7 +71,7 @@ def mean(
             total = 0.0
             for p in range(parts):
                 for q in range(parts):
-                    x, y = _position(lattice, step, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
+                    x, y = _position(lattice, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
                     a, b = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
                     total += source[a, b] if 0 <= a < rows and 0 <= b < cols else np.nan
             out[i, j] = total / (parts * parts)
@@ -91,7 +87,7 @@ def _vote(votes: NDArray[np.int64], found: int, best: int) -> int:
 
 @compile_kernel
 def resample_majority(
-    source: NDArray[np.uint8], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.uint8]
+    source: NDArray[np.uint8], lattice: NDArray[np.float64], parts: int, out: NDArray[np.uint8]
 ) -> None:
     """Take the commonest class over every pixel of ``out`` at parts x parts points (1: nearest); 0 is no data and votes; ties go low."""
     rows, cols = source.shape
@@ -101,7 +97,7 @@ def resample_majority(
             best = 0
             for p in range(parts):
                 for q in range(parts):
-                    x, y = _position(lattice, step, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
+                    x, y = _position(lattice, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
                     a, b = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
                     found = int(source[a, b]) if 0 <= a < rows and 0 <= b < cols else 0
                     best = _vote(votes, found, best)
@@ -171,7 +167,7 @@ def iterate_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iter
     means = np.where(values == 0, np.float32(np.nan), values.astype(np.float32)) if grey else values
     for factor in factors[1:]:
         means = _halve(means)
-        yield factor, _to_grey(means) if grey else means
+        yield factor, np.where(np.isfinite(means), np.rint(means), 0.0).astype(np.uint8) if grey else means
 
 
 def _halve(values: Pixels) -> Pixels:
@@ -179,7 +175,3 @@ def _halve(values: Pixels) -> Pixels:
     even = values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2]
     rows = even[0::2] + even[1::2]
     return np.asarray((rows[:, 0::2] + rows[:, 1::2]) * rows.dtype.type(0.25))
-
-
-def _to_grey(means: Pixels) -> NDArray[np.uint8]:
-    return np.where(np.isfinite(means), np.rint(means), 0.0).astype(np.uint8)

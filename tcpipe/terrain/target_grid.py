@@ -80,13 +80,13 @@ class Georeference:
         return self.crs == crs and upright and math.isclose(abs(a), abs(e), rel_tol=1e-6)
 
 
-def find_projection(footing: Georeference, crs: CRS) -> Projection | None:
+def find_projection(raster: Georeference, crs: CRS) -> Projection | None:
     """Return the operation from a raster's CRS to the map's; None where they are the same."""
-    if footing.crs == crs:
+    if raster.crs == crs:
         return None
-    outline = footing.outline()
+    outline = raster.outline()
     bounds = (*outline.min(axis=0).tolist(), *outline.max(axis=0).tolist())
-    return Projection(footing.crs, crs, compute_area(footing.crs, bounds))
+    return Projection(raster.crs, crs, compute_area(raster.crs, bounds))
 
 
 def _project(raster: Georeference, points: FloatArray, crs: CRS) -> FloatArray:

@@ -109,7 +109,7 @@ def group_by_tile(px: NDArray[np.float64], source: MapReader | BandReader) -> It
     cells = np.clip(np.floor(px), 0, limit).astype(np.int64)
     tile_j, tile_i = (cells // source.tile_px).T
     fine = compute_morton(cells[:, 0] % source.tile_px, cells[:, 1] % source.tile_px)
-    order = np.lexsort((np.arange(len(px)), fine, tile_j, tile_i, tile_j // _STRIP_TILES))
+    order = np.lexsort((fine, tile_j, tile_i, tile_j // _STRIP_TILES))
     changed = (np.diff(tile_i[order]) != 0) | (np.diff(tile_j[order]) != 0)
     yield from (group for group in np.split(order, np.flatnonzero(changed) + 1) if group.size)
 

@@ -15,6 +15,7 @@ from pyproj import CRS
 
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
+from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
 from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
@@ -75,10 +76,6 @@ class MoreLayers:
     ortho_bands: OrthoBands = "grey"
     """rgb: the orthophoto's colours, too."""
 
-    def uses(self) -> dict[str, Use]:
-        """Return what is taken of each layer's rasters."""
-        return {name: "classes" if name in self.categorical else "numbers" for name in self.files}
-
 
 def build_map(
     out_path: Path,
@@ -119,9 +116,9 @@ def build_map(
         rasters = _open_all(open_file, paths, more, wanted)
         scheme, origin = _choose_scheme(classes, agreed, rasters.get("terrain"))
         schemes = {"terrain": scheme} | _read_own_schemes(more, rasters)
-        ground = rasters["height"].place
+        ground = rasters["height"].georeference
         map_crs = choose_crs(ground, wanted)
-        others = [rasters[role].place for role in ("ortho", "terrain") if role in rasters]
+        others = [rasters[role].georeference for role in ("ortho", "terrain") if role in rasters]
         grid = choose_grid(ground, others, map_crs, pixel_size_m)
         made = {role: _make_sources(raster, schemes, grid, map_crs, name) for role, raster in rasters.items()}
         sources: dict[str, Sequence[LayerSource]] = {role: bands for role, bands in made.items() if len(bands) == 1}
@@ -149,12 +146,12 @@ def _make_sources(
     """Return a raster as a layer, or each of its bands, on a grid of their own; log how large that becomes."""
     layer, projection, count = (
         _make_layer(raster, schemes),
-        find_projection(raster.place, crs),
+        find_projection(raster.georeference, crs),
         len(raster.tiles[0].bands),
     )
     if raster.role in PAPER_LAYERS or count == 1:
         return (RasterLayer(layer, raster, grid, projection, schemes.get(raster.role)),)
-    grid = choose_layer_grid(grid, raster.place, crs)
+    grid = choose_layer_grid(grid, raster.georeference, crs)
     dtype = np.dtype("float16" if all(tile.is_half for tile in raster.tiles) else "float32")
     values = count * grid.rows * grid.cols
     message = "map %s: layer %s: %d bands, %d x %d px of %g m, %s: up to %.1f MB"
@@ -162,7 +159,7 @@ def _make_sources(
     logger.info(message, name, layer.name, *sizes)
     if values > MAX_PIXELS:
         raise MapError(
-            f"{raster.place.name}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all"
+            f"{raster.georeference.name}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all"
         )
     layer = make_banded_layer(layer.name, layer.unit, [(0.0, 1.0)] * count, dtype.name, grid.pixel_size_m)
     return [RasterLayer(layer, raster.select_band(band), grid, projection, None) for band in range(count)]
@@ -200,7 +197,7 @@ def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[s
         for name, table in more.categorical.items()
     }
     if problems := [
-        f"{rasters[name].place.name}: does not define the meaning of its values (no attribute table, no category names); "
+        f"{rasters[name].georeference.name}: does not define the meaning of its values (no attribute table, no category names); "
         f"give a table: --categorical {name}=classes.csv"
         for name, scheme in schemes.items()
         if scheme is None
@@ -212,7 +209,13 @@ def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[s
 def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Raster | None) -> tuple[ClassScheme, str]:
     """Return the classes and where they come from: ``file``, ``names`` of the raster's values, ``store`` or ``default``."""
     if classes is not None:
-        return _read_scheme(classes, agreed), "file"
+        scheme = read_class_scheme(classes)
+        if different := () if agreed is None else scheme.table.differences(agreed.table):
+            raise MapError(
+                f"{classes}: the class table is not the one of the store's other maps; take theirs, or keep this map in another store",
+                *(f"{classes}: {clause}" for clause in different),
+            )
+        return scheme, "file"
     scheme, origin = (PAPER_SCHEME, "default") if agreed is None else (agreed, "store")
     if terrain is None or not terrain.names:
         return scheme, origin
@@ -221,21 +224,10 @@ def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Ra
         theirs = ", ".join(dict.fromkeys(terrain.names.values()))
         ours = ", ".join(entry.name for entry in scheme.table.classes)
         raise MapError(
-            f"{terrain.place.name}: none of its class names ({theirs}) is in the class table ({ours}); "
+            f"{terrain.georeference.name}: none of its class names ({theirs}) is in the class table ({ours}); "
             "define them with --classes"
         )
     return named, "names"
-
-
-def _read_scheme(classes: Path, agreed: ClassScheme | None) -> ClassScheme:
-    scheme = read_class_scheme(classes)
-    different = () if agreed is None else scheme.table.differences(agreed.table)
-    if different:
-        raise MapError(
-            f"{classes}: the class table is not the one of the store's other maps; take theirs, or keep this map in another store",
-            *(f"{classes}: {clause}" for clause in different),
-        )
-    return scheme
 
 
 def _open_all(
@@ -243,7 +235,7 @@ def _open_all(
 ) -> dict[str, Raster]:
     rasters: dict[str, Raster] = {}
     problems: list[str] = []
-    uses = {**USES, **more.uses()}
+    uses = USES | {name: "classes" if name in more.categorical else "numbers" for name in more.files}
     if more.ortho_bands == "rgb":
         paths = {**paths, **dict.fromkeys(COLOURS, paths["ortho"])}
         uses |= dict(zip(COLOURS, _RGB, strict=True))
@@ -356,9 +348,7 @@ def read_class_scheme(path: Path) -> ClassScheme:
     if not classes and not problems:
         problems.append(f"{path}: the class table has no classes (expected columns {','.join(_COLUMNS)})")
     if problems:
-        raise MapError(
-            *problems[:_SHOWN], *([f"{path}: … and {len(problems) - _SHOWN} more"] if len(problems) > _SHOWN else [])
-        )
+        raise MapError(*shorten_problems(problems, _SHOWN))
     return ClassScheme(ClassTable(tuple(classes[key] for key in sorted(classes))), dict(sorted(id_by_value.items())))
 
 

@@ -485,12 +485,31 @@ def write_geotiff(
     profile |= {"compress": "deflate", "zlevel": 1, "predictor": 3 if dtype == "float32" else 2}
     if bands == 4:
         profile |= {"photometric": "RGB", "alpha": "YES"}
-    with write_atomic_file(path) as temporary, rasterio.open(temporary, "w", **profile) as dataset:
-        if palette is not None:  # before the first pixel: GDAL cannot change what is on disk already
-            dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
-        for first in range(0, grid.rows, _STRIP_ROWS):
-            last = min(first + _STRIP_ROWS, grid.rows)
-            dataset.write(strip(first, last), window=Window(0, first, grid.cols, last - first))
+    with write_atomic_file(path) as temporary:
+        with rasterio.open(temporary, "w", **profile) as dataset:
+            if palette is not None:  # before the first pixel: GDAL cannot change what is on disk already
+                dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
+            for first in range(0, grid.rows, _STRIP_ROWS):
+                last = min(first + _STRIP_ROWS, grid.rows)
+                dataset.write(strip(first, last), window=Window(0, first, grid.cols, last - first))
+        with _convert_late_errors():
+            _read_again(temporary)
+
+
+@contextmanager
+def _convert_late_errors() -> Iterator[None]:
+    """Turn what GDAL says of a file that it wrote into an `OSError` of writing; its errors have no common base."""
+    try:
+        yield
+    except Exception as error:
+        raise OSError(f"No space left on device, as far as GDAL says: {describe_error(error)}") from error
+
+
+def _read_again(path: Path) -> None:
+    """Read every pixel of a file: where the disk was full GDAL closes it without a word, and the end of it is missing."""
+    with rasterio.open(path) as dataset:
+        for first in range(0, dataset.height, _STRIP_ROWS):
+            dataset.read(window=Window(0, first, dataset.width, min(_STRIP_ROWS, dataset.height - first)))
 
 
 def write_cog(
@@ -509,11 +528,13 @@ def write_cog(
         plain = temporary.with_name("plain.tif")
         nodata = float("nan") if np.dtype(dtype).kind == "f" else None
         write_geotiff(plain, strip, grid, dtype=dtype, bands=len(bands), nodata=nodata)
-        with rasterio.open(plain, "r+") as dataset:
-            dataset.descriptions = [name for name, _ in bands]
-            dataset.units = [unit for _, unit in bands]
-        options = {"compress": "deflate", "predictor": "yes", "blocksize": 256, "overview_resampling": "nearest"}
-        rasterio.shutil.copy(plain, temporary, driver="COG", bigtiff="IF_SAFER", **options)
+        with _convert_late_errors():
+            with rasterio.open(plain, "r+") as dataset:
+                dataset.descriptions = [name for name, _ in bands]
+                dataset.units = [unit for _, unit in bands]
+            options = {"compress": "deflate", "predictor": "yes", "blocksize": 256, "overview_resampling": "nearest"}
+            rasterio.shutil.copy(plain, temporary, driver="COG", bigtiff="IF_SAFER", **options)
+            _read_again(temporary)
 
 
 def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError
+from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.maps.geotiff import OpenFile, Tile, Use, read_tile, read_window
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
@@ -32,8 +33,6 @@ MAX_FILES = 100_000
 _OFF_GRID_PX = 0.05
 """Tiles whose corners are farther from the pixels of the rest do not lie on one grid [px]."""
 
-_SHOWN = 4
-
 
 @dataclass(frozen=True, slots=True)
 class Raster:
@@ -41,7 +40,7 @@ class Raster:
 
     role: str
     unit: str
-    place: Georeference
+    georeference: Georeference
     """Where it lies; its name, for messages, is the path, and how many more there are."""
     findings: tuple[Finding, ...]
     """One a code, of the first tile that has it."""
@@ -58,7 +57,7 @@ class Raster:
     @property
     def name(self) -> str:
         """What it is called without its folder."""
-        return _label([tile.path for tile in self.tiles], name_path=lambda path: path.name)
+        return label_files([Path(tile.path.name) for tile in self.tiles])
 
     def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.read_window` does of one tile."""
@@ -83,7 +82,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
 
     `MapError`: one of them cannot play the role, or they are not of one kind and one grid, or have no CRS.
     """
-    label = _label(paths)
+    label = label_files(paths)
     if len(paths) > MAX_FILES:
         raise MapError(
             f"{label}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: gdalwarp part*.tif joined.tif"
@@ -96,7 +95,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
         except MapError as error:
             problems += error.problems
     if problems:
-        raise MapError(*_shorten_list(problems))
+        raise MapError(*shorten_problems(problems))
     known = {text: parse_crs(text, where=label) for text in dict.fromkeys(tile.crs for tile in tiles) if text}
     _refuse_odd(tiles, "CRS", _find_crs_keys(tiles), "gdalwarp -t_srs EPSG:n in.tif out.tif")
     _refuse_odd(tiles, "type and bands", [tile.kind for tile in tiles], "gdal_translate -ot T -b n in.tif out.tif")
@@ -108,7 +107,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
     return Raster(
         role=role,
         unit=tiles[0].unit,
-        place=Georeference(found, affine, int(corners[:, 1].max()), int(corners[:, 3].max()), label),
+        georeference=Georeference(found, affine, int(corners[:, 1].max()), int(corners[:, 3].max()), label),
         findings=tuple(findings.values()),
         names=_join_value_names(tiles),
         tiles=tuple(tiles),
@@ -117,12 +116,9 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
     )
 
 
-def _label(paths: Sequence[Path], name_path: Callable[[Path], str] = str) -> str:
-    return name_path(paths[0]) if len(paths) == 1 else f"{name_path(paths[0])} … {paths[-1].name} ({len(paths)} files)"
-
-
-def _shorten_list(lines: list[str]) -> list[str]:
-    return [*lines[:_SHOWN], f"… and {len(lines) - _SHOWN} more"] if len(lines) > _SHOWN + 1 else lines
+def label_files(paths: Sequence[Path]) -> str:
+    """Return what files are called in a message: the first, the last and how many there are."""
+    return str(paths[0]) if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
 
 
 def _find_crs_keys(tiles: Sequence[Tile]) -> list[str]:
@@ -139,7 +135,7 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
     usual = Counter(keys).most_common(1)[0][0]
     odd = [(tile, key) for tile, key in zip(tiles, keys, strict=True) if key != usual]
     if odd:
-        names = ", ".join(_shorten_list([str(tile.path) for tile, _ in odd]))
+        names = ", ".join(shorten_problems([str(tile.path) for tile, _ in odd]))
         got, wanted = (CRS(key).name if "[" in key else key or "none" for key in (odd[0][1], usual))
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, expected {wanted}): {names}; "
@@ -160,7 +156,7 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
         got, wanted = (f"{abs(tile.affine[0]):.6g} x {abs(tile.affine[4]):.6g}" for tile in (odd[0], tiles[base]))
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files do not lie on the pixels of the rest "
-            f"({got}, the rest {wanted}): {', '.join(_shorten_list([str(tile.path) for tile in odd]))}; "
+            f"({got}, the rest {wanted}): {', '.join(shorten_problems([str(tile.path) for tile in odd]))}; "
             "put all on one grid: gdalwarp -r bilinear *.tif joined.tif"
         )
     a, b, x, d, e, y = tiles[base].affine
@@ -259,7 +255,7 @@ class RasterLayer:
     @property
     def label(self) -> str:
         """The raster's files, for messages."""
-        return self.raster.place.name
+        return self.raster.georeference.name
 
     @property
     def name(self) -> str:
@@ -306,7 +302,7 @@ class RasterLayer:
         return (*self.raster.findings, *rough, finding)
 
     def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
-        return compute_source_lattice(self.grid, self.raster.place, self.projection, row0, rows, col0, cols)
+        return compute_source_lattice(self.grid, self.raster.georeference, self.projection, row0, rows, col0, cols)
 
     def _fill(self, part: Pixels, row0: int, col0: int) -> None:
         """Resample one block of the grid from the raster."""
@@ -317,7 +313,8 @@ class RasterLayer:
             return
         low = np.maximum(np.floor(flat.min(axis=0)).astype(np.int64) - 1, 0)
         high = np.minimum(
-            np.ceil(flat.max(axis=0)).astype(np.int64) + 2, (self.raster.place.cols, self.raster.place.rows)
+            np.ceil(flat.max(axis=0)).astype(np.int64) + 2,
+            (self.raster.georeference.cols, self.raster.georeference.rows),
         )
         if (low >= high).any():
             return
@@ -330,13 +327,13 @@ class RasterLayer:
         if self.scheme is not None:
             ids = self.scheme.ids(values, valid)
             self.tally.note_unnamed(values[valid & (ids == 0)])
-            resample_majority(ids, lattice, LATTICE_STEP_PX, parts, part)
+            resample_majority(ids, lattice, parts, part)
             return
         source = np.where(valid, values, np.nan).astype(np.float64, copy=False)
         if parts > 1:
-            mean(source, lattice, LATTICE_STEP_PX, parts, part)
+            mean(source, lattice, parts, part)
         else:
-            resample_bilinear(source, lattice, LATTICE_STEP_PX, part)
+            resample_bilinear(source, lattice, part)
 
 
 def _compute_source_px_per_px(lattice: NDArray[np.float64]) -> float:

@@ -168,13 +168,9 @@ def read_value_names(vrt: str, band: int) -> dict[int, str]:
     if described is None:
         return {}
     table = described.find("GDALRasterAttributeTable")
+    categories = [(entry.text or "").strip() for entry in described.findall("./CategoryNames/Category")]
     names = {} if table is None else _read_table_names(table)
-    return names or _read_category_names(described)
-
-
-def _read_category_names(described: Element) -> dict[int, str]:
-    names = [(entry.text or "").strip() for entry in described.findall("./CategoryNames/Category")]
-    return {value: name for value, name in enumerate(names) if name}
+    return names or {value: name for value, name in enumerate(categories) if name}
 
 
 def _read_table_names(table: Element) -> dict[int, str]:
@@ -261,22 +257,16 @@ def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass
     """Return the layers that `describe_layer` wrote into ``path``, by name; ``classes`` are those of terrain, if any."""
     layers: dict[str, Layer] = {}
     for name, description in found.items():
-        layer_description = parse_typed(description, _LayerDescription, path)
+        about = parse_typed(description, _LayerDescription, path)
         if name in PAPER_LAYERS:
             known = make_paper_layers([name], ClassTable(tuple(classes))) if classes else PAPER_LAYERS
-            layers[name] = replace(known[name], long_name=layer_description.long_name or known[name].long_name)
-        elif layer_description.kind == "categorical":
-            layers[name] = make_categorical_layer(name, ClassTable(layer_description.classes))
-        elif layer_description.bands:
-            layers[name] = make_banded_layer(
-                name,
-                layer_description.units,
-                layer_description.bands,
-                layer_description.dtype,
-                layer_description.pixel_size_m,
-                layer_description.own_px,
-            )
+            layers[name] = replace(known[name], long_name=about.long_name or known[name].long_name)
+        elif about.kind == "categorical":
+            layers[name] = make_categorical_layer(name, ClassTable(about.classes))
+        elif about.bands:
+            own = about.bands, about.dtype, about.pixel_size_m, about.own_px
+            layers[name] = make_banded_layer(name, about.units, *own)
         else:
-            low, high = layer_description.actual_range
-            layers[name] = make_continuous_layer(name, unit=layer_description.units, low=low, high=high)
+            low, high = about.actual_range
+            layers[name] = make_continuous_layer(name, unit=about.units, low=low, high=high)
     return layers

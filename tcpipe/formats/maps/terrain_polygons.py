@@ -20,7 +20,7 @@ from pyproj import CRS
 from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_problems, shorten_value
 from tcpipe.formats.maps.geotiff import burn_polygons
-from tcpipe.formats.maps.layer_building import Tally
+from tcpipe.formats.maps.layer_building import Tally, label_files
 from tcpipe.splits.regions import project_near
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import ClassScheme, name_key
@@ -97,8 +97,7 @@ def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: M
     once.
     """
     features, problems = _read_all(paths)
-    label = f"{paths[0]}" if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
-    name = label.removeprefix(f"{paths[0].parent}/")
+    label, name = label_files(paths), label_files([Path(path.name) for path in paths])
     ids = [_read_class_id(feature, scheme, problems) for feature in features]
     if not features:
         problems.append(f"{label}: no polygon in it; draw the terrain as polygons")

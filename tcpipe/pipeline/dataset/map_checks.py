@@ -34,7 +34,6 @@ from tcpipe.terrain.registration import (
     REACH_M,
     Registration,
     SharedShift,
-    register_track,
     register_tracks,
     share_shift,
     thin_tracks,
@@ -165,7 +164,7 @@ def _register(run: RunDirectory, source: MapFile, projection: Projection, config
     xy_m, height_m = projection.forward(lonlat), height_m[certain]
     is_on = source.grid.contains(xy_m)
     track_std_m = float(np.median(std_m[certain][is_on])) if is_on.any() else float("nan")
-    found = register_track(source, xy_m, height_m)
+    found = register_tracks(source, [(xy_m, height_m)])
     (thin,) = thin_tracks([(xy_m[is_on], height_m[is_on])])
     return _Track(run.run_id, thin, found, expected_m, track_std_m)
 

@@ -1,9 +1,11 @@
 """The network alone: its first weights, its widths, and that a narrow one trains on odd batches and several threads."""
 
+import resource
+
 import numpy as np
 import pytest
 
-from tcpipe.errors import ModelError
+from tcpipe.errors import ModelError, StoreError
 from tcpipe.learning.fitting import compute_loss_factors, mean_loss
 from tcpipe.learning.network_model import check_trainable
 
@@ -53,6 +55,23 @@ def test_odd_batches_of_a_narrow_network_on_two_threads():
     ]
     torch.set_num_threads(threads)
     assert np.isfinite(losses).all()
+
+
+@pytest.mark.parametrize("size", [1, 1_000, 100_000])
+def test_a_state_for_which_there_is_no_room_is_one_error_that_names_it(tmp_path, size):
+    from tcpipe.learning.network import Trainer, make_resnet18
+
+    trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), np.ones(1, np.float32))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with pytest.raises(StoreError, match=r"checkpoint: cannot be written \(File too large\)"):
+            trainer.write_state(tmp_path / "checkpoint", {"epoch": 1})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+    trainer.write_state(tmp_path / "checkpoint", {"epoch": 1})
+    assert trainer.read_state(tmp_path / "checkpoint") == {"epoch": 1}
 
 
 @pytest.mark.parametrize("width", [4, 8, 24])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from map_worlds import ArrayMap, LeveledMap
 
-from tcpipe.terrain.registration import register_track
+from tcpipe.terrain.registration import register_tracks
 from tcpipe.terrain.target_grid import MapGrid
 
 SIDE, PITCH_M = 1000, 0.1
@@ -22,6 +22,10 @@ def site(ground=rolling, noise_m=0.01, factors=(1,), seed=0):
     return LeveledMap(
         grid, {"height": height.astype(np.float32)}, tile_px=256, height_reference_m=600.0, factors=factors
     )
+
+
+def register_track(source, xy_m, height_m):
+    return register_tracks(source, [(xy_m, height_m)])
 
 
 def drive(count=6000, seed=1):

@@ -1,11 +1,14 @@
 """GeoTIFFs that are written: what other readers find in them."""
 
 import logging
+import resource
 
 import numpy as np
+import pytest
 import rasterio
 
-from tcpipe.formats.maps.geotiff import write_geotiff
+from tcpipe.errors import StoreError
+from tcpipe.formats.maps.geotiff import write_cog, write_geotiff
 from tcpipe.terrain.target_grid import MapGrid
 
 
@@ -28,3 +31,28 @@ def test_a_palette_is_written_before_the_pixels_and_gdal_has_nothing_to_say(tmp_
         assert {value: dataset.colormap(1)[value][:3] for value in palette} == palette
         assert dataset.xy(0, 0) == (500_000.025, 5_199_999.975)
         np.testing.assert_array_equal(dataset.read(), pixels)
+
+
+@pytest.mark.parametrize("lacking", [1, 300, 20_000, 200_000, 1_000_000])
+@pytest.mark.parametrize("kind", ["plain", "cog"])
+def test_a_disk_that_is_full_is_one_error_that_names_the_output_and_nothing_is_left(tmp_path, kind, lacking):
+    """GDAL closes a file of which the end is missing without a word."""
+    side = 600
+    pixels = np.random.default_rng(0).random((1, side, side), dtype=np.float32)
+    grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.05, side, side)
+
+    def write(path):
+        if kind == "plain":
+            write_geotiff(path, lambda first, last: pixels[:, first:last], grid, dtype="float32")
+        else:
+            write_cog(path, lambda first, last: pixels[:, first:last], grid, dtype="float32", bands=[("cost", "J")])
+
+    write(tmp_path / "whole.tif")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "whole.tif").stat().st_size - lacking, before[1]))
+    try:
+        with pytest.raises(StoreError, match=r"cost\.tif: cannot be written"):
+            write(tmp_path / "cost.tif")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.tif"]

@@ -91,7 +91,7 @@ def test_tiles_in_degrees_lie_side_by_side_also_across_the_antimeridian(tmp_path
         tmp_path / "e.tif", np.full((1, 50, 60), 9.0, np.float32), "EPSG:4326", corner(0, 0, pitch, -180.0, -16.5)
     )
     with open_heights([west, east]) as raster:
-        assert (raster.place.rows, raster.place.cols) == (50, 120)
+        assert (raster.georeference.rows, raster.georeference.cols) == (50, 120)
         values, valid = raster.read(10, 12, 50, 70)
     assert valid.all()
     assert values[0].tolist() == [7.0] * 10 + [9.0] * 10
@@ -101,8 +101,8 @@ def test_few_files_are_open_however_many_there_are(tmp_path):
     paths = tiles(tmp_path, rows=8, cols=8, without=())["height"]
     before = len(list(Path("/dev/fd").iterdir()))
     with open_heights(paths) as raster:
-        for row in range(0, raster.place.rows, STEP):
-            raster.read(row, min(row + STEP, raster.place.rows), 0, raster.place.cols)
+        for row in range(0, raster.georeference.rows, STEP):
+            raster.read(row, min(row + STEP, raster.georeference.rows), 0, raster.georeference.cols)
             assert len(list(Path("/dev/fd").iterdir())) - before <= geotiff._MAX_OPEN
         assert raster.name == "t_0_0.tif … t_7_7.tif (64 files)"
 
@@ -134,4 +134,4 @@ def test_a_damaged_tile_is_named_by_its_own_rows(tmp_path):
     with open_heights(paths) as raster:
         paths[4].write_bytes(whole[:3000])
         with pytest.raises(MapError, match=r"t_1_1.tif: .*damaged"):
-            raster.read(0, raster.place.rows, 0, raster.place.cols)
+            raster.read(0, raster.georeference.rows, 0, raster.georeference.cols)

@@ -43,7 +43,7 @@ def address():
 
 def read(path):
     with open_heights([path]) as raster:
-        return raster.read(0, raster.place.rows, 0, raster.place.cols)
+        return raster.read(0, raster.georeference.rows, 0, raster.georeference.cols)
 
 
 def hostile(site, secret, address):
