@@ -226,8 +226,11 @@ def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
 
 def main() -> None:
     """Run the command line: errors become plain lines and exit codes, never a traceback (unless ``--debug``)."""
-    prepare_process()
-    _run()
+    try:
+        prepare_process()
+        _run()
+    except Terminated as ended:  # before a command begins
+        _fail([f"{ended}; {_NOTHING_HALF}"], ended.exit_code)
 
 
 @terminate_on_signal()

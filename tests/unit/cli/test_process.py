@@ -52,3 +52,16 @@ def test_linear_algebra_has_one_thread_unless_the_environment_says_otherwise():
             [sys.executable, "-c", told], env=environment, capture_output=True, text=True, check=True
         )
         assert found.stdout == wanted
+
+
+def test_a_signal_before_the_command_begins_is_one_line_too():
+    """As soon as it is listened for."""
+    program = (
+        "import os, signal, tcpipe.cli as c; real = c.prepare_process\n"
+        "c.prepare_process = lambda: (real(), os.kill(os.getpid(), signal.SIGTERM))\nc.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (
+        143,
+        "tcpipe: ended by SIGTERM; no output is incomplete; run the same command again\n",
+    )
