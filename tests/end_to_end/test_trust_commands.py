@@ -59,11 +59,13 @@ def test_verify_names_what_is_wrong_one_line_each_and_fails(work):
         path.write_bytes(whole)
         (work / "dataset" / "mine.txt").unlink()
     assert (done.returncode, as_json.returncode) == (1, 1)
-    head, *problems = done.stdout.splitlines()
-    assert head.endswith(f"{len(problems)} problems")
+    problems = json.loads(as_json.stdout)["problems"]
+    assert len(problems) == 2
+    head, *lines = done.stdout.splitlines()
+    assert head.endswith(": 2 problems")
+    assert lines[:2] == problems
     assert any(line.startswith("dataset/samples.parquet: its sha256 is") for line in problems)
     assert "dataset/mine.txt: is no file of this dataset" in problems
-    assert json.loads(as_json.stdout)["problems"] == problems
 
 
 def test_a_sample_is_traced_to_its_log_and_made_again_bit_for_bit(work, ids):
