@@ -96,7 +96,7 @@ class Recorder:
             self.tab.wait_for_timeout(300)
             self.hold(90)
 
-    def place(self, plot: str, x: float, y: float) -> tuple[float, float]:
+    def find_place(self, plot: str, x: float, y: float) -> tuple[float, float]:
         """Return where a point of a plot lies in the window."""
         return tuple(self.tab.evaluate(_PLACE, [plot, x, y]))
 
@@ -117,9 +117,8 @@ class Recorder:
 
 def _find_middle(element: Any) -> tuple[float, float]:
     box = element.bounding_box()
-    return box["x"] + min(0.5 * box["width"], 60.0), box["y"] + min(
-        0.5 * box["height"], 12.0
-    )  # a link may have two lines
+    across, down = min(0.5 * box["width"], 60.0), min(0.5 * box["height"], 12.0)  # a link may have two lines
+    return box["x"] + across, box["y"] + down
 
 
 def _draw_pointer(frame: Image.Image, x: float, y: float, *, presses: bool) -> tuple[Image.Image, tuple[int, int]]:
@@ -135,7 +134,7 @@ def _draw_pointer(frame: Image.Image, x: float, y: float, *, presses: bool) -> t
     return part.resize((side, side), Image.Resampling.LANCZOS), corner
 
 
-_STEEPEST = """page.unpack(page.data.samples.packed).then(({ x, y, power }) => {
+_MOST_POWER = """page.unpack(page.data.samples.packed).then(({ x, y, power }) => {
   const i = power.indexOf(Math.max(...power));
   return [x[i], y[i]];
 })"""
@@ -155,7 +154,7 @@ def record_tour(tab: Any, demo: Path, plan: Path, path: Path) -> None:
     tour.caption = "Colour the track by power, and click a metre: its labels and their uncertainty"
     tour.choose("#colour", "power w")
     tour.hold(1200)
-    tour.click(tour.place("map", *metre))
+    tour.click(tour.find_place("map", *metre))
     tour.hold(1800)
     tour.open(demo / "dataset/report.html", "A dataset: what is wrong with it, and the remedy as lines to copy")
     tour.hold(1600)
@@ -163,11 +162,11 @@ def record_tour(tab: Any, demo: Path, plan: Path, path: Path) -> None:
     tour.hold(800)
     tour.caption = "Click a sample: its labels, its patches of the map, and the log it comes from"
     tour.scroll("#scale")
-    tour.click(tour.place("map", *tab.evaluate(_STEEPEST)))
+    tour.click(tour.find_place("map", *tab.evaluate(_MOST_POWER)))
     tab.wait_for_selector("#chosen .patch")
     tour.hold(2400)
     tour.caption = "Draw a box: one selection on the map, in all plots and in words"
-    tour.drag(tour.place("brush", 4.0, 340.0), tour.place("brush", 15.0, 190.0))
+    tour.drag(tour.find_place("brush", 4.0, 340.0), tour.find_place("brush", 15.0, 190.0))
     tour.hold(2000)
     tour.caption = "Its patches, and the line of Python that opens these samples"
     tour.scroll("#s2")

@@ -43,7 +43,7 @@ from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 
 @dataclass(frozen=True, slots=True)
 class Repair:
-    """How the problems before it are made right."""
+    """How to repair the problems before it."""
 
     text: str
 
@@ -76,7 +76,7 @@ class Verified:
     read: Mapping[str, int]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    """How the problems are made right; what a redacted dataset does not tell."""
+    """How to repair the problems; what a redacted dataset does not tell."""
 
     def __str__(self) -> str:
         """Return a line of what was read, and one for each problem."""
@@ -204,7 +204,7 @@ def _verify_log(place: Place) -> Iterator[CheckResult]:
             lost += 1
     if lost:
         yield Repair(
-            f"{log.where()}: copy the store again, or ingest all logs again and acknowledge the commits; a later snapshot has them, too"
+            f"{log.where()}: copy the store again, or ingest all logs again and acknowledge the commits; what a later snapshot has is kept"
         )
     for name in log.files():
         if name in snapshots:
@@ -215,7 +215,7 @@ def _verify_log(place: Place) -> Iterator[CheckResult]:
 
 
 def _repair_by(repair: Repair, findings: Iterable[CheckResult]) -> Iterator[CheckResult]:
-    """Yield findings, and after each problem how it is made right."""
+    """Yield findings, and after each problem how to repair it."""
     for finding in findings:
         yield from (finding, repair) if isinstance(finding, str) else (finding,)
 

@@ -306,6 +306,9 @@ class CovariateConfig(_Section):
     max_age_s: Annotated[float, Bounds(ge=1e-3, le=1e9)] = 7200.0
     """Each sample uses the last row before its start; largest age of this row [s]."""
 
+    def __post_init__(self) -> None:
+        validate_fields(self, "covariates")
+
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig(_Section):

@@ -171,12 +171,12 @@ def test_croissant_names_every_file_and_column(built, samples):
     assert fields["power_watt"]["source"]["fileObject"]["@id"] == "samples.parquet"
 
 
-def test_the_same_bytes_whatever_the_batches(built, tmp_path, monkeypatch):
+def test_the_same_bytes_whatever_the_jobs_and_whatever_the_batches(built, tmp_path, monkeypatch):
     from tcpipe.pipeline.dataset import sampling as dataset_sampling
 
     directory, store, region, _ = built
     monkeypatch.setattr(dataset_sampling, "_BATCH_ROWS", 150)
-    build_dataset(tmp_path / "again", store=store.root, split=region, recipe=RECIPE)
+    build_dataset(tmp_path / "again", store=store.root, split=region, recipe=RECIPE, jobs=2)
     assert files(tmp_path / "again") == files(directory / "zarr")
 
 

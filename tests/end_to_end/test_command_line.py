@@ -21,7 +21,7 @@ import rasterio
 from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from stored_files import only_run, tables
+from stored_files import only_run, read_files, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, make_tiny, simulate
@@ -492,6 +492,9 @@ def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_pa
     assert "in broken" in done.stderr
     again = _run("ingest", *logs, "--retry-failed", cwd=tmp_path)
     assert [line.split()[0] for line in again.splitlines() if "robot husky" in line] == ["unchanged", "done", "done"]
+    _run("ingest", logs[0], "--store", "alone", cwd=tmp_path)
+    by_worker, alone = (read_files(tmp_path / name / "runs") for name in ("tcpipe-store", "alone"))
+    assert {name: by_worker.get(name) for name in alone} == alone != {}, "a worker makes the same bytes"
 
 
 def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_path: Path) -> None:

@@ -227,3 +227,9 @@ def test_snippets_run(snippet: str, datasets: Path, tmp_path: Path, monkeypatch:
     if "patches" in names and "labels" in names:
         assert names["patches"].shape[1:] == (40, 40, 3)
         assert names["labels"].shape[1:] == (2,)
+
+
+def test_nothing_of_one_machine_is_in_the_pages() -> None:
+    """No absolute path of where the pages were written."""
+    found = {page.name: re.findall(r"/(?:work|root|tmp|mnt)/\S*", page.read_text(encoding="utf-8")) for page in PAGES}
+    assert {name: paths for name, paths in found.items() if paths} == {}

@@ -136,7 +136,7 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
     odd = [(tile, key) for tile, key in zip(tiles, keys, strict=True) if key != usual]
     if odd:
         names = ", ".join(shorten_problems([str(tile.path) for tile, _ in odd]))
-        got, wanted = (CRS(key).name if "[" in key else key or "none" for key in (odd[0][1], usual))
+        got, wanted = ((CRS(key).name if key else "none") if what == "CRS" else key for key in (odd[0][1], usual))
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, expected {wanted}): {names}; "
             f"write them like the rest: {mended}"

@@ -31,6 +31,7 @@ from tcpipe.formats.dataset_files import (
     RELIEF,
     REPORT,
     SAMPLES,
+    parse_card,
     read_card,
     read_intact_card,
 )
@@ -261,10 +262,11 @@ def _find_left_out(
 def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     """Return the card of the dataset at a URL, if there is one, and whether it is intact."""
     open_place(url).check()
-    if find_newest(url, [CARD]) is None:
+    if (found := find_newest(url, [CARD])) is None:
         return None, False
-    directory, fetched = fetch_directory_by_range(url, by_range=lambda _: True)
-    card = read_card(directory)
+    with _name_remedy(url):
+        card = parse_card(found.data, found.place.where(found.name))
+    _, fetched = fetch_directory_by_range(url, by_range=lambda _: True)
     return card, fetched is not None and fetched.is_complete()
 
 
@@ -299,11 +301,8 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
         raise UsageError(f"{place}: is a file, expected a directory for the dataset; give another OUT")
     if not (place / CARD).is_file():
         raise UsageError(f"{place}: exists and is not a dataset (no {CARD}); it is not changed; give another OUT")
-    try:
+    with _name_remedy(place):
         card, proved = read_card(place, proved=False), True
-    except DatasetError as error:
-        left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
-        raise DatasetError(*error.problems, left) from None
     try:
         read_intact_card(place)
     except DatasetError as error:
@@ -316,6 +315,16 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     files = ((place / name, entry.size_bytes) for name, entry in card.checksums.items())
     is_whole = all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
     return card, proved and is_whole
+
+
+@contextmanager
+def _name_remedy(place: Path | str) -> Iterator[None]:
+    """Add to a `DatasetError` about the card in a place what becomes of the dataset there, and what to do."""
+    try:
+        yield
+    except DatasetError as error:
+        left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
+        raise DatasetError(*error.problems, left) from None
 
 
 @contextmanager

@@ -62,6 +62,7 @@ WRONG = {
     "fuse.rate_hz = nan": "fuse.rate_hz is nan; expected a number from 1 to 500",
     'mask.keep_reversing = "maybe"': "expected true or false",
     "split.folds = 2.5": "split.folds is 2.5; expected a whole number",
+    "covariates.max_age_s = 0": "covariates.max_age_s is 0; expected a number from 0.001",
 }
 
 

@@ -331,6 +331,8 @@ def test_names(name: str, kind: str, role: str | None) -> None:
         ([("/status", "warthog_msgs/msg/Status")], "warthog"),
         ([("/status", "jackal_msgs/msg/Status")], "jackal"),
         ([("/platform/power", POWER)], "husky"),
+        ([("/w200_0042/platform/power", POWER)], "warthog"),
+        ([("/j100/platform/power", POWER)], "jackal"),
         ([("/warthog_velocity_controller/odom", ODOMETRY)], "warthog"),
         ([("/husky/odom", ODOMETRY), ("/jackal/odom", ODOMETRY)], "generic"),
         ([("/huskystone/odom", ODOMETRY)], "generic"),

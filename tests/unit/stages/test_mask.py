@@ -86,9 +86,12 @@ def test_below_the_limit_unless_it_is_unknown_or_allowed():
     speed, commanded = np.full(len(T), 0.6), np.full(len(T), 0.7)
     track = straight_track(speed, commanded_mps=commanded)
     assert rows_of(gate(track, config=MaskConfig(max_velocity_mps=1.0)), DropReason.BELOW_FULL_SPEED).all()
-    assert not rows_of(gate(track, config=MaskConfig(require_full_speed=False)), DropReason.BELOW_FULL_SPEED).any()
+    allowed = gate(track, config=MaskConfig(require_full_speed=False, max_velocity_mps=1.0, full_speed_fraction=0.9))
+    assert not rows_of(allowed, DropReason.BELOW_FULL_SPEED).any()
+    assert allowed.info.report.facts.mask.full_speed_mps == pytest.approx(0.9), "labels are flagged below it"
     unknown = gate(track, limit_mps=None)
     assert not rows_of(unknown, DropReason.BELOW_FULL_SPEED).any()
+    assert unknown.info.report.facts.mask.full_speed_mps is None
     (finding,) = unknown.info.report.findings
     assert (finding.code, finding.remedies[0].recipe) == ("max-velocity-unknown", {"mask": {"max_velocity_mps": 0.7}})
     assert not rows_of(gate(track, config=MaskConfig(max_velocity_mps=0.7)), DropReason.BELOW_FULL_SPEED).any()

@@ -12,6 +12,7 @@ from rasterio import Affine
 from tcpipe.errors import MapError
 from tcpipe.formats.maps import geotiff
 from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.layer_building import open_raster
 from tcpipe.formats.maps.map_files import open_map
 
 LEFT, TOP, PITCH_M = 560_000.0, 5_215_000.0, 0.25
@@ -126,6 +127,17 @@ def test_tiles_that_are_odd_are_named_in_one_line(tmp_path):
         (line,) = caught.value.problems
         assert path.name in line
         assert "1 of 9 files" in line
+
+
+def test_a_tile_in_another_unit_is_named_with_both_units(tmp_path):
+    paths = []
+    for n, unit in enumerate(("[m]", "[K]", "[m]")):
+        ones = np.ones((1, SIDE, SIDE), np.float32)
+        paths.append(write_tif(tmp_path / f"{n}.tif", ones, "EPSG:32633", corner(n * SIDE, 0)))
+        with rasterio.open(paths[-1], "r+") as dataset:
+            dataset.units = [unit]
+    with geotiff.keep_open() as open_file, pytest.raises(MapError, match=r"\[K\]\), expected .*\[m\]\)\): .*1\.tif"):
+        open_raster(paths, "soil", "numbers", open_file)
 
 
 def test_a_damaged_tile_is_named_by_its_own_rows(tmp_path):

@@ -153,6 +153,18 @@ def test_a_dataset_of_another_data_model_is_left_alone(here):
     assert "written by data model 2.1, expected 3.0; run 'tcpipe migrate' on it" in caught.value.problems[0]
 
 
+def test_a_dataset_of_another_data_model_in_a_bucket_is_left_alone(here, monkeypatch):
+    shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
+    reseal(here / "served" / "sets" / "ds", data_model_version="2.1")
+    with object_store(here / "served") as (environment, _):
+        in_environment(monkeypatch, environment, here / "cache")
+        with pytest.raises(DatasetError) as caught:
+            build_dataset("s3://sets/ds", **usual(here, force=True))
+    migrate, move = caught.value.problems
+    assert migrate.startswith("s3://sets/ds: written by data model 2.1, expected 3.0; run 'tcpipe migrate' on it")
+    assert move == "s3://sets/ds: is not changed, because its inputs are unknown; move it or give another OUT"
+
+
 def test_a_redacted_dataset_does_not_tell_its_options(here):
     out = here / "dataset"
     build_dataset(out, **usual(here, redact=True, force=True))
