@@ -21,9 +21,11 @@ from tcpipe.power.sources import (
     apply_sign,
     find_rejection,
     find_sources,
+    find_wrap,
     read_rails,
     reject_power,
     sign_by_mean,
+    unwrap_currents,
 )
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import GAIN_STD_FRACTION, LOSS_STD_FRACTION, TORQUE_GAIN_STD_FRACTION, CurrentSign, PowerSource
@@ -234,10 +236,9 @@ def _unwrap_currents(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
     wraps_amp = find_wrap(rail.current_amp)
     if wraps_amp is None:
         return rail, []
-    upper = rail.current_amp > wraps_amp / 2
-    count = int(np.count_nonzero(upper))
+    count = int(np.count_nonzero(rail.current_amp > wraps_amp / 2))
     found = make_finding("current-wrapped", _POWER, names=names, currents_count=count, wraps_amp=wraps_amp)
-    return replace(rail, current_amp=np.where(upper, rail.current_amp - wraps_amp, rail.current_amp)), [found]
+    return replace(rail, current_amp=unwrap_currents(rail.current_amp, wraps_amp)), [found]
 
 
 def _pair_rails(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
@@ -380,29 +381,3 @@ def _sum_currents(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Floats
     ]
     time_s = parts[0][0]
     return time_s, np.sum([np.interp(time_s, at, current) for at, current in parts], axis=0)
-
-
-_VALUES = 65536
-_STEPS_AMP = (*(2.0**-bits for bits in range(9)), 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
-_OFF_GRID = 0.02
-_FEWEST = 20
-
-
-def find_wrap(current_amp: Floats) -> float | None:
-    """Return what is to be subtracted from the upper values of a current [A], shape (N,), NaN where unknown; None where it never wrapped.
-
-    A Warthog's motor controllers send a signed number of 1/16 A as unsigned (norlab-ulaval/warthog_sevcon_fix), AgileX's did with 0.1 A
-    until 2024 (agilexrobotics/ugv_sdk, 7769abf): -2 A reads as 4094 A, or as 6551.6 A. So it is where all values are on the grid of a
-    number of 16 bits, some in its upper quarter, and none in the two quarters between, which no current crosses without a value there.
-    """
-    known = current_amp[np.isfinite(current_amp)]
-    if known.size < _FEWEST or known.min() < 0.0:
-        return None
-    top = float(known.max())
-    for step_amp in _STEPS_AMP:
-        wraps_amp = _VALUES * step_amp
-        if not 0.75 * wraps_amp < top < wraps_amp or np.any((known > wraps_amp / 4) & (known < 0.75 * wraps_amp)):
-            continue
-        if np.all(np.abs(known / step_amp - np.rint(known / step_amp)) < _OFF_GRID):
-            return wraps_amp
-    return None

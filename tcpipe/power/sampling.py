@@ -183,6 +183,8 @@ def _compute_unexplained(power_watt: Floats, causes: Floats) -> float:
 _INSTANT_S = 0.1
 """Motion is averaged over so much about a sample."""
 _WIDTHS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+_FEWEST_MEANS = 20
+"""Of a width, one after the other in the record: to fewer the six causes fit by chance, where power wanders slowly."""
 
 
 def find_smoothing(
@@ -214,7 +216,10 @@ def find_smoothing(
         return _compute_unexplained(power.value[inside], means)
 
     after_s = max(-corrected_s, 0.0)
-    tried = [Smoothing(width_s - after_s, after_s) for width_s in _WIDTHS_S if width_s > after_s]
+    longest_s = float(at_s[-1] - at_s[0]) / _FEWEST_MEANS
+    tried = [Smoothing(width_s - after_s, after_s) for width_s in _WIDTHS_S if after_s < width_s <= longest_s]
+    if not tried:
+        return None
     about = [Smoothing(width_s / 2.0 - after_s, width_s / 2.0 + after_s) for width_s in _WIDTHS_S]
     unexplained = [judge(smoothing) for smoothing in tried]
     least = min(judge(smoothing) for smoothing in (Smoothing(0.0, 0.0), *about))

@@ -198,7 +198,8 @@ def find_lone_side(topics: Collection[str]) -> str | None:
     """Return a topic of the drives of one side whose other side is not among the topics; None without one."""
     names = {topic.lower() for topic in topics}
     for topic in filter(is_of_drives, topics):
-        if re.sub("left|right", lambda side: _OTHER_SIDE[side[0]], topic.lower()) not in names:
+        sides = set(re.findall("left|right", topic.lower()))
+        if len(sides) == 1 and topic.lower().replace(side := sides.pop(), _OTHER_SIDE[side]) not in names:
             return topic
     return None
 
@@ -303,11 +304,11 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         watt = source.current_scale * _sum_fields(columns, parse_fields(source.power))
         current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
-        current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)
-    sides = [_read_values(columns, field).reshape(len(current), -1) for field in parse_fields(source.current)]
-    unmeasured = (
-        find_unmeasured(np.hstack(sides), _choose_stamps(columns)) if sides else np.zeros(len(current), np.bool_)
-    )
+        current = unwrap_currents(current, source.wraps_amp)
+    parts = [source.current_scale * _read_values(columns, field) for field in parse_fields(source.current)]
+    unmeasured = np.zeros(len(current), np.bool_)
+    if parts:
+        unmeasured = find_unmeasured(np.column_stack(parts), _choose_stamps(columns), wraps_amp=source.wraps_amp)
     current = np.where(unmeasured, np.nan, current)
     return RailReadings(name, voltage, current, unmeasured_count=int(unmeasured.sum()))
 
@@ -319,11 +320,14 @@ _BESIDE, _CROWDED = 20, 10.0
 """Levels next to the end of a range, and how many times as many values as on one of them are at the end of a clipped current."""
 
 
-def find_unmeasured(parts: Floats, stamp_ns: Stamps) -> NDArray[np.bool_]:
+def find_unmeasured(parts: Floats, stamp_ns: Stamps, *, wraps_amp: float | None = None) -> NDArray[np.bool_]:
     """Return the rows in which one of several currents, shape (N, K), is clipped, or repeats a value while another changes, shape (N,)."""
     found = np.zeros(len(parts), np.bool_)
+    parts = np.where(np.abs(parts) <= _IMPOSSIBLE, parts, np.nan)
     for column, values in enumerate(parts.T):
-        found |= _is_clipped(values) | _is_frozen(values, np.delete(parts, column, axis=1), stamp_ns)
+        wraps = wraps_amp or find_wrap(values)  # the end of an unsigned current is the smallest that flows back
+        is_clipped = _is_clipped(values if wraps is None else unwrap_currents(values, wraps))
+        found |= is_clipped | _is_frozen(values, np.delete(parts, column, axis=1), stamp_ns)
     return found
 
 
@@ -347,11 +351,42 @@ def _is_frozen(values: Floats, others: Floats, stamp_ns: Stamps) -> NDArray[np.b
     first = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
     last = np.append(first[1:], len(values)) - 1
     is_long = (last - first >= _FEWEST_EQUAL) & (stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS)
+    others = others[:, np.isfinite(others).any(axis=0)]
     if is_long.any() and others.size:
         low, high = np.nanquantile(others, (0.05, 0.95), axis=0)
         for begin, end in zip(first[is_long], last[is_long] + 1, strict=True):
             frozen[begin:end] = (np.ptp(others[begin:end], axis=0) > _MOVES * (high - low)).any()
     return frozen
+
+
+_VALUES = 65536
+_STEPS_AMP = (*(2.0**-bits for bits in range(9)), 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
+_OFF_GRID = 0.02
+
+
+def find_wrap(current_amp: Floats) -> float | None:
+    """Return what is to be subtracted from the upper values of a current [A], shape (N,), NaN where unknown; None where it never wrapped.
+
+    A Warthog's motor controllers send a signed number of 1/16 A as unsigned (norlab-ulaval/warthog_sevcon_fix), AgileX's did with 0.1 A
+    until 2024 (agilexrobotics/ugv_sdk, 7769abf): -2 A reads as 4094 A, or as 6551.6 A. So it is where all values are on the grid of a
+    number of 16 bits, some in its upper quarter, and none in the two quarters between, which no current crosses without a value there.
+    """
+    known = current_amp[np.isfinite(current_amp)]
+    if known.size < _FEWEST_EQUAL or known.min() < 0.0:
+        return None
+    top = float(known.max())
+    for step_amp in _STEPS_AMP:
+        wraps_amp = _VALUES * step_amp
+        if not 0.75 * wraps_amp < top < wraps_amp or np.any((known > wraps_amp / 4) & (known < 0.75 * wraps_amp)):
+            continue
+        if np.all(np.abs(known / step_amp - np.rint(known / step_amp)) < _OFF_GRID):
+            return wraps_amp
+    return None
+
+
+def unwrap_currents(current_amp: Floats, wraps_amp: float) -> Floats:
+    """Return currents [A], shape (N,), with those negative again that were read as unsigned."""
+    return np.where(current_amp > wraps_amp / 2, current_amp - wraps_amp, current_amp)
 
 
 def _choose_stamps(columns: Columns) -> NDArray[np.int64]:

@@ -180,3 +180,16 @@ def test_power_as_it_is_and_noisy_motion_are_no_smoothing(seed, noise):
     slow = slice(None, None, 20)  # a mean of a second, as the source states
     mean = make_samples(AT_NS[slow], average_before(power, 1)[slow])
     assert find_smoothing(mean, AT_NS, motion, averaged=True) is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_power_that_wanders_slowly_in_a_short_record_is_no_smoothing(seed):
+    motion, power = drive_by_formula(seed)
+    short = slice(1800)
+    wanders = make_samples(AT_NS[short], (power + 60.0 * wandering(COUNT, 600, np.random.default_rng(seed)))[short])
+    assert find_smoothing(wanders, AT_NS[short], motion[short], averaged=False) is None
+
+
+def test_a_correction_of_more_than_every_width_is_no_smoothing():
+    motion, power = drive_by_formula(0)
+    assert find_smoothing(make_samples(AT_NS, power), AT_NS, motion, averaged=False, corrected_s=-30.0) is None
