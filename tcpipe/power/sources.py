@@ -305,10 +305,10 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
         current = unwrap_currents(current, source.wraps_amp)
-    parts = [source.current_scale * _read_values(columns, field) for field in parse_fields(source.current)]
+    currents = [source.current_scale * _read_values(columns, field) for field in parse_fields(source.current)]
     unmeasured = np.zeros(len(current), np.bool_)
-    if parts:
-        unmeasured = find_unmeasured(np.column_stack(parts), _choose_stamps(columns), wraps_amp=source.wraps_amp)
+    if currents:
+        unmeasured = find_unmeasured(np.column_stack(currents), _choose_stamps(columns), wraps_amp=source.wraps_amp)
     current = np.where(unmeasured, np.nan, current)
     return RailReadings(name, voltage, current, unmeasured_count=int(unmeasured.sum()))
 
