@@ -1,9 +1,11 @@
 """A small store for tests of datasets: an analytic map and runs whose segments are laid out on it, without any log."""
 
+import atexit
+import os
 import shutil
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 import numpy as np
 import pyarrow as pa
@@ -195,13 +197,22 @@ def supersede(store, run_id, by):
     open_log(store).commit("superseded", Entries(superseded=(Superseded(run_id, by),)))
 
 
-_BUILT = TemporaryDirectory(prefix="tcpipe-test-")
+_BUILT = Path(mkdtemp(prefix="tcpipe-test-"))
+
+
+def _remove_built(maker):
+    """Remove the maps that were built, but not in a forked child, which runs the exit functions of its parent, too."""
+    if os.getpid() == maker:
+        shutil.rmtree(_BUILT)
+
+
+atexit.register(_remove_built, os.getpid())
 
 
 @cache
 def _build_world(name, layers):
     """Build the analytic map, once for all stores of a process."""
-    here = Path(_BUILT.name, "-".join((name, *layers)))
+    here = _BUILT / "-".join((name, *layers))
     here.mkdir()
     rasters = WORLD.write(here, pixel_size_m=0.1)
     build_map(here / "map.zarr", name=name, **{layer: rasters[layer] for layer in ("height", *layers)})

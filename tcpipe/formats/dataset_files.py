@@ -79,7 +79,7 @@ MOST_PX = 1024
 
 @contextmanager
 def _convert_errors(remedy: str = "") -> Iterator[None]:
-    """Raise a `StoreError`, or that a recipe cannot be, as `DatasetError`, ``remedy`` added to its lines."""
+    """Raise a `StoreError`, or the `RecipeError` of the recipe in a card, as `DatasetError`, ``remedy`` added to its lines."""
     try:
         yield
     except (StoreError, RecipeError) as error:

@@ -133,7 +133,7 @@ def _iterate_ingestions(
 ) -> Iterator[tuple[str, Place, str, list[tuple[str, str]]]]:
     """Yield what may go of runs that the log knows: what it is, where it lies, its run, and the ingestions in it."""
     superseded = list(_iterate_superseded(store, found))
-    begun = _iterate_begun(store, state, min_age_s, but={run_id for _, run_id, _ in superseded})
+    begun = _iterate_begun(store, state, min_age_s, except_runs={run_id for _, run_id, _ in superseded})
     for what, run_id, recipe_id in (*begun, *_iterate_old_recipes(found, key), *superseded):
         if recipe_id:
             yield what, store.runs_place.below(f"{run_id}/{recipe_id}"), run_id, [(run_id, recipe_id)]
@@ -167,17 +167,17 @@ def _find_turn(entry: Entry) -> tuple[bool, bool]:
     return entry.name.endswith(".parquet"), split_number(entry.name) is not None
 
 
-def _iterate_begun(store: Store, state: State, min_age_s: float, *, but: Collection[str]) -> Iterator[_Target]:
+def _iterate_begun(store: Store, state: State, min_age_s: float, *, except_runs: Collection[str]) -> Iterator[_Target]:
     """Yield the ingestions that a prune took from the log and was killed before it had removed their files, if these are old enough.
 
-    Those of the runs ``but`` go with their runs.
+    Those of ``except_runs`` go with their runs.
     """
     before_ns, modified_ns = time.time_ns() - int(min_age_s * 1e9), dict[tuple[str, str], int]()
     for entry in store.runs_place.entries() if state.pruned else ():
         run_id, recipe_id, *_ = (*entry.name.split("/", 2), "")
         modified_ns[run_id, recipe_id] = max(entry.modified_ns, modified_ns.get((run_id, recipe_id), 0))
     for key in sorted(state.pruned.keys() & modified_ns.keys()):
-        if modified_ns[key] < before_ns and key[0] not in but:
+        if modified_ns[key] < before_ns and key[0] not in except_runs:
             yield BEGUN, *key
 
 

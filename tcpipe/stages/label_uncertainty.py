@@ -171,6 +171,7 @@ def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInf
     if idle_watt is None or residual_watt is None or not table.num_rows:
         return
     is_idle = np.abs(watt - idle_watt) < _IDLE_FRACTION * (np.nanmedian(watt) - idle_watt)
+    is_idle &= np.isfinite(needed_watt)
     for first, last in find_runs(is_idle, to_integers(table, "clock_epoch")).tolist():
         missing_watt = float(np.mean((needed_watt - watt)[first : last + 1]))
         if last + 1 - first < _FEWEST_UNPOWERED or missing_watt < _MISSING_RESIDUALS * residual_watt:

@@ -144,11 +144,8 @@ def _make_sources(
     raster: Raster, schemes: Mapping[str, ClassScheme], grid: MapGrid, crs: CRS, name: str
 ) -> Sequence[RasterLayer]:
     """Return a raster as a layer, or each of its bands, on a grid of their own; log how large that becomes."""
-    layer, projection, count = (
-        _make_layer(raster, schemes),
-        find_projection(raster.georeference, crs),
-        len(raster.tiles[0].bands),
-    )
+    layer, count = _make_layer(raster, schemes), len(raster.tiles[0].bands)
+    projection = find_projection(raster.georeference, crs)
     if raster.role in PAPER_LAYERS or count == 1:
         return (RasterLayer(layer, raster, grid, projection, schemes.get(raster.role)),)
     grid = choose_layer_grid(grid, raster.georeference, crs)

@@ -502,7 +502,9 @@ def _convert_late_errors() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise OSError(f"No space left on device, as far as GDAL says: {describe_error(error)}") from error
+        raise OSError(
+            f"GDAL could not finish the file (often: No space left on device): {describe_error(error)}"
+        ) from error
 
 
 def _read_again(path: Path) -> None:
