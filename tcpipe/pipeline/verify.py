@@ -137,9 +137,9 @@ def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str,
 def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     """Yield what was read of the files that a card lists, and a line for everything that is not as it says."""
     place, where, kind = found.place, found.place.where(found.name), _KINDS[found.name]
-    repair = Repair(f"{path}: copy it again, or {_HOW_MADE[kind]} it again with --force")
+    repair = f"{path}: copy it again, or {_HOW_MADE[kind]} it again"
     if broken := find_broken_seal(found.data, where):
-        yield from (broken, repair)  # its checksums say nothing of the other files
+        yield from (broken, Repair(f"{repair} elsewhere"))  # its checksums say nothing of the other files
         return
     yield "files", 1
     if kind == "dataset":
@@ -147,7 +147,7 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
         card = parse_card(found.data, where, proved=False)
     checksums = parse_typed(parse_json(found.data, where), Checksums, where).checksums
     wrong = list(find_wrong_files(place, checksums))
-    yield from _repair_by(repair, wrong)
+    yield from _repair_by(Repair(f"{repair} with --force"), wrong)
     yield "files", len(checksums)
     yield from (
         f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)

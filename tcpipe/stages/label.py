@@ -135,8 +135,8 @@ def label_segments(
     )
     facts = replace(facts, power_sensor=None if facts.energy_joule is None else power)
     start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
-    findings = (*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns))
-    findings = (*findings, *find_unpowered_motion(table, physics, masked.info, start_ns))
+    findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
+    findings += find_unpowered_motion(table, physics, masked.info, start_ns)
     info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 
