@@ -159,7 +159,7 @@ def _print_map(found: InspectedMap) -> None:
 
 def _print_dataset(found: InspectedDataset) -> None:
     from tcpipe.formats.dataset_card import group_dataset_findings
-    from tcpipe.formats.finding_lines import format_verdict, list_mixed_groups
+    from tcpipe.formats.finding_lines import list_mixed_groups, list_verdict
 
     print_line(
         f"{found.path}: dataset {found.name}, {found.samples} samples of {', '.join(found.robots)}, "
@@ -177,7 +177,8 @@ def _print_dataset(found: InspectedDataset) -> None:
     print_line(
         f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}"
     )
-    print_line(f"verdict: {format_verdict(found.verdict)}")
+    for line in list_verdict(found.verdict):
+        print_line(f"verdict: {line}")
     for line in list_mixed_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
         print_line(line)
 
@@ -204,7 +205,7 @@ def _print_store(found: InspectedStore) -> None:
 
 
 def _print_run(found: InspectedRun) -> None:
-    from tcpipe.formats.finding_lines import format_verdict
+    from tcpipe.formats.finding_lines import describe_power, list_verdict
 
     print_line(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
     if found.tags:
@@ -217,7 +218,8 @@ def _print_run(found: InspectedRun) -> None:
         ordered = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
         losses = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in ordered)
         print_line(f"{run.driven_m:.1f} m driven: {losses}" if losses else "not driven")
-        print_line(f"verdict: {format_verdict(run.verdict)}")
+        for line in [f"verdict: {line}" for line in list_verdict(run.verdict)] + describe_power(run.verdict):
+            print_line(line)
         _print_findings(run.findings)
         _print_damage("damage", run.damage)
 

@@ -107,7 +107,13 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
     """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
     from tcpipe.cost.labels import format_budget
-    from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
+    from tcpipe.formats.finding_lines import (
+        describe_finding,
+        describe_power,
+        format_findings,
+        format_verdict,
+        list_verdict,
+    )
     from tcpipe.tables.findings import select_problems
 
     aside = " (acknowledged)" if result.acknowledged else ""
@@ -140,7 +146,8 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
     if result.is_new_problem or result.status == "damaged":
         yield from (f"  damage:  {describe_finding(finding)} [{finding.code}]" for finding in run.damage)
     if is_new and not several:
-        yield f"  verdict: {format_verdict(result.verdict)}"
+        yield from (f"  verdict: {line}" for line in list_verdict(result.verdict))
+        yield from (f"  {line}" for line in describe_power(result.verdict))
         where = f"tcpipe inspect {shlex.quote(f'{store}/runs/{run.run_id}')}"
         yield from (f"  {line}" for line in format_findings(result.findings, more=where))
     elif is_new or result.is_new_problem:

@@ -13,9 +13,11 @@ import numpy as np
 
 from tcpipe.motion.distance_breakdown import StoreLoss, make_loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
+from tcpipe.robots import KNOWN_ENERGY
 from tcpipe.tables.findings import (
     AFFECTED,
     GRADES,
+    WITNESSES_OF_LABEL,
     Affected,
     Entry,
     Finding,
@@ -30,6 +32,7 @@ from tcpipe.tables.findings import (
 K = TypeVar("K", bound=Hashable)
 
 _UNITS: Mapping[str, tuple[str, float]] = {
+    "_jpm": (" J/m", 1.0), "_spm": (" s/m", 1.0),
     "_mps2": (" m/s²", 1.0), "_mps": (" m/s", 1.0), "_radps": (" °/s", 180.0 / np.pi), "_rad": ("°", 180.0 / np.pi), "_hz": (" Hz", 1.0),
     "_volt": (" V", 1.0), "_amp": (" A", 1.0), "_watt": (" W", 1.0), "_joule": (" J", 1.0), "_fraction": (" %", 100.0),
     "_m2": (" m²", 1.0), "_bytes": (" MB", 1e-6), "_px": (" px", 1.0), "_deg": ("°", 1.0), "_m": (" m", 1.0), "_s": (" s", 1.0),
@@ -155,7 +158,8 @@ def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
     ordered = sort_findings(findings)
     found = [finding for finding in ordered if finding.severity != "note"]
-    return list_findings(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
+    notes = len(ordered) - len(found) - sum(finding.code == WITNESSES_OF_LABEL for finding in ordered)
+    return list_findings(found[:most]) + _count_rest(len(found) - most, notes, more)
 
 
 def list_findings(findings: Iterable[Finding]) -> list[str]:
@@ -177,6 +181,41 @@ def format_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) 
     """Return the grades as one line, the worst first: ``energy not usable; position and time usable with care``."""
     labels = {grade: [name for name in quantities if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
     return "; ".join(f"{_join(names)} {grade}" for grade, names in labels.items() if names)
+
+
+def list_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) -> list[str]:
+    """Return a line for each label: ``energy 172 ± 7 J/m · confirmed by: slope · usable``; ± is σ of one segment."""
+    labels = {finding.subject.name: finding for finding in verdict.labels}
+    return [" · ".join([*describe_label(name, labels.get(name)), getattr(verdict, name)]) for name in quantities]
+
+
+def describe_power(verdict: Verdict) -> list[str]:
+    """Return idle power, driving power and energy per metre beside those of known robots, as one line; nothing without energy."""
+    finding = next((finding for finding in verdict.labels if finding.subject.name == "energy"), None)
+    if finding is None or "driving_watt" not in finding.numbers:
+        return []
+    sizes = {name: format_number(name, number) for name, number in finding.numbers.items()}
+    idle = f"idle {sizes['idle_watt']}, " if "idle_watt" in sizes else ""
+    return [f"power: {idle}driving {sizes['driving_watt']}, {sizes['mean_jpm']}; known robots: {KNOWN_ENERGY}"]
+
+
+def describe_label(name: str, finding: Finding | None) -> list[str]:
+    """Return the size of a label with its σ, and what confirms it, as far as known."""
+    if finding is None:
+        return [name]
+    missing = f" ({finding.names['missing']})" if "missing" in finding.names else ""
+    size = next((_format_size(key, finding.numbers) for key in finding.numbers if key.startswith("std")), "")
+    return [f"{name}{size}", f"confirmed by: {finding.names['witnesses']}{missing}"]
+
+
+def _format_size(key: str, numbers: Mapping[str, float]) -> str:
+    """Return `` 172 ± 7 J/m`` or, of several runs, `` 158 to 190 ± 7 J/m``, with the decimals of σ; of a position σ alone."""
+    std, suffix = numbers[key], key.removeprefix("std")
+    digits = max(-int(np.floor(np.log10(std))), 0) if std > 0.0 else 3
+    values = dict.fromkeys(
+        f"{numbers[f'{of}{suffix}']:.{digits}f}" for of in ("mean", "most") if f"{of}{suffix}" in numbers
+    )
+    return f" {' to '.join(values)}{' ' if values else ''}± {std:.{digits}f}{_UNITS[suffix][0]}"
 
 
 def _join(names: Sequence[str]) -> str:
@@ -291,7 +330,8 @@ def format_mixed_groups(
     """Return the same of groups of different things, each with the arguments of `format_group`."""
     found = [group for group in groups if group[0].severity != "note"]
     ordered = sorted(found, key=lambda group: rank_severity(group[0].severity))[:most]
-    return list_mixed_groups(ordered) + _count_rest(len(found) - most, len(groups) - len(found), more)
+    notes = len(groups) - len(found) - sum(group[0].code == WITNESSES_OF_LABEL for group in groups)
+    return list_mixed_groups(ordered) + _count_rest(len(found) - most, notes, more)
 
 
 def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:

@@ -16,7 +16,7 @@ import pyarrow as pa
 from tcpipe.errors import clean_line
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import OVERVIEW, SAMPLES, SHARDS
-from tcpipe.formats.finding_lines import format_verdict
+from tcpipe.formats.finding_lines import list_verdict
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json, to_json
 from tcpipe.formats.maps.map_facts import read_layers
@@ -96,7 +96,8 @@ def _iterate_lines(card: DatasetCard) -> Iterator[str]:
         "",
     )
     yield from ("## Splits", "", _format_splits(card), "")
-    yield from ("## Verdict", "", f"Labels: {format_verdict(card.verdict)}. `dataset.json` has the findings.", "")
+    verdict = (f"- {line}" for line in list_verdict(card.verdict))
+    yield from ("## Verdict", "", *verdict, "", "`dataset.json` has the findings.", "")
     if card.redaction is not None:
         yield from ("## Redacted", "", *map(_escape_markdown, card.redaction.lines()), "")
     yield from (

@@ -16,7 +16,7 @@ from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError, clea
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, find_newest, require_card
 from tcpipe.formats.dataset_files import is_shard, read_card
-from tcpipe.formats.finding_lines import format_findings, format_verdict
+from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.integrity import seal_document
 from tcpipe.formats.json_files import digest, parse_json, parse_typed, read_as, read_json, write_json
 from tcpipe.formats.object_storage import is_url
@@ -62,7 +62,8 @@ class EvaluationResult:
             ]
             lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
-        lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
+        lines += [f"verdict: {line}" for line in list_verdict(self.values.verdict, PREDICTED)]
+        lines += format_findings(self.values.findings)
         return clean_lines((*lines, f"open {self.path}/{PAGE}"))
 
 

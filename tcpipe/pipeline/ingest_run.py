@@ -224,5 +224,5 @@ def run_stages(
         chord_m=sections.segment.chord_m,
     )
     segments = segment_track(masked, sections.segment)
-    labelled = label_segments(segments, masked, streams, sections.label, voltage_range_volt=profile.voltage_range_volt)
+    labelled = label_segments(segments, masked, streams, sections.label, robot=profile)
     return track, masked, labelled

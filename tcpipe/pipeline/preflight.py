@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError, clean_lines
-from tcpipe.formats.finding_lines import format_findings, format_loss, format_verdict
+from tcpipe.formats.finding_lines import describe_power, format_findings, format_loss, list_verdict
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
@@ -126,7 +126,8 @@ class Preflight:
         ]
         said += [f"topic     {_rate(topic)}" for topic in self.topics]
         said += [f"fails     {line}" for line in self.problems]
-        said += [f"verdict   {format_verdict(self.verdict)}"] if self.expected_yield else []
+        if self.expected_yield:
+            said += [f"verdict   {line}" for line in list_verdict(self.verdict)] + describe_power(self.verdict)
         said += format_findings(self.findings, more=f"tcpipe preflight {shlex.quote(self.log)} --json")
         said += [f"loss      {format_loss(loss)}" for loss in self.losses]
         said += ["ready: no problems found"] if self.exit_code == 0 else []

@@ -17,7 +17,7 @@ from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import check_local_output, make_scratch_directory
 from tcpipe.formats.commits import CallRecord, Problem
-from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, format_verdict, group_findings
+from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, group_findings, list_verdict
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import format_path, is_url, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
@@ -106,7 +106,7 @@ class Status:
         lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
         lines += [f"{call.state}: {call}" for call in self.begun if call.state != "killed"]
-        lines += [f"verdict: {format_verdict(self.verdict)}"] if self.runs else []
+        lines += [f"verdict: {line}" for line in list_verdict(self.verdict)] if self.runs else []
         lines += [f"  {format_count(code, count, self.runs)}" for code, count in [*self.findings.items()][:MOST_LINES]]
         lines += ["losses:", *map(format_loss, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []

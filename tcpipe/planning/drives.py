@@ -19,7 +19,7 @@ from tcpipe.errors import ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.bucket_directories import require_card
 from tcpipe.formats.dataset_card import list_shifts
-from tcpipe.formats.finding_lines import format_findings, format_verdict
+from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
@@ -318,7 +318,8 @@ class DrivesResult:
             lines.append(
                 f"all {len(held)} drives held back: {sums}; intervals cover {hits[0]} of the times and {hits[1]} of the energies"
             )
-        lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
+        lines += [f"verdict: {line}" for line in list_verdict(self.values.verdict, PREDICTED)]
+        lines += format_findings(self.values.findings)
         return clean_lines((*lines, f"{self.path}/{JSON}"))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tcpipe.power.rails import is_power_only
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
@@ -23,12 +24,21 @@ from tcpipe.power.sources import (
     find_sources,
     find_wrap,
     read_rails,
+    read_values,
     reject_power,
     sign_by_mean,
     unwrap_currents,
 )
+from tcpipe.power.witnesses import compare_charge
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots import GAIN_STD_FRACTION, LOSS_STD_FRACTION, TORQUE_GAIN_STD_FRACTION, CurrentSign, PowerSource
+from tcpipe.robots import (
+    GAIN_STD_FRACTION,
+    LOSS_STD_FRACTION,
+    TORQUE_GAIN_STD_FRACTION,
+    CurrentSign,
+    PowerSource,
+    parse_fields,
+)
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
 
 _LOG_TIME = "log_time_ns"
@@ -38,6 +48,15 @@ _SIGNS = ("drawn_negative", "drawn_positive")
 
 Rails = Mapping[str, list[RailReadings]]
 """By topic."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sides:
+    """Currents of both sides of the drive [A], positive when drawn, shape (N,), and the log times of their rows [ns]."""
+
+    log_time_ns: Floats
+    first_amp: Floats
+    second_amp: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +78,10 @@ class PowerReadings:
     """Of the zero of its current [A]."""
     rest_current_amp: tuple[float, float] | None = None
     """Lowest and highest current of a rail at rest [A]; None where a source does not state it."""
+    charge_ratio: float | None = None
+    """Integral of the current over the fall of the battery's charge; None without a counter, or where it falls by less than 5 %."""
+    sides: Sides | None = None
+    """Currents of both sides of the drive; None where they are not told apart."""
 
     @property
     def is_rejected(self) -> bool:
@@ -73,6 +96,7 @@ def read_power(
     platform: str | None = None,
     husky_power: HuskyPower = "battery",
     current_sign: CurrentSign = "auto",
+    current_scale: float = 1.0,
 ) -> PowerReadings:
     """Return the rails of all power topics, with every current positive when drawn.
 
@@ -90,6 +114,8 @@ def read_power(
             rejected += too_few
             continue
         choices = find_sources(type_name, topic, known, platform=platform, husky_power=husky_power)
+        if not isinstance(choices, Finding):
+            choices = [[_scale_source(source, current_scale) for source in choice] for choice in choices]
         found = [choices] if isinstance(choices, Finding) else _read_first_valid(topic, columns, choices, known)
         if isinstance(found, list):
             rejected += found
@@ -133,7 +159,65 @@ def read_power(
         rest_current_amp=(min(range_amp[0] for range_amp in rest), max(range_amp[1] for range_amp in rest))
         if rest and len(rest) == sum(bool(source.current or source.energy) for source in sources)
         else None,
+        charge_ratio=_compare_charges(topics, signed),
+        sides=_find_sides(topics, sources, signed, sign),
     )
+
+
+def _scale_source(source: PowerSource, factor: float) -> PowerSource:
+    """Return a source with its currents, powers, counters and torques multiplied."""
+    scales = ("current_scale", "energy_scale", "torque_scale")
+    return replace(source, **{name: factor * getattr(source, name) for name in scales})
+
+
+_FULL_PERCENT = 100.0
+
+
+def _compare_charges(topics: Mapping[str, tuple[str, Columns]], rails: Rails) -> float | None:
+    """Return the integral of the current over the fall of the charge, of the topic whose charge contradicts it most."""
+    ratios = []
+    for topic, found in rails.items():
+        _, columns = topics[topic]
+        charge_ah = _read_charge(columns)
+        if charge_ah is not None and not is_power_only(found[0].voltage_volt):
+            time_s = np.asarray(columns[_LOG_TIME], np.float64) * 1e-9
+            ratios.append(compare_charge(time_s, np.sum([rail.current_amp for rail in found], axis=0), charge_ah))
+    return max((ratio for ratio in ratios if ratio), key=lambda ratio: abs(math.log(abs(ratio))), default=None)
+
+
+def _read_charge(columns: Columns) -> Floats | None:
+    """Return the charge of a battery message [Ah], shape (N,): its own, else its state of charge times its capacity; None without both."""
+    values = {name: np.asarray(columns[name], np.float64) for name in _CHARGES if name in columns}
+    if np.isfinite(values.get("charge", np.nan)).any():
+        return values["charge"]
+    share, capacity_ah = values.get("percentage"), values.get("capacity", values.get("design_capacity"))
+    if share is None or capacity_ah is None or not np.isfinite(share * capacity_ah).any():
+        return None
+    return share * capacity_ah / (_FULL_PERCENT if np.nanmax(share) > 1.0 else 1.0)
+
+
+_CHARGES = ("charge", "percentage", "capacity", "design_capacity")
+
+
+def _find_sides(
+    topics: Mapping[str, tuple[str, Columns]], sources: Sequence[PowerSource], rails: Rails, sign: int
+) -> Sides | None:
+    """Return the currents of both sides: the two currents that one source adds, or two rails called left and right."""
+    if len(sources) == 1 and len(fields_added := parse_fields(sources[0].current)) == 2:
+        (topic,) = rails
+        _, columns = topics[topic]
+        of_sign = -1 if sources[0].sign == "drawn_negative" else 1
+        first, second = (of_sign * sign * field.sign * read_values(columns, field) for field in fields_added)
+        return Sides(np.asarray(columns[_LOG_TIME], np.float64), first, second)
+    named = [(rail.name.lower(), topic, rail) for topic, found in rails.items() for rail in found]
+    left, right = ([entry for entry in named if side in entry[0]] for side in ("left", "right"))
+    if len(named) != 2 or len(left) != 1 or len(right) != 1:
+        return None
+    (_, topic, first_rail), (_, other, second_rail) = left[0], right[0]
+    first_ns, second_ns = (np.asarray(topics[name][1][_LOG_TIME], np.float64) for name in (topic, other))
+    known = np.isfinite(second_rail.current_amp)
+    second_amp = np.interp(first_ns, second_ns[known], second_rail.current_amp[known])
+    return Sides(first_ns, first_rail.current_amp, second_amp)
 
 
 def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:

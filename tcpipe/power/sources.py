@@ -295,7 +295,7 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         voltage = np.full(len(voltage), UNIT_VOLT if source.lacks_voltage else source.nominal_voltage_volt)
     if source.energy:
         parts = [
-            (field.sign * source.energy_scale, _read_values(columns, field)) for field in parse_fields(source.energy)
+            (field.sign * source.energy_scale, read_values(columns, field)) for field in parse_fields(source.energy)
         ]
         counter = count_energy(parts, wraps=source.counter_wraps)
         return RailReadings(name, voltage, counter.mean_amp(_choose_stamps(columns), voltage), counter)
@@ -305,7 +305,7 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
         current = unwrap_currents(current, source.wraps_amp)
-    currents = [source.current_scale * _read_values(columns, field) for field in parse_fields(source.current)]
+    currents = [source.current_scale * read_values(columns, field) for field in parse_fields(source.current)]
     unmeasured = np.zeros(len(current), np.bool_)
     if currents:
         unmeasured = find_unmeasured(np.column_stack(currents), _choose_stamps(columns), wraps_amp=source.wraps_amp)
@@ -405,7 +405,7 @@ def _sum_fields(columns: Columns, fields: Sequence[FieldPath]) -> Floats:
         return np.full(len(next(iter(columns.values()))), np.nan)
     parts = [
         np.where(np.abs(values) <= _IMPOSSIBLE, values, np.nan)
-        for values in (_read_values(columns, field) for field in fields)
+        for values in (read_values(columns, field) for field in fields)
     ]
     total: Floats = np.sum([field.sign * values for field, values in zip(fields, parts, strict=True)], axis=0)
     return total
@@ -415,7 +415,7 @@ _IMPOSSIBLE = 1e6
 """No battery has more volts, no drive more amperes (a current in milliamperes is refused by its median)."""
 
 
-def _read_values(columns: Columns, field: FieldPath) -> Floats:
+def read_values(columns: Columns, field: FieldPath) -> Floats:
     """Return a field's values, shape (N,); of a list that is summed NaN where a row is shorter than others."""
     values = np.asarray(columns[field.column], np.float64)
     return values.sum(axis=1) if field.every else values if field.index is None else values[:, field.index]

@@ -97,6 +97,8 @@ class ReadConfig(_Section):
     """Factor on velocities and distances of an odometry (wheels of another radius, a camera of another baseline)."""
     imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
     """Units of the IMU: si is rad/s and m/s² as in REP-103; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
+    current_scale: Annotated[float, Bounds(ge=1e-6, le=1e6)] = field(default=1.0, metadata={"json": (1.0,)})
+    """Factor on all currents, powers and counters of energy: 0.001 if a driver publishes milliamperes as amperes."""
     current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"
     """Sign of currents: auto uses that of the message type; for BatteryState, which differs by robot, the mean over the run decides."""
     power_averaged: Literal["auto", "yes", "no"] = "auto"

@@ -42,6 +42,7 @@ from tcpipe.formats.finding_lines import (
     FindingGroup,
     describe_finding,
     describe_group,
+    describe_label,
     describe_title,
     list_remedies,
 )
@@ -108,7 +109,8 @@ class ShownFinding:
 class VerdictBox:
     """The verdict at the top of a page: findings ``shown`` in full, ``more`` and ``notes`` folded."""
 
-    grades: tuple[tuple[str, Grade], ...]
+    grades: tuple[tuple[str, Grade, str], ...]
+    """Label, grade, and size and witnesses of the label."""
     shown: tuple[ShownFinding, ...]
     more: tuple[ShownFinding, ...]
     notes: tuple[ShownFinding, ...]
@@ -134,11 +136,17 @@ def show_verdict(
         shown.append(ShownFinding(group.severity, group.code, title, [(text, None)], list_remedies(group.findings)))
     problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
     return VerdictBox(
-        grades=tuple((name, getattr(verdict, name)) for name in labels),
+        grades=tuple((name, getattr(verdict, name), _describe_witnesses(verdict, name)) for name in labels),
         shown=tuple(problems[:MOST_LINES]),
         more=tuple(problems[MOST_LINES:]),
         notes=tuple(line for line in shown if line.severity == "note"),
     )
+
+
+def _describe_witnesses(verdict: Verdict, label: Affected) -> str:
+    """Return size and witnesses of a label; "" where it has none."""
+    found = next((finding for finding in verdict.labels if finding.subject.name == label), None)
+    return "" if found is None else " · ".join(describe_label(label, found)).removeprefix(label).strip()
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,8 @@ Volt = Annotated[float, Bounds(ge=0.1, le=1e4)]
 Scale = Annotated[float, Bounds(gt=0, le=1e9)]
 Share = Annotated[float, Bounds(ge=0, le=1)]
 Amp = Annotated[float, Bounds(ge=-1e4, le=1e4)]
+Mass = Annotated[float, Bounds(ge=0.1, le=1e6)]
+Watt = Annotated[float, Bounds(ge=0.1, le=1e7)]
 
 GAIN_STD_FRACTION, OFFSET_STD_AMP = 0.02, 0.2
 """σ of gain and zero [A] of a current sensor where nothing better is known: those of open-loop Hall sensors (Allegro ACS712, 20 A, data
@@ -46,6 +48,10 @@ GENERIC = "generic"
 
 MAX_PLAUSIBLE_MPS = 15.0
 """No ground robot that records terrain costs is faster [m/s]: a faster track is an estimate that went astray."""
+
+KNOWN_ENERGY = "e-scooter 36 to 146, rover of 20 kg 210, Husky 170 to 340, Warthog 440 to 810 J/m"
+"""Energy per metre of known robots: 51 trips of e-scooters (SFIEssential/DualEMobilityData), the rover of docs/explanation/real-data.md, a
+simulated Husky, and Warthogs on grass and snow (norlab-ulaval/DRIVE, fomo-sdk)."""
 
 CurrentSign = Literal["drawn_positive", "drawn_negative", "auto"]
 
@@ -82,6 +88,10 @@ class Robot:
     """Largest plausible speed of a track [m/s]; faster rows get no label."""
     voltage_range_volt: tuple[Volt, Volt] | None = None
     """Lowest and highest voltage of the battery [V]; segments outside are flagged."""
+    mass_kg: Mass | None = None
+    """Mass while driving, with its load [kg]; with it the power on slopes shows whether the scale of the power is possible."""
+    power_range_watt: tuple[Watt, Watt] | None = None
+    """Lowest and highest median power while driving that was measured on this model, widened by a factor of three [W]."""
     platform: str | None = None
     """Platform code that power sources refer to (Clearpath's, as A200)."""
     status_types: list[str] = field(default_factory=list)
@@ -91,8 +101,10 @@ class Robot:
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield each key whose value cannot be, and what was wanted."""
-        if self.voltage_range_volt is not None and self.voltage_range_volt[0] >= self.voltage_range_volt[1]:
-            yield "voltage_range_volt", "the lower of two voltages first"
+        for key, what in (("voltage_range_volt", "voltages"), ("power_range_watt", "powers")):
+            limits = getattr(self, key)
+            if limits is not None and limits[0] >= limits[1]:
+                yield key, f"the lower of two {what} first"
 
 
 @dataclass(frozen=True, slots=True)

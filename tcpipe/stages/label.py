@@ -34,6 +34,7 @@ from tcpipe.power.rails import (
     integrate_energy,
 )
 from tcpipe.recipe import LabelConfig
+from tcpipe.robots import Robot
 from tcpipe.stages.label_motion import (
     find_label_findings,
     find_motion_flags,
@@ -51,6 +52,7 @@ from tcpipe.stages.label_uncertainty import (
     find_unpowered_motion,
     make_sensor_error,
 )
+from tcpipe.stages.label_witnesses import find_witnesses
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
@@ -74,11 +76,12 @@ def label_segments(
     streams: Streams,
     config: LabelConfig,
     *,
-    voltage_range_volt: tuple[float, float] | None,
+    robot: Robot,
 ) -> LabelledSegments:
     """Return the segments with w, v, T, E, their standard deviations, and quality bits.
 
-    Power and energy are null where ``streams`` has no power. A label beyond ``voltage_range_volt`` [V], of the robot's profile, is flagged.
+    Power and energy are null where ``streams`` has no power. The profile ``robot`` gives the range of voltages outside which a label is
+    flagged, and the mass with which the scale of the power is judged.
     """
     rule: Rule = "averaged" if streams.power_averaged else config.integration
     parts, joules = [LABELLED_SEGMENTS.empty()], Counter[str]()
@@ -105,7 +108,7 @@ def label_segments(
         flags = {
             Quality.POWER_MEAN_MISMATCH: has_mean_mismatch(mean_watt, cost.power_watt),
             Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, is_clock_doubtful(streams, masked.info)),
-            **find_power_flags(cut, rails, range_volt=voltage_range_volt),
+            **find_power_flags(cut, rails, range_volt=robot.voltage_range_volt),
             **find_motion_flags(
                 cut,
                 rows,
@@ -137,6 +140,7 @@ def label_segments(
     start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
     findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
     findings += find_unpowered_motion(table, physics, masked.info, start_ns)
+    findings += find_witnesses(table, masked.info.report.facts, robot)
     info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 

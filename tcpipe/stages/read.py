@@ -20,7 +20,13 @@ from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import Arrays, LogReader, gather_messages
 from tcpipe.stages.proposals import find_proposals
-from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_power, remove_repeats
+from tcpipe.stages.read_power import (
+    add_averaging,
+    find_repeats,
+    find_side_share,
+    read_rail_power,
+    remove_repeats,
+)
 from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
 from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
 from tcpipe.tables.findings import Finding, Severity, StageReport, Subject, make_finding, read_threshold
@@ -112,7 +118,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
     power, assumed = add_averaging(power, streams, config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
-    report = make_read_report(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
+    report = make_read_report(assignment, every, clocks, streams, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
     findings = (
         *report.findings,
@@ -187,6 +193,7 @@ def make_read_report(
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
     clocks: AlignedClocks,
+    streams: Mapping[str, pa.Table],
     *,
     power: PowerReadings,
     sensors: Mapping[str, Sensor],
@@ -213,12 +220,12 @@ def make_read_report(
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
         time_offset_s=offset_s,
-        power=None if power.current_sign is None else _describe_power(power),
+        power=None if power.current_sign is None else _describe_power(power, find_side_share(power, streams)),
     )
     return StageReport(tuple(dict.fromkeys(findings)), facts)
 
 
-def _describe_power(power: PowerReadings) -> PowerSign:
+def _describe_power(power: PowerReadings, side_share: float | None) -> PowerSign:
     return PowerSign(
         power.current_sign or "",
         power.averaged,
@@ -226,6 +233,8 @@ def _describe_power(power: PowerReadings) -> PowerSign:
         power.gain_std_fraction,
         power.offset_std_amp,
         power.rest_current_amp,
+        charge_ratio=power.charge_ratio,
+        side_share=side_share,
     )
 
 

@@ -16,6 +16,7 @@ from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.sampling import find_readings, is_stated_averaged
 from tcpipe.power.sources import Counter, RailReadings, find_lone_side, reject_power
+from tcpipe.power.witnesses import compute_side_share
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
@@ -47,7 +48,27 @@ def read_power_of_topics(
         platform=known.robots[assignment.robot].platform,
         husky_power=config.husky_power,
         current_sign=config.current_sign,
+        current_scale=config.current_scale,
     )
+
+
+_STRAIGHT_RADPS, _MOVING_MPS = 0.05, 0.2
+"""Largest turn rate and smallest speed of straight driving."""
+
+
+def find_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> float | None:
+    """Return the share of one side in the current in straight driving, by an odometry; None without sides or odometry."""
+    motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
+    if power.sides is None or motion is None:
+        return None
+    at_ns = to_integers(motion, "log_time_ns").astype(np.float64)
+    order = np.argsort(at_ns, kind="stable")
+    speed_mps, turn_radps = (
+        np.interp(power.sides.log_time_ns, at_ns[order], np.abs(to_floats(motion, name))[order])
+        for name in ("velocity_x_mps", "angular_velocity_z_radps")
+    )
+    is_straight = (speed_mps > _MOVING_MPS) & (turn_radps < _STRAIGHT_RADPS)
+    return compute_side_share(power.sides.first_amp, power.sides.second_amp, is_straight)
 
 
 def name_rail_columns(rail: str) -> tuple[str, str]:

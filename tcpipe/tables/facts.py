@@ -79,6 +79,12 @@ class PowerSign:
     gain_std_fraction: float | None = field(default=None, metadata=LEFT_OUT)
     offset_std_amp: float | None = field(default=None, metadata=LEFT_OUT)
     rest_current_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    charge_ratio: float | None = field(default=None, metadata=LEFT_OUT)
+    """Integral of the current over the fall of the battery's charge."""
+    meter_slope: float | None = field(default=None, metadata=LEFT_OUT)
+    """Slope of a second meter's power over the power."""
+    side_share: float | None = field(default=None, metadata=LEFT_OUT)
+    """Share of one side in the current in straight driving; 0.5 where both sides draw the same."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ The catalogue of findings (``catalogue.toml``): what each code means, what to do
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from hashlib import sha256
@@ -20,6 +20,13 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 Severity: TypeAlias = Literal["error", "warning", "note"]
 Affected: TypeAlias = Literal["position", "time", "energy"]
+WITNESSES_OF_LABEL = "label-witnesses"
+"""Code of the findings that state what confirms a label; their subject is the label."""
+Witness: TypeAlias = Literal["wheel_odometry", "visual_odometry", "slope", "charge", "second_meter", "nothing"]
+"""What can confirm a label: an odometry beside GNSS (position, time); the power that slopes need, the fall of the battery's charge, or a
+second meter (energy)."""
+NOTHING: Witness = "nothing"
+
 Action: TypeAlias = Literal["kept", "corrected", "inflated", "excluded", "rejected"]
 """What tcpipe did with the subject of a finding; inflated: raised its standard deviations."""
 
@@ -105,7 +112,7 @@ F = TypeVar("F")
 
 SubjectKind: TypeAlias = Literal[
     "role", "topic", "frame", "layer", "run", "class", "slope", "file", "log", "map", "dataset", "column", "tag", "call", "model", "robot",
-    "split",
+    "split", "label",
 ]  # fmt: skip
 
 LEFT_OUT: Mapping[str, tuple[object, ...]] = {"json": (None, {}, [], ())}
@@ -235,12 +242,18 @@ _GRADE_OF: Mapping[Severity, Grade] = {"error": "not usable", "warning": "usable
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A grade each for position, time and energy, and the findings that decided, the worst first."""
+    """A grade each for position, time and energy, and the findings that decided, the worst first.
+
+    ``confirmed_by`` names the witnesses of each label that was compared with any, ``nothing`` where none was found; ``labels`` are the
+    findings with size, σ and witnesses of each label.
+    """
 
     position: Grade = "usable"
     time: Grade = "usable"
     energy: Grade = "usable"
     reasons: tuple[Finding, ...] = ()
+    confirmed_by: Mapping[Affected, tuple[Witness, ...]] = field(default_factory=dict)
+    labels: tuple[Finding, ...] = ()
     catalogue: str = field(default_factory=read_catalogue_version)
     """Version of the catalogue that judged."""
 
@@ -251,18 +264,52 @@ class Verdict:
 
 
 def judge(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict: each label has the grade of the worst finding that affects it."""
-    catalogue = read_catalogue()
+    """Return the verdict: each label has the grade of the worst finding that affects it; nothing unconfirmed is better than usable with care."""
+    catalogue, findings = read_catalogue(), tuple(findings)
     decisive = (
         finding
         for finding in findings
         if finding.severity != "note" and finding.code in catalogue and catalogue[finding.code].affects
     )
     reasons = tuple(sort_findings(decisive))
-    grades: dict[Affected, Grade] = {}
+    labels = _merge_witnesses(findings)
+    confirmed_by: dict[Affected, tuple[Witness, ...]] = {
+        finding.subject.name: tuple(finding.names["witnesses"].split(", "))  # type: ignore[arg-type,misc]
+        for finding in labels
+    }
+    grades: dict[Affected, Grade] = {
+        label: "usable with care" for label, witnesses in confirmed_by.items() if witnesses == (NOTHING,)
+    }
     for finding in reversed(reasons):
-        grades |= dict.fromkeys(catalogue[finding.code].affects, _GRADE_OF[finding.severity])
-    return Verdict(**grades, reasons=reasons)
+        for label in catalogue[finding.code].affects:
+            grades[label] = max(grades.get(label, "usable"), _GRADE_OF[finding.severity], key=GRADES.index)
+    return Verdict(**grades, reasons=reasons, confirmed_by=confirmed_by, labels=labels)
+
+
+def _merge_witnesses(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return one finding with witnesses for each label; of several runs with the range of their means."""
+    by_label: dict[str, list[Finding]] = {}
+    for finding in findings:
+        if finding.code == WITNESSES_OF_LABEL:
+            by_label.setdefault(finding.subject.name, []).append(finding)
+    return tuple(_merge_label(by_label[label]) for label in AFFECTED if label in by_label)
+
+
+def _merge_label(findings: Sequence[Finding]) -> Finding:
+    first = findings[0]
+    if len(findings) == 1:
+        return first
+    count = sum(finding.names["witnesses"] == NOTHING for finding in findings)
+    others = dict.fromkeys(name for finding in findings for name in finding.names["witnesses"].split(", "))
+    others.pop(NOTHING, None)
+    names = {"witnesses": ", ".join(others) or NOTHING}
+    if count:
+        rest = f"; the others by {', '.join(others)}" if others else ""
+        names = {"witnesses": NOTHING, "missing": f"in {count} of {len(findings)} runs{rest}"}
+    values = {name: [each.numbers[name] for each in findings if name in each.numbers] for name in first.numbers}
+    numbers = {name: max(found) if name.startswith("std") else min(found) for name, found in values.items()}
+    numbers |= {name.replace("mean", "most"): max(found) for name, found in values.items() if name.startswith("mean")}
+    return replace(first, names=names, numbers=numbers)
 
 
 def judge_by_code(findings: Iterable[Finding]) -> Verdict:

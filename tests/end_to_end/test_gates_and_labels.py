@@ -9,6 +9,7 @@ from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, LabelConfig, MaskConfig, ReadConfig, SegmentConfig
+from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, make_tiny, read_truth, simulate
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.robot import SimulatedRobot
@@ -33,7 +34,7 @@ def run(site, *, config=None):
         masked,
         streams,
         LabelConfig(),
-        voltage_range_volt=(20.0, 30.0),
+        robot=Robot(voltage_range_volt=(20.0, 30.0)),
     )
     return masked, labelled, read_truth(site.truths[0])
 

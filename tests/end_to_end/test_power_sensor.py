@@ -11,6 +11,7 @@ from simulated_streams import streams_of
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import from_values
+from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, read_truth, simulate
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import RasterSpec
@@ -52,7 +53,7 @@ def label(drive, change=lambda amp, _: amp, recipe=None):
         masked, table=MASKED_TRACK.table(**{name: power.get(name, rows[name]) for name in rows.column_names})
     )
     recipe = recipe or Recipe()
-    return label_segments(segment_track(masked, recipe.segment), masked, streams, recipe.label, voltage_range_volt=None)
+    return label_segments(segment_track(masked, recipe.segment), masked, streams, recipe.label, robot=Robot())
 
 
 def normalized(drive, labelled, name, part="std"):

@@ -18,6 +18,7 @@ from tcpipe.formats.recipe_toml import (
 )
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.recipe import IngestSections, Recipe
+from tcpipe.robots import Robot
 from tcpipe.simulation.scenarios import make_tiny
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.label import label_segments
@@ -50,7 +51,7 @@ def track(streams):
 def after_fusion(track, streams, recipe):
     masked = mask_track(track, recipe.mask, max_velocity_mps=1.0, chord_m=recipe.segment.chord_m)
     segments = segment_track(masked, recipe.segment)
-    return label_segments(segments, masked, streams, recipe.label, voltage_range_volt=None)
+    return label_segments(segments, masked, streams, recipe.label, robot=Robot())
 
 
 @pytest.mark.parametrize("key", keys())

@@ -35,7 +35,7 @@ from tcpipe.formats.dataset_files import (
     read_card,
     read_intact_card,
 )
-from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
+from tcpipe.formats.finding_lines import format_mixed_groups, list_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
@@ -130,7 +130,8 @@ class BuildResult:
         ledger = f"{sum(card.distance_by_reason_m.values()):.0f} m driven: {card.distance_by_reason_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {-metres:.0f} m {name.replace('_', ' ')}" for metres, name in sorted(lost))
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
-        return [head, ledger, *map(str, card.exclusions), *floor, f"verdict: {format_verdict(card.verdict)}"]
+        verdict = (f"verdict: {line}" for line in list_verdict(card.verdict))
+        return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
         if self.card is None or self.card.redaction is None:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from made_tracks import make_track, power_streams, stamps
 
 from tcpipe.recipe import LabelConfig, MaskConfig, SegmentConfig
+from tcpipe.robots import Robot
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
@@ -64,9 +65,7 @@ def labelled(track):
     stamp_ns = masked.table["stamp_ns"].to_numpy()
     t_ns = np.arange(stamp_ns.min() - 10**9, stamp_ns.max() + 10**9, 40_000_000)
     power = power_streams({"drive": (t_ns, np.full(len(t_ns), 24.0), np.full(len(t_ns), 6.0))})
-    found = label_segments(
-        segment_track(masked, SegmentConfig()), masked, power, LabelConfig(), voltage_range_volt=None
-    )
+    found = label_segments(segment_track(masked, SegmentConfig()), masked, power, LabelConfig(), robot=Robot())
     return masked, found, 144.0 * (t_ns[-1] - t_ns[0]) * 1e-9
 
 

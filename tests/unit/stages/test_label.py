@@ -13,6 +13,7 @@ from tcpipe.cost.labels import CAUSES, SensorError, format_budget
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.power.rails import IdlePower, integrate_energy
 from tcpipe.recipe import LabelConfig, MaskConfig, Recipe, SegmentConfig
+from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, find_scenario
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
@@ -31,10 +32,13 @@ ZERO = stamps(1)[0]
 SPEED = np.full(len(T), 0.8)
 
 
-def label(track, streams, *, config=None, voltage_range_volt=(20.0, 30.0)):
+HUSKY = Robot(voltage_range_volt=(20.0, 30.0))
+
+
+def label(track, streams, *, config=None, robot=HUSKY):
     masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
     segments = segment_track(masked, SegmentConfig())
-    return label_segments(segments, masked, streams, config or LabelConfig(), voltage_range_volt=voltage_range_volt)
+    return label_segments(segments, masked, streams, config or LabelConfig(), robot=robot)
 
 
 def record(period_s=0.05, *, volt=lambda t: 24 + 0 * t, amp=lambda t: 6 + 0 * t, delay_s=0.0131):
@@ -153,7 +157,7 @@ def test_voltage_out_of_range_where_it_is():
     start, end = ((to_integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
     assert found[(start < 21) & (end > 20.1)].all()
     assert not found[(end < 19.9) | (start > 21.1)].any()
-    none = label(straight_track(SPEED), streams, voltage_range_volt=None)
+    none = label(straight_track(SPEED), streams, robot=Robot())
     assert not flagged(none, Quality.VOLTAGE_OUT_OF_RANGE).any()
 
 

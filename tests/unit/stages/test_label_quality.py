@@ -8,6 +8,7 @@ import pytest
 from made_tracks import make_track, power_streams, stamps, straight_track
 
 from tcpipe.recipe import LabelConfig, MaskConfig, SegmentConfig
+from tcpipe.robots import Robot
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.label_motion import find_motion_flags, is_clock_doubtful
 from tcpipe.stages.mask import mask_track
@@ -186,7 +187,7 @@ def labelled(track, streams=None):
     masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
     segments = segment_track(masked, SegmentConfig())
     given = streams or Streams({}, {}, "husky")
-    table = label_segments(segments, masked, given, LabelConfig(), voltage_range_volt=None).table
+    table = label_segments(segments, masked, given, LabelConfig(), robot=Robot()).table
     assert table.num_rows > 10
     return table
 

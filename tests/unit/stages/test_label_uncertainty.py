@@ -7,6 +7,7 @@ import pytest
 from made_tracks import power_streams, stamps, straight_track
 
 from tcpipe.recipe import LabelConfig, MaskConfig, SegmentConfig
+from tcpipe.robots import Robot
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
@@ -38,7 +39,7 @@ def label(power, *, facts=None, config=None, tables=None):
     streams = power_streams(power)
     streams = replace(streams, tables={**streams.tables, **(tables or {})})
     return label_segments(
-        segment_track(masked, SegmentConfig()), masked, streams, config or LabelConfig(), voltage_range_volt=None
+        segment_track(masked, SegmentConfig()), masked, streams, config or LabelConfig(), robot=Robot()
     ).table
 
 

@@ -37,6 +37,7 @@ def read(topic=None, clock=None, *, steps=(), power=None, findings=(), timelines
         assignment,
         [topic or source()],
         clocks,
+        {},
         power=power or PowerReadings(),
         sensors={"gnss": SENSOR},
         offset_s={"gnss": 0.25},

@@ -1,0 +1,178 @@
+"""Witnesses of electric power: measurements that do not use the current sensor and show whether its scale is possible.
+
+A factor of 10 or 100 is one line of a driver, and no statistics of the power itself can show it. Each witness is coarse, but independent:
+
+- *slopes*: climbing costs m g sin(slope) v over an efficiency, which is known within a factor of three;
+- *weight*: a metre of level ground costs a fraction of the robot's weight that is bounded by rolling resistance and efficiency;
+- *charge*: the battery's charge or state of charge falls by the integral of the current;
+- *second meter*: a meter of the whole pack follows the power of the drives with slope 1;
+- *sides*: in straight driving both sides of a skid-steered robot draw power.
+
+The limits were measured on logs of two Warthogs and a rover and on simulated drives (docs/explanation/uncertainty.md).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.robust import estimate_robust_std
+
+Floats = NDArray[np.float64]
+
+_GRAVITY_MPS2 = 9.80665
+
+_MIN_SEGMENTS = 20
+"""Fewest segments on which power is compared with slopes or weight."""
+_INSTRUMENT_SHIFT = 2
+"""Distance of the slope that serves as instrument [segments]: its height noise is independent, the hill is the same."""
+_BLOCK_SEGMENTS = 5
+"""Neighbouring segments have correlated residuals; σ is computed from blocks of this length."""
+_HUBER = 1.5
+"""Residuals beyond this many robust standard deviations get less weight."""
+_ITERATIONS = 12
+_LEVEL_RISE = 0.05
+"""Largest tangent of the slope of level ground."""
+_MIN_CHARGE_FALL = 0.05
+"""Smallest fall of a charge or state of charge that is compared, as a fraction: these counters have steps of 1 %."""
+_MIN_STRAIGHT_ROWS = 30
+_MIN_METER_ROWS = 50
+
+
+class Climb(NamedTuple):
+    """What a slope costs: power = … + factor · m g sin(slope) v. ``factor`` is 1 / efficiency, ``std`` its standard deviation.
+
+    ``reliability`` is the correlation of the slope with that of its neighbours, in [-1, 1]: below 0.7 the slopes are mostly noise.
+    """
+
+    factor: float
+    std: float
+    reliability: float
+
+    def judge(self, low: float, high: float, *, min_reliability: float, max_std_fraction: float) -> ScaleVerdict:
+        """Return what the factor proves of the scale of power, if ``low`` to ``high`` are possible."""
+        if not self.reliability >= min_reliability or not 0.0 < self.std < max_std_fraction * abs(self.factor):
+            return "unconfirmed"
+        return "confirmed" if low < self.factor < high else "contradicted"
+
+
+ScaleVerdict = Literal["confirmed", "contradicted", "unconfirmed"]
+
+
+def estimate_climb(
+    *,
+    power_watt: Floats,
+    velocity_mps: Floats,
+    rise: Floats,
+    mean_abs_yaw_rate_radps: Floats,
+    piece: NDArray[np.int64],
+    mass_kg: float,
+) -> Climb | None:
+    """Fit power = a + b v + factor · m g sin(slope) v + c |yaw rate| to segments; None for fewer than 20, or on level ground.
+
+    The slope of the segments two before and two behind is the instrument of each slope, so that noise of heights does not bias it.
+
+    Parameters
+    ----------
+    power_watt, velocity_mps, mean_abs_yaw_rate_radps : of each segment, in the order of driving, [W], [m/s], [rad/s], shape (M,).
+    rise : tangent of the slope along travel, shape (M,).
+    piece : number of the uninterrupted section that each segment is in, shape (M,).
+    mass_kg : mass of the robot [kg].
+    """
+    slope = rise / np.hypot(1.0, rise)
+    instrument = _average_neighbours(slope, piece)
+    turn = np.nan_to_num(mean_abs_yaw_rate_radps)
+    used = np.isfinite(power_watt + velocity_mps + slope + instrument)
+    if used.sum() < _MIN_SEGMENTS or not slope[used].std() > 0.0 or not instrument[used].std() > 0.0:
+        return None
+    ones, velocity = np.ones(int(used.sum())), velocity_mps[used]
+    weight = mass_kg * _GRAVITY_MPS2 * velocity
+    columns, instruments = (
+        np.column_stack([ones, velocity, weight * each[used], turn[used]]) for each in (slope, instrument)
+    )
+    factor, std = _fit_with_instruments(columns, instruments, power_watt[used], of=2)
+    return Climb(factor, std, float(np.corrcoef(slope[used], instrument[used])[0, 1]))
+
+
+def _average_neighbours(values: Floats, piece: NDArray[np.int64]) -> Floats:
+    """Return the mean of the values two before and two behind in the same piece, shape (M,); NaN without either."""
+    found = np.full((2, len(values)), np.nan)
+    shift = _INSTRUMENT_SHIFT
+    same = piece[shift:] == piece[:-shift]
+    found[0, shift:][same] = values[:-shift][same]
+    found[1, :-shift][same] = values[shift:][same]
+    known = np.isfinite(found)
+    total, count = np.where(known, found, 0.0).sum(axis=0), known.sum(axis=0)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, *, of: int) -> tuple[float, float]:
+    """Return one coefficient of a robust two-stage least-squares fit and its σ; columns and instruments have shape (M, K)."""
+    size = np.maximum(np.abs(columns).max(axis=0), 1e-12)
+    columns, instruments = columns / size, instruments / size
+    fitted = instruments @ np.linalg.lstsq(instruments, columns, rcond=None)[0]
+    weight, residual = np.ones(len(target)), target
+    inverse, value = np.eye(columns.shape[1]), np.zeros(columns.shape[1])
+    for _ in range(_ITERATIONS):
+        inverse = np.linalg.pinv(fitted.T @ (weight[:, None] * columns))
+        value = inverse @ (fitted.T @ (weight * target))
+        residual = target - columns @ value
+        limit = _HUBER * max(estimate_robust_std(residual), 1e-12)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-300)).astype(np.float64)
+    starts = np.arange(0, len(target), _BLOCK_SEGMENTS)
+    sums = np.add.reduceat(fitted * (weight * residual)[:, None], starts, axis=0)
+    covariance = inverse @ (sums.T @ sums) @ inverse.T * (len(starts) / max(len(starts) - columns.shape[1], 1))
+    return float(value[of] / size[of]), float(np.sqrt(covariance[of, of]) / size[of])
+
+
+def compute_weight_ratio(net_energy_jpm: Floats, rise: Floats, mass_kg: float) -> float | None:
+    """Return the median net energy per metre of level ground over the weight [1]; None for fewer than 20 such segments.
+
+    ``net_energy_jpm`` is the energy above idle power [J/m], ``rise`` the tangent of the slope, shape (M,); ``mass_kg`` [kg].
+    """
+    level = net_energy_jpm[np.isfinite(net_energy_jpm) & (np.abs(rise) < _LEVEL_RISE)]
+    return float(np.median(level)) / (mass_kg * _GRAVITY_MPS2) if len(level) >= _MIN_SEGMENTS else None
+
+
+def compare_charge(time_s: Floats, current_amp: Floats, charge_ah: Floats) -> float | None:
+    """Return the integral of the current over the fall of the charge [1]; None if the charge falls by less than 5 % of its first value.
+
+    ``time_s`` [s], ``current_amp`` [A] (positive when drawn) and ``charge_ah`` [Ah] have shape (N,); NaN is not measured.
+    """
+    known = np.isfinite(charge_ah) & (charge_ah > 0.0)
+    drawn = np.isfinite(current_amp)
+    if known.sum() < 2 or drawn.sum() < 2:
+        return None
+    first, last = np.flatnonzero(known)[[0, -1]]
+    fall_ah = float(charge_ah[first] - charge_ah[last])
+    if fall_ah < _MIN_CHARGE_FALL * charge_ah[first]:
+        return None
+    inside = drawn & (time_s >= time_s[first]) & (time_s <= time_s[last])
+    return float(np.trapezoid(current_amp[inside], time_s[inside])) / 3600.0 / fall_ah if inside.sum() > 1 else None
+
+
+def compare_meters(drive_watt: Floats, pack_watt: Floats) -> tuple[float, float] | None:
+    """Return the slope of the pack's power over the power of the drives, shape (N,), and their correlation; None for few rows.
+
+    A constant load of the pack (computers) does not change the slope.
+    """
+    known = np.isfinite(drive_watt + pack_watt)
+    drive, pack = drive_watt[known], pack_watt[known]
+    if known.sum() < _MIN_METER_ROWS or not drive.std() > 0.0 or not pack.std() > 0.0:
+        return None
+    drive, pack = drive - drive.mean(), pack - pack.mean()
+    product = float(drive @ pack)
+    return product / float(drive @ drive), product / float(np.sqrt((drive @ drive) * (pack @ pack)))
+
+
+def compute_side_share(first_amp: Floats, second_amp: Floats, is_straight: NDArray[np.bool_]) -> float | None:
+    """Return the share of the first of two sides in their current in straight driving [1]; None for fewer than 30 rows.
+
+    The currents [A], shape (N,), are positive when drawn. A share below 0.05 or above 0.95 shows that one whole side is not measured;
+    half a side cannot be told: sound robots have shares of 0.13 to 0.50.
+    """
+    used = is_straight & np.isfinite(first_amp + second_amp)
+    total = float((first_amp + second_amp)[used].sum())
+    return float(first_amp[used].sum()) / total if used.sum() >= _MIN_STRAIGHT_ROWS and total > 0.0 else None
