@@ -158,7 +158,7 @@ def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
     ordered = sort_findings(findings)
     found = [finding for finding in ordered if finding.severity != "note"]
-    notes = len(ordered) - len(found) - sum(finding.code == WITNESSES_OF_LABEL for finding in ordered)
+    notes = sum(finding.severity == "note" and finding.code != WITNESSES_OF_LABEL for finding in ordered)
     return list_findings(found[:most]) + _count_rest(len(found) - most, notes, more)
 
 
@@ -166,6 +166,8 @@ def list_findings(findings: Iterable[Finding]) -> list[str]:
     """Return every finding as a line, the worst first, notes too, with the recipe that fits in no line below it."""
     lines = []
     for finding in sort_findings(findings):
+        if finding.code == WITNESSES_OF_LABEL:  # a line of the verdict
+            continue
         lines += [f"{finding.severity}: {format_finding(finding)}"]
         lines += [f"    {line}" for line in format_remedy_blocks([finding])]
     return lines
@@ -190,13 +192,13 @@ def list_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) ->
 
 
 def describe_power(verdict: Verdict) -> list[str]:
-    """Return idle power, driving power and energy per metre beside those of known robots, as one line; nothing without energy."""
+    """Return idle and driving power, and the energy per metre of known robots, as one line; nothing without energy."""
     finding = next((finding for finding in verdict.labels if finding.subject.name == "energy"), None)
     if finding is None or "driving_watt" not in finding.numbers:
         return []
     sizes = {name: format_number(name, number) for name, number in finding.numbers.items()}
     idle = f"idle {sizes['idle_watt']}, " if "idle_watt" in sizes else ""
-    return [f"power: {idle}driving {sizes['driving_watt']}, {sizes['mean_jpm']}; known robots: {KNOWN_ENERGY}"]
+    return [f"power: {idle}driving {sizes['driving_watt']}; known robots: {KNOWN_ENERGY}"]
 
 
 def describe_label(name: str, finding: Finding | None) -> list[str]:
@@ -205,7 +207,14 @@ def describe_label(name: str, finding: Finding | None) -> list[str]:
         return [name]
     missing = f" ({finding.names['missing']})" if "missing" in finding.names else ""
     size = next((_format_size(key, finding.numbers) for key in finding.numbers if key.startswith("std")), "")
-    return [f"{name}{size}", f"confirmed by: {finding.names['witnesses']}{missing}"]
+    witnesses = ", ".join(f"{each}{_PROVES.get(each, '')}" for each in finding.names["witnesses"].split(", "))
+    return [f"{name}{size}", f"confirmed by: {witnesses}{missing}"]
+
+
+_PROVES: Mapping[str, str] = {
+    "slope": " (to a factor of three)", "charge": " (to a factor of three)", "second_meter": " (to a factor of two)"
+}  # fmt: skip
+"""What a witness of power proves of its scale."""
 
 
 def _format_size(key: str, numbers: Mapping[str, float]) -> str:
@@ -330,7 +339,7 @@ def format_mixed_groups(
     """Return the same of groups of different things, each with the arguments of `format_group`."""
     found = [group for group in groups if group[0].severity != "note"]
     ordered = sorted(found, key=lambda group: rank_severity(group[0].severity))[:most]
-    notes = len(groups) - len(found) - sum(group[0].code == WITNESSES_OF_LABEL for group in groups)
+    notes = sum(group.severity == "note" and group.code != WITNESSES_OF_LABEL for group, *_ in groups)
     return list_mixed_groups(ordered) + _count_rest(len(found) - most, notes, more)
 
 
@@ -338,6 +347,8 @@ def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]])
     """Return every group as a line, the worst first, notes too."""
     lines = []
     for group, total, what in sorted(groups, key=lambda entry: rank_severity(entry[0].severity)):
+        if group.code == WITNESSES_OF_LABEL:
+            continue
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines

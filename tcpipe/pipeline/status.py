@@ -36,6 +36,7 @@ from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
+from tcpipe.power.witnesses import compare_batteries
 from tcpipe.robust import estimate_robust_std
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding, read_threshold
@@ -226,14 +227,16 @@ def judge_runs(runs: Iterable[RunFacts], changes: Iterable[Finding]) -> Verdict:
 
 
 def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
-    """Return a finding for each measure of a robot that its latest runs have changed."""
+    """Return a finding for each measure of a robot that its latest runs have changed, and for runs with another battery resistance."""
+    runs = tuple(runs)
     series = dict[tuple[str, str, str], list[float]]()
     dated = [run for run in runs if run.start_ns is not None]
     for run in sorted(dated, key=lambda run: (run.start_ns or 0, run.run_id)):
         for measure, unit, value in _iterate_measures(run):
             series.setdefault((run.robot, measure, unit), []).append(value)
     found = ((key, shift) for key, values in series.items() if (shift := find_shift(values)) is not None)
-    return tuple(
+    batteries = compare_batteries((run.run_id, run.robot, run.findings) for run in runs)
+    return *batteries, *(
         make_finding(
             _CHANGE,
             Subject("column", measure),

@@ -150,6 +150,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
         variance = max(step / (len(at) - 3), 1e-300)
         return (unexplained(ones) - step) / variance, (unexplained(ones, at) - step) / variance
 
+    halves = _compare_halves(edge_ns, by_volt, weight)
     judged = {first: judge(first) for first in range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1)}
     first = max(judged, key=lambda at: judged[at][0])
     before, after = (
@@ -158,8 +159,28 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     is_sure = judged[first][0] > _SURE**2 and judged[first][1] > _GRADUAL**2
     least = read_threshold("current-gain-changes", "min_change_fraction")
     if not is_sure or min(before, after) <= 0.0 or abs(before / after - 1.0) < least:
-        return None
+        return halves
     return GainChange(int(edge_ns[first]), before / after)
+
+
+def _compare_halves(edge_ns: Stamps, by_volt: Floats, weight: Floats) -> GainChange | None:
+    """Return the gain of the second half of the blocks over the first; None where it is usual, or a half does not show the resistance."""
+    middle = len(weight) // 2
+    first, last = slice(middle), slice(middle, None)
+    if not (_is_known(by_volt[first], weight[first]) and _is_known(by_volt[last], weight[last])):
+        return None
+    ratio = float(by_volt[first].sum() / weight[first].sum()) / float(by_volt[last].sum() / weight[last].sum())
+    most = read_threshold("current-gain-changes", "max_ratio_of_halves")
+    return None if 1.0 / most <= ratio <= most else GainChange(int(edge_ns[middle]), ratio)
+
+
+def estimate_resistance_ohm(sag: Sag | None) -> float | None:
+    """Return the resistance of the battery by all of its sag [ohm]; None where it is not known to 5 %."""
+    if sag is None:
+        return None
+    edge_ns = np.arange(sag.stamp_ns[0], sag.stamp_ns[-1], round(_BLOCK_S * 1e9), dtype=np.int64)
+    by_volt, weight = (np.diff(product) for product in sag.products(edge_ns))
+    return -float(by_volt.sum() / weight.sum()) if len(weight) and _is_known(by_volt, weight) else None
 
 
 def _is_known(by_volt: Floats, by_amp: Floats) -> bool:

@@ -29,7 +29,7 @@ from tcpipe.power.sources import (
     sign_by_mean,
     unwrap_currents,
 )
-from tcpipe.power.witnesses import compare_charge
+from tcpipe.power.witnesses import compare_charge, compare_meters
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import (
     GAIN_STD_FRACTION,
@@ -80,6 +80,8 @@ class PowerReadings:
     """Lowest and highest current of a rail at rest [A]; None where a source does not state it."""
     charge_ratio: float | None = None
     """Integral of the current over the fall of the battery's charge; None without a counter, or where it falls by less than 5 %."""
+    meter_slope: float | None = None
+    """Slope of a second meter's power over this one; None without a second meter that follows it."""
     sides: Sides | None = None
     """Currents of both sides of the drive; None where they are not told apart."""
 
@@ -197,6 +199,43 @@ def _read_charge(columns: Columns) -> Floats | None:
 
 
 _CHARGES = ("charge", "percentage", "capacity", "design_capacity")
+
+
+_MIN_CORRELATION = 0.7
+"""Smallest correlation at which a second meter measures the same power."""
+
+
+def compare_second_meters(
+    power: PowerReadings,
+    topics: Mapping[str, tuple[str, Columns]],
+    meters: Mapping[str, tuple[str, Columns]],
+    known: Sequence[PowerSource],
+    *,
+    platform: str | None = None,
+) -> PowerReadings:
+    """Return the power with the slope of the second meter that contradicts it most; ``meters`` are power topics that are not used."""
+    series = [_sum_watt(topics[topic][1], rails) for topic, rails in power.rails.items()]
+    if not series or not meters:
+        return power
+    slopes = []
+    for topic, (type_name, columns) in meters.items():
+        choices = find_sources(type_name, topic, known, platform=platform, husky_power="battery")
+        rails = choices if isinstance(choices, Finding) else read_rails(columns, choices[0], topic, known)
+        if isinstance(rails, Finding) or len(columns[_LOG_TIME]) < read_threshold(REJECTED, "min_messages_count"):
+            continue
+        at_ns, watt = _sum_watt(columns, rails)
+        drive = sum(np.interp(at_ns, *each, left=np.nan, right=np.nan) for each in series)
+        slope, correlation = compare_meters(np.asarray(drive, np.float64), watt) or (np.nan, 0.0)
+        if abs(correlation) > _MIN_CORRELATION:
+            slopes.append(abs(slope))
+    return replace(power, meter_slope=max(slopes, key=lambda slope: abs(math.log(slope)), default=None))
+
+
+def _sum_watt(columns: Columns, rails: Sequence[RailReadings]) -> tuple[Floats, Floats]:
+    """Return the log times [ns] at which all rails of a topic have a power, and their sum [W]."""
+    watt = np.sum([rail.voltage_volt * rail.current_amp for rail in rails], axis=0)
+    known = np.isfinite(watt)
+    return np.asarray(columns[_LOG_TIME], np.float64)[known], watt[known]
 
 
 def _find_sides(

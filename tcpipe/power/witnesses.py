@@ -13,12 +13,14 @@ The limits were measured on logs of two Warthogs and a rover and on simulated dr
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.robust import estimate_robust_std
+from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding, Severity, Subject, make_finding, read_threshold
 
 Floats = NDArray[np.float64]
 
@@ -114,9 +116,10 @@ def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, 
     columns, instruments = columns / size, instruments / size
     fitted = instruments @ np.linalg.lstsq(instruments, columns, rcond=None)[0]
     weight, residual = np.ones(len(target)), target
-    inverse, value = np.eye(columns.shape[1]), np.zeros(columns.shape[1])
+    inverse: Floats = np.eye(columns.shape[1])
+    value: Floats = np.zeros(columns.shape[1])
     for _ in range(_ITERATIONS):
-        inverse = np.linalg.pinv(fitted.T @ (weight[:, None] * columns))
+        inverse = np.asarray(np.linalg.pinv(fitted.T @ (weight[:, None] * columns)), np.float64)
         value = inverse @ (fitted.T @ (weight * target))
         residual = target - columns @ value
         limit = _HUBER * max(estimate_robust_std(residual), 1e-12)
@@ -176,3 +179,31 @@ def compute_side_share(first_amp: Floats, second_amp: Floats, is_straight: NDArr
     used = is_straight & np.isfinite(first_amp + second_amp)
     total = float((first_amp + second_amp)[used].sum())
     return float(first_amp[used].sum()) / total if used.sum() >= _MIN_STRAIGHT_ROWS and total > 0.0 else None
+
+
+_BATTERY = "battery-resistance-differs"
+RESISTANCE_OHM = "battery_ohm"
+"""Number in a finding on the witnesses of energy: resistance of the battery by its sag [ohm]."""
+
+
+def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Iterator[Finding]:
+    """Yield each run whose battery has another resistance than the median of the other runs of its robot.
+
+    ``runs`` are run, robot and findings of each. The voltage sags in proportion to the current, so that a run with another scale of its
+    current shows another resistance.
+    """
+    by_robot: dict[str, dict[str, float]] = {}
+    for run_id, robot, findings in runs:
+        for finding in findings:
+            if finding.code == WITNESSES_OF_LABEL and RESISTANCE_OHM in finding.numbers:
+                by_robot.setdefault(robot, {})[run_id] = finding.numbers[RESISTANCE_OHM]
+    most, most_of_batteries = (read_threshold(_BATTERY, name) for name in ("max_ratio", "max_ratio_of_batteries"))
+    for robot, by_run in by_robot.items():
+        for run_id, ohm in by_run.items():
+            others = [other for other_id, other in by_run.items() if other_id != run_id]
+            ratio = ohm / float(np.median(others)) if others else 1.0
+            if max(ratio, 1.0 / ratio) > most:
+                severity: Severity | None = "error" if max(ratio, 1.0 / ratio) > most_of_batteries else None
+                yield make_finding(
+                    _BATTERY, Subject("run", run_id), severity=severity, names={"robot": robot}, ratio=ratio
+                )

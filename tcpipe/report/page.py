@@ -49,7 +49,16 @@ from tcpipe.formats.finding_lines import (
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
-from tcpipe.tables.findings import AFFECTED, Affected, Finding, Grade, Severity, Verdict, sort_findings
+from tcpipe.tables.findings import (
+    AFFECTED,
+    WITNESSES_OF_LABEL,
+    Affected,
+    Finding,
+    Grade,
+    Severity,
+    Verdict,
+    sort_findings,
+)
 
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Invisible characters and those that reverse the direction of text; a name may contain them."""
@@ -139,7 +148,7 @@ def show_verdict(
         grades=tuple((name, getattr(verdict, name), _describe_witnesses(verdict, name)) for name in labels),
         shown=tuple(problems[:MOST_LINES]),
         more=tuple(problems[MOST_LINES:]),
-        notes=tuple(line for line in shown if line.severity == "note"),
+        notes=tuple(line for line in shown if line.severity == "note" and line.code != WITNESSES_OF_LABEL),
     )
 
 

@@ -49,9 +49,9 @@ GENERIC = "generic"
 MAX_PLAUSIBLE_MPS = 15.0
 """No ground robot that records terrain costs is faster [m/s]: a faster track is an estimate that went astray."""
 
-KNOWN_ENERGY = "e-scooter 36 to 146, rover of 20 kg 210, Husky 170 to 340, Warthog 440 to 810 J/m"
-"""Energy per metre of known robots: 51 trips of e-scooters (SFIEssential/DualEMobilityData), the rover of docs/explanation/real-data.md, a
-simulated Husky, and Warthogs on grass and snow (norlab-ulaval/DRIVE, fomo-sdk)."""
+KNOWN_ENERGY = "e-scooter 36 to 146, Husky 170 to 340, Warthog 440 to 810 J/m"
+"""Energy per metre of known robots: 51 trips of e-scooters (SFIEssential/DualEMobilityData), a simulated Husky, and Warthogs on grass and
+snow (norlab-ulaval/DRIVE, fomo-sdk)."""
 
 CurrentSign = Literal["drawn_positive", "drawn_negative", "auto"]
 

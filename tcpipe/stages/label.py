@@ -140,7 +140,7 @@ def label_segments(
     start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
     findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
     findings += find_unpowered_motion(table, physics, masked.info, start_ns)
-    findings += find_witnesses(table, masked.info.report.facts, robot)
+    findings += find_witnesses(table, replace(masked.info.report.facts, label=facts), robot)
     info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,9 @@ from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.power.audit import (
+    Sag,
     estimate_offset_std,
+    estimate_resistance_ohm,
     find_gain_change,
     find_lost_signs,
     measure_rest_currents,
@@ -56,11 +58,14 @@ def audit_power_sensor(
     late = clocks is not None and "power" in clocks.offsets and clocks.offsets["power"].noted  # flags every label
     corrected_s = info.report.facts.time_offset_s.get("power", 0.0)
     smoothing = None if late else _find_longest_smoothing(rows, rails_by_epoch, corrected_s)
-    facts = PowerSensorFacts(*_find_prior(power), smoothing=smoothing)
+    sags = [measure_sag(rails) for rails in rails_by_epoch.values()]
+    resistances_ohm = [ohm for sag in sags if (ohm := estimate_resistance_ohm(sag)) is not None]
+    battery_ohm = float(np.median(resistances_ohm)) if resistances_ohm else None
+    facts = PowerSensorFacts(*_find_prior(power), battery_ohm=battery_ohm, smoothing=smoothing)
     if config.power_gain_std_fraction is not None:
         facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
     else:
-        facts = _add_gain_change(facts, rails_by_epoch)
+        facts = _add_gain_change(facts, sags)
     if config.power_offset_std_amp is not None:
         return replace(facts, offset_std_amp=config.power_offset_std_amp)
     if power is None or power.rest_current_amp is None:
@@ -88,9 +93,9 @@ def _find_prior(power: PowerSign | None) -> tuple[float, float]:
     return GAIN_STD_FRACTION if gain is None else gain, OFFSET_STD_AMP if offset is None else offset
 
 
-def _add_gain_change(facts: PowerSensorFacts, rails_by_epoch: Mapping[int, list[Rail]]) -> PowerSensorFacts:
+def _add_gain_change(facts: PowerSensorFacts, sags: Sequence[Sag | None]) -> PowerSensorFacts:
     """Return the facts with a changed gain: of both parts of the run either may be right."""
-    changes = [found for rails in rails_by_epoch.values() if (found := find_gain_change(measure_sag(rails)))]
+    changes = [found for sag in sags if (found := find_gain_change(sag))]
     if not changes:
         return facts
     change = max(changes, key=lambda candidate: abs(candidate.ratio - 1.0))

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
-from tcpipe.power.witnesses import Climb, ScaleVerdict, compute_weight_ratio, estimate_climb
+from tcpipe.power.witnesses import RESISTANCE_OHM, Climb, ScaleVerdict, compute_weight_ratio, estimate_climb
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Robot
 from tcpipe.tables.columns import to_floats, to_integers
@@ -105,7 +105,13 @@ def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> 
         yield make_finding(_LARGE, _POWER, mean_jpm=energy["mean_jpm"], max_jpm=read_threshold(_LARGE, "max_mean_jpm"))
     idle_watt = to_floats(table, "idle_power_watt")[0]
     sizes = {"driving_watt": np.nanmedian(to_floats(table, "power_watt")), "idle_watt": idle_watt}
-    yield _make_witnesses("energy", confirming, ", ".join(missing), **energy, **sizes)
+    why = (
+        f"contradicted by {', '.join(each.witness for each in contradicting)}" if contradicting else ", ".join(missing)
+    )
+    sensor = facts.label.power_sensor if facts.label else None
+    if sensor is not None and sensor.battery_ohm is not None:
+        sizes[RESISTANCE_OHM] = sensor.battery_ohm
+    yield _make_witnesses("energy", confirming, why, **energy, **sizes)
 
 
 def _make_implausible(found: _Comparison, *, is_confirmed: bool) -> Finding:

@@ -24,6 +24,7 @@ from tcpipe.stages.read_power import (
     add_averaging,
     find_repeats,
     find_side_share,
+    list_second_meters,
     read_rail_power,
     remove_repeats,
 )
@@ -98,6 +99,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
         raise RoleError(*assignment.problems, findings=(*assignment.findings, *proposals))
     # 2. Messages to SI columns; what cannot be used is counted.
     played = dict.fromkeys(topic for role in assignment.roles.values() for topic in role.topics)
+    played |= dict.fromkeys(list_second_meters(assignment, log.topics, config, known))
     lists = {topic: list_power_lists(log.topics[topic].type_name, known.power_sources) for topic in played}
     messages, tables = gather_messages(log.batches([*played, *assignment.static_transforms]), lists)
     every, power, unread = read_sources(messages, log.topics, assignment, config, known=known)
@@ -234,6 +236,7 @@ def _describe_power(power: PowerReadings, side_share: float | None) -> PowerSign
         power.offset_std_amp,
         power.rest_current_amp,
         charge_ratio=power.charge_ratio,
+        meter_slope=power.meter_slope,
         side_share=side_share,
     )
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from tcpipe.logs.field_mapping import Columns
 from tcpipe.logs.messages import LOG_TIME, Readings, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.power.readings import PowerReadings, read_power
+from tcpipe.logs.topics import Topic
+from tcpipe.power.readings import PowerReadings, compare_second_meters, read_power
 from tcpipe.power.sampling import find_readings, is_stated_averaged
-from tcpipe.power.sources import Counter, RailReadings, find_lone_side, reject_power
+from tcpipe.power.sources import FLOAT_TYPES, Counter, RailReadings, find_lone_side, reject_power
 from tcpipe.power.witnesses import compute_side_share
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
@@ -32,8 +33,12 @@ def read_power_of_topics(
     config: ReadConfig,
     *,
     known: Profiles,
+    meters: Mapping[str, tuple[str, Columns]] = {},
 ) -> PowerReadings:
-    """Return the rails of the topics used as power, by message type and columns; none unless all of them can be decoded."""
+    """Return the rails of the topics used as power, by message type and columns; none unless all of them can be decoded.
+
+    ``meters`` are power topics that are not used; the power is compared with them.
+    """
     wanted = len(assignment.roles["power"].topics) if "power" in assignment.roles else 0
     if not topics:
         return PowerReadings()
@@ -42,14 +47,31 @@ def read_power_of_topics(
         return PowerReadings(findings=tuple(reject_power(topic, "not-decoded") for topic in lost))
     if "power" not in config.topics and (topic := find_lone_side(topics)):
         return PowerReadings(findings=(reject_power(topic, "other-side-missing"),))
-    return read_power(
+    platform = known.robots[assignment.robot].platform
+    power = read_power(
         topics,
         known.power_sources,
-        platform=known.robots[assignment.robot].platform,
+        platform=platform,
         husky_power=config.husky_power,
         current_sign=config.current_sign,
         current_scale=config.current_scale,
     )
+    return compare_second_meters(power, topics, meters, known.power_sources, platform=platform)
+
+
+def list_second_meters(
+    assignment: RoleAssignment, topics: Mapping[str, Topic], config: ReadConfig, known: Profiles
+) -> list[str]:
+    """Return the topics of known power messages that are not used, to be compared with those that are."""
+    types = set(known.types()) - {*known.refusals(), *FLOAT_TYPES}
+    return [
+        topic
+        for topic in assignment.left_out
+        if "power" in assignment.roles
+        and topic not in config.ignore_topics
+        and topics[topic].type_name in types
+        and topics[topic].problem is None
+    ]
 
 
 _STRAIGHT_RADPS, _MOVING_MPS = 0.05, 0.2

@@ -33,7 +33,7 @@ from tcpipe.recipe import Extrinsics, ReadConfig, Role
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import Arrays, LogReader, read_transforms
-from tcpipe.stages.read_power import read_power_of_topics, select_power_rows
+from tcpipe.stages.read_power import list_second_meters, read_power_of_topics, select_power_rows
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor
@@ -80,7 +80,13 @@ def read_sources(
         arrays[role, topic] = _read_fields(messages[topic], role, config)
     types = {topic: topics[topic].type_name for _, topic in arrays}
     of_power = {topic: (types[topic], columns) for (role, topic), columns in arrays.items() if role == "power"}
-    power = read_power_of_topics(of_power, assignment, config, known=known)
+    used = {topic for _, topic in played}
+    meters = {
+        topic: (topics[topic].type_name, messages[topic])
+        for topic in list_second_meters(assignment, topics, config, known)
+        if topic in messages and topic not in used
+    }
+    power = read_power_of_topics(of_power, assignment, config, known=known, meters=meters)
     sources = []
     messages.clear()
     for role, topic in list(arrays):

@@ -400,13 +400,15 @@ class Smoothing:
 class PowerSensorFacts:
     """What is not known of the power sensor: σ of its gain and of the zero of a rail [A], and what the log shows (`tcpipe.power.audit`).
 
-    ``rest_amp``: lowest and highest current of a rail in halts; the gain changed by ``gain_ratio`` at ``gain_changed_ns``;
-    ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None where none shows.
+    ``rest_amp``: lowest and highest current of a rail in halts; ``battery_ohm``: resistance of the battery by its sag [ohm]; the gain
+    changed by ``gain_ratio`` at ``gain_changed_ns``; ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None
+    if power is not smoothed.
     """
 
     gain_std_fraction: float
     offset_std_amp: float
     rest_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    battery_ohm: float | None = field(default=None, metadata=LEFT_OUT)
     gain_ratio: float | None = field(default=None, metadata=LEFT_OUT)
     gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
     lost_signs: int = 0

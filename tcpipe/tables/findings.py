@@ -264,7 +264,7 @@ class Verdict:
 
 
 def judge(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict: each label has the grade of the worst finding that affects it; nothing unconfirmed is better than usable with care."""
+    """Return the verdict: each label has the grade of its worst finding; without a witness it is usable with care at best."""
     catalogue, findings = read_catalogue(), tuple(findings)
     decisive = (
         finding

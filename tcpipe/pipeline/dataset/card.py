@@ -29,6 +29,7 @@ from tcpipe.formats.maps.map_facts import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
+from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
@@ -212,6 +213,7 @@ def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
     yield from _find_empty_splits(card)
     yield from (_find_leakage(part, card) for part in card.split.audit if part.overlapping_samples)
     yield from _find_thin_ground(card)
+    yield from compare_batteries((run.run_id, run.robot, run.findings) for run in card.runs if run.samples)
     if not any(card.balance.repeatability.values()):
         yield make_finding("no-repeated-places", dataset)
 
