@@ -187,7 +187,7 @@ RESISTANCE_OHM = "battery_ohm"
 
 
 def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Iterator[Finding]:
-    """Yield each run whose battery has another resistance than the median of the other runs of its robot.
+    """Yield each run whose battery has another resistance than the other runs of its robot.
 
     ``runs`` are run, robot and findings of each. The voltage sags in proportion to the current, so that a run with another scale of its
     current shows another resistance.
@@ -201,6 +201,8 @@ def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Ite
     for robot, by_run in by_robot.items():
         for run_id, ohm in by_run.items():
             others = [other for other_id, other in by_run.items() if other_id != run_id]
+            if len(others) > 1:  # of three or more runs a single odd one does not make the others odd
+                others.append(ohm)
             ratio = ohm / float(np.median(others)) if others else 1.0
             if max(ratio, 1.0 / ratio) > most:
                 severity: Severity | None = "error" if max(ratio, 1.0 / ratio) > most_of_batteries else None

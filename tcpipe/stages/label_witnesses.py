@@ -95,7 +95,7 @@ def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> 
     confirming = [each.witness for each in comparisons if each.proves == "confirmed"]
     contradicting = [each for each in comparisons if each.proves == "contradicted"]
     if contradicting:
-        yield _make_implausible(max(contradicting, key=lambda each: each.excess), is_confirmed=bool(confirming))
+        yield _make_implausible(max(contradicting, key=lambda each: each.excess), comparisons)
     share = facts.power.side_share if facts.power else None
     limit = read_threshold(_SIDE, "min_share_fraction")
     if share is not None and not limit <= share <= 1.0 - limit:
@@ -114,12 +114,13 @@ def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> 
     yield _make_witnesses("energy", confirming, why, **energy, **sizes)
 
 
-def _make_implausible(found: _Comparison, *, is_confirmed: bool) -> Finding:
+def _make_implausible(found: _Comparison, comparisons: list[_Comparison]) -> Finding:
     """Return the finding that a witness contradicts the scale of power; only a warning where another witness confirms it."""
+    is_confirmed = any(each.proves == "confirmed" for each in comparisons)
     above = found.ratio > found.high
     bound = found.high if above else found.low
     scale = found.scale
-    mends = scale != 1.0 and found.low < found.ratio * scale < found.high
+    mends = scale != 1.0 and all(each.low < each.ratio * scale < each.high for each in comparisons)
     return make_finding(
         _IMPLAUSIBLE,
         _POWER,
@@ -137,7 +138,7 @@ def _compare_power(table: pa.Table, facts: StageFacts, robot: Robot) -> tuple[li
     power = facts.power
     for witness, ratio, most in (
         ("charge", power.charge_ratio if power else None, limit["max_charge_factor"]),
-        ("second_meter", power.meter_slope if power else None, limit["max_meter_factor"]),
+        ("second_meter", 1.0 / power.meter_slope if power and power.meter_slope else None, limit["max_meter_factor"]),
     ):
         if ratio is None:
             missing += [f"no {witness.replace('_', ' ')}"]
