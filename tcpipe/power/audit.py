@@ -107,6 +107,13 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
     return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
 
 
+def correlate_sag(rails: Sequence[Rail]) -> float:
+    """Return the correlation of the voltage with the whole current, of either sign; 0 where it is unknown."""
+    sag = measure_sag(rails)
+    size = 0.0 if sag is None else float(np.linalg.norm(sag.volt) * np.linalg.norm(sag.amp))
+    return abs(float(sag.volt @ sag.amp)) / size if sag is not None and size > 0.0 else 0.0
+
+
 def _compute_moving_mean(values: Floats, rows: int) -> Floats:
     """Return the mean over so many rows around each, the ends repeated."""
     padded = np.pad(values, (rows // 2 + 1, rows - rows // 2 - 1), mode="edge")

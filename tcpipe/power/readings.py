@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from tcpipe.power.audit import correlate_sag
+from tcpipe.power.plausibility import find_isolated, find_missing_rows
+from tcpipe.power.rails import Rail, make_rail, make_samples
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
@@ -29,11 +32,11 @@ from tcpipe.power.sources import (
 )
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import GAIN_STD_FRACTION, LOSS_STD_FRACTION, TORQUE_GAIN_STD_FRACTION, CurrentSign, PowerSource
-from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold, select_findings
 
 _LOG_TIME = "log_time_ns"
 _POWER = Subject("role", "power")
-_ODD, _ASSUMED = "power-values-excluded", "current-sign-assumed"
+_EXCLUDED, _ASSUMED, _WRAPPED = "power-values-excluded", "current-sign-assumed", "current-wrapped"
 _SIGNS = ("drawn_negative", "drawn_positive")
 
 Rails = Mapping[str, list[RailReadings]]
@@ -102,20 +105,24 @@ def read_power(
         gains += [_find_gain_std(source, rail.joints) for source, rail in zip(found.sources, found.rails, strict=True)]
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
-    rejected = rejected or _find_incomplete(rails) or _find_too_small(rails)
+    rejected = rejected or _find_incomplete(rails)
+    log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
+    if not rejected:
+        rails, excluded = _exclude_rows(rails, log_times)
+        rails, wrapped = _undo_overflows(rails, log_times)
+        findings += [*excluded, *wrapped]
+        rejected = select_findings(findings, REJECTED) or _find_too_small(rails)
     if rejected:
         if len(scaled) == len(topics) and all(scaled.values()):
             rejected[0] = replace(rejected[0], remedies=_propose_sources(scaled))
         return PowerReadings(findings=tuple(rejected))
-    rails, odd = _exclude_implausible(rails)
-    log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
     given: CurrentSign = "auto" if any(source.joints for source in sources) else current_sign
     sign, of_sign, told_by = _sign(rails, log_times, sources, given)
     if sign == 0:
         return PowerReadings(findings=of_sign)
     includes = tuple(dict.fromkeys(source.other_loads for source in sources if source.other_loads))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
-    findings += [*of_sign, *odd, *loads, *_find_nominal(sources)]
+    findings += [*of_sign, *loads, *_find_nominal(sources)]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(source.energy for source in sources)
     unknown = any(source.averaging_unknown for source in sources) and not counts
@@ -237,7 +244,7 @@ def _unwrap_currents(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
     if wraps_amp is None:
         return rail, []
     count = int(np.count_nonzero(rail.current_amp > wraps_amp / 2))
-    found = make_finding("current-wrapped", _POWER, names=names, currents_count=count, wraps_amp=wraps_amp)
+    found = make_finding(_WRAPPED, _POWER, names=names, currents_count=count, wraps_amp=wraps_amp)
     return replace(rail, current_amp=unwrap_currents(rail.current_amp, wraps_amp)), [found]
 
 
@@ -296,33 +303,69 @@ def _find_too_few(topic: str, log_time_ns: Floats) -> list[Finding]:
     )
 
 
-def _exclude_implausible(rails: Rails) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
-    """Return the rails with NaN for single values that no battery and no drive has (saturated, lost), and a finding for each rail.
+def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
+    """Return the rails with NaN in all rows that are no measurement, and findings: on their number, or that the power is rejected.
 
-    Without current a low voltage may be true: a drive that is not switched on yet sends zeros.
+    A row is one measurement: where its voltage or its current is missing or implausible, both are excluded. A driver sends such rows before
+    the sensor starts and after it stops; these are not counted.
     """
-    low, high = read_threshold(_ODD, "min_of_median"), read_threshold(_ODD, "max_of_median")
     kept: dict[str, list[RailReadings]] = {}
     findings = []
     for topic, found in rails.items():
         kept[topic] = []
         for rail in found:
-            known = rail.voltage_volt[np.isfinite(rail.voltage_volt)]
-            usual = float(np.median(known)) if known.size else np.nan
-            low_volt, high_volt = usual * low, usual * high
-            odd_volt = ((rail.voltage_volt < low_volt) & (rail.current_amp != 0.0)) | (rail.voltage_volt > high_volt)
-            odd_amp = np.abs(rail.current_amp) > rail.largest_amp
-            counts: dict[str, Any] = {
-                "voltages_count": int(np.count_nonzero(odd_volt)),
-                "currents_count": int(np.count_nonzero(odd_amp)) + rail.unmeasured_count,
-            }
-            if any(counts.values()):
-                numbers = counts | {"low_volt": low_volt, "high_volt": high_volt, "high_amp": rail.largest_amp}
-                numbers = {name: value for name, value in numbers.items() if np.isfinite(value)}
-                findings.append(make_finding(_ODD, _POWER, names={"rail": rail.name}, **numbers))
-            volt, amp = np.where(odd_volt, np.nan, rail.voltage_volt), np.where(odd_amp, np.nan, rail.current_amp)
+            volt, amp = rail.voltage_volt, np.where(np.abs(rail.current_amp) > rail.largest_amp, np.nan, rail.current_amp)
+            excluded = find_missing_rows(volt, amp) | (np.isnan(amp) & np.isfinite(rail.current_amp))
+            isolated, is_rejected = find_isolated(np.where(excluded, np.nan, amp), log_times[topic] / 1e9)
+            excluded |= isolated
+            if is_rejected:
+                findings.append(reject_power(topic, "isolated-values", names={"rail": rail.name}))
+            live = np.flatnonzero((np.isfinite(volt) | np.isfinite(amp)) & ~excluded)
+            inner = excluded[live[0] : live[-1]] if live.size else excluded[:0]
+            if count := max(int(np.count_nonzero(inner)), rail.unmeasured_count):
+                numbers = {"rows_count": count, "rows_fraction": count / len(volt)}
+                findings.append(make_finding(_EXCLUDED, _POWER, names={"rail": rail.name}, **numbers))
+            volt, amp = np.where(excluded, np.nan, volt), np.where(excluded, np.nan, amp)
             kept[topic].append(replace(rail, voltage_volt=volt, current_amp=amp))
     return kept, findings
+
+
+def _undo_overflows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Rails, list[Finding]]:
+    """Return the rails with overflows of signed currents undone where the voltage confirms it, and findings, also that it does not."""
+    whole, findings = {topic: list(found) for topic, found in rails.items()}, []
+    for topic, found in whole.items():
+        for at, rail in enumerate(found):
+            if rail.overflow is not None:
+                changed = np.isfinite(rail.current_amp) & (rail.overflow.current_amp != rail.current_amp)
+                current_amp = np.where(np.isfinite(rail.current_amp), rail.overflow.current_amp, np.nan)
+                found[at] = replace(rail, current_amp=current_amp)
+                numbers = {"currents_count": int(np.count_nonzero(changed)), "wraps_amp": rail.overflow.span_amp}
+                findings.append(make_finding(_WRAPPED, _POWER, names={"rail": rail.name}, **numbers))
+                if not rail.overflow.is_clear:
+                    findings.append(reject_power(topic, "current-overflow", names={"rail": rail.name}))
+    if not findings:
+        return rails, []
+    before, after = (correlate_sag(_make_rails(each, log_times)) for each in (rails, whole))
+    if before >= max(after, read_threshold(_WRAPPED, "min_correlation")):
+        return rails, []
+    rejected = [found for found in findings if found.code == REJECTED]
+    if not rejected and after <= before:
+        rejected = [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
+    return whole, rejected or findings
+
+
+def _make_rails(rails: Rails, log_times: Mapping[str, Floats]) -> list[Rail]:
+    """Return the rails by log time, each with the voltages and currents of all its topics."""
+    parts: dict[str, list[tuple[Floats, Floats, Floats]]] = {}
+    for topic, found in rails.items():
+        for rail in found:
+            parts.setdefault(rail.name, []).append((log_times[topic], rail.voltage_volt, rail.current_amp))
+    made = []
+    for name, columns in parts.items():
+        time_ns, volt, amp = (np.concatenate(column) for column in zip(*columns, strict=True))
+        samples = (make_samples(time_ns.astype(np.int64), value) for value in (volt, amp))
+        made.append(make_rail(name, *samples, averaged=False))
+    return made
 
 
 def _sign(

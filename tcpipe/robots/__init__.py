@@ -41,6 +41,13 @@ a stated loss: copper's resistance rises by 0.39 % a kelvin."""
 TABLE_POWER = "tcpipe/msg/TablePower"
 """The type of a table of power, where that is neither a voltage nor a current as it stands."""
 
+UNMEASURED_AMP = {
+    "battery_status": (-1.0,),
+    "": (-1.0, *(limit / 10**digits for limit in (32767.0, -32768.0, 65535.0) for digits in range(4))),
+}
+"""Currents that mean "not measured", as recorded, by message: PX4 defines -1 A. Of all other messages (""), -1 and the limits of registers of
+16 bits may be real: they count only where both neighbours are far. NaN and a voltage of 0 V or less are never a measurement."""
+
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
 
