@@ -28,18 +28,17 @@ _FEWEST_BLOCKS = 6
 _FEWEST_SAMPLES = 400
 _CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
 """Standard deviations that show the resistance itself, a change of it, and that it is not gradual (a battery warms up)."""
-"""Median of the absolute value of a normal variate of unit variance."""
 _FEWEST_BRAKED = 5
 _LIKELY = 8.0
 """Logarithm of a ratio of likelihoods: of three thousand segments one by chance."""
-_SETTLED_NS = 300_000_000
-"""After a stop and before a start the motors still draw."""
+SETTLED_S = 0.3
+"""After a stop and before a start the motors still draw power for this long [s]."""
 _SHORTEST_HALT_NS = 1_000_000_000
 
 
 def measure_rest_currents(rail: Rail, still_ns: Stamps) -> Floats:
     """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), begin and end [ns]."""
-    settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
+    settled = still_ns + np.rint(1e9 * np.array([SETTLED_S, -SETTLED_S])).astype(np.int64)
     settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
     first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
     sums = np.concatenate(([0.0], np.cumsum(rail.current.value)))

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 
 from tcpipe.power.audit import correlate_sag
 from tcpipe.power.plausibility import find_isolated, find_missing_rows
-from tcpipe.power.rails import Rail, make_rail, make_samples
+from tcpipe.power.rails import Rail, is_power_only, make_rail, make_samples
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
@@ -62,6 +61,10 @@ class PowerReadings:
     """Of the zero of its current [A]."""
     rest_current_amp: tuple[float, float] | None = None
     """Lowest and highest current of a rail at rest [A]; None where a source does not state it."""
+    offset_amp: float = 0.0
+    """Zero of each rail's current that the recipe states [A]; it is not subtracted yet."""
+    is_charging: bool = False
+    """Whether messages state that the battery is charged."""
 
     @property
     def is_rejected(self) -> bool:
@@ -76,6 +79,7 @@ def read_power(
     platform: str | None = None,
     husky_power: HuskyPower = "battery",
     current_sign: CurrentSign = "auto",
+    offset_amp: float = 0.0,
 ) -> PowerReadings:
     """Return the rails of all power topics, with every current positive when drawn.
 
@@ -122,7 +126,9 @@ def read_power(
         return PowerReadings(findings=of_sign)
     includes = tuple(dict.fromkeys(source.other_loads for source in sources if source.other_loads))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
-    findings += [*of_sign, *loads, *_find_nominal(sources)]
+    nominal = list(_find_nominal(sources))
+    constant = [] if nominal else list(_find_constant_voltages(rails, log_times))
+    findings += [*of_sign, *loads, *nominal, *constant]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(source.energy for source in sources)
     unknown = any(source.averaging_unknown for source in sources) and not counts
@@ -135,12 +141,36 @@ def read_power(
         tuple(dict.fromkeys(findings)),
         told_by,
         includes,
-        gain_std_fraction=max(gains),
+        gain_std_fraction=math.hypot(max(gains), read_threshold(_CONSTANT, "std_fraction") if constant else 0.0),
         offset_std_amp=max(source.zero_std for source in sources),
         rest_current_amp=(min(range_amp[0] for range_amp in rest), max(range_amp[1] for range_amp in rest))
         if rest and len(rest) == sum(bool(source.current or source.energy) for source in sources)
         else None,
+        offset_amp=offset_amp,
+        is_charging=any(np.any(columns.get(_STATUS, ()) == _CHARGING) for _, columns in topics.values()),
     )
+
+
+_STATUS, _CHARGING = "power_supply_status", 1
+"""Of sensor_msgs/BatteryState."""
+
+
+def _find_constant_voltages(rails: Rails, log_times: Mapping[str, Floats]) -> Iterator[Finding]:
+    """Yield the rails whose voltage has too few levels to be measured, while their current changes."""
+    for rail in _make_rails(rails, log_times):
+        levels, currents = (np.unique(signal.value).size for signal in (rail.voltage, rail.current))
+        if (
+            not is_power_only(rail.voltage.value)
+            and levels < read_threshold(_CONSTANT, "min_levels_count") <= currents / 4
+        ):
+            numbers = {
+                "voltage_volt": np.median(rail.voltage.value),
+                "std_fraction": read_threshold(_CONSTANT, "std_fraction"),
+            }
+            yield make_finding(_CONSTANT, _POWER, names={"rail": rail.name}, **numbers)
+
+
+_CONSTANT = "voltage-constant"
 
 
 def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
@@ -314,7 +344,10 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
     for topic, found in rails.items():
         kept[topic] = []
         for rail in found:
-            volt, amp = rail.voltage_volt, np.where(np.abs(rail.current_amp) > rail.largest_amp, np.nan, rail.current_amp)
+            volt, amp = (
+                rail.voltage_volt,
+                np.where(np.abs(rail.current_amp) > rail.largest_amp, np.nan, rail.current_amp),
+            )
             excluded = find_missing_rows(volt, amp) | (np.isnan(amp) & np.isfinite(rail.current_amp))
             isolated, is_rejected = find_isolated(np.where(excluded, np.nan, amp), log_times[topic] / 1e9)
             excluded |= isolated

@@ -99,6 +99,8 @@ class ReadConfig(_Section):
     """Units of the IMU: si is rad/s and m/s² as in REP-103; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
     current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"
     """Sign of currents: auto uses that of the message type; for BatteryState, which differs by robot, the mean over the run decides."""
+    current_offset_amp: Annotated[float, Bounds(ge=-1e4, le=1e4)] = field(default=0.0, metadata={"json": (0.0,)})
+    """Zero of each rail's current, positive as drawn, that is subtracted [A]; of a power without voltage [W]."""
     power_averaged: Literal["auto", "yes", "no"] = "auto"
     """Whether the power source averages over its message period: auto uses the value of the message type."""
     husky_power: Literal["battery", "drivers"] = "battery"

@@ -174,7 +174,12 @@ def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings)
     for rail in power.rails[source.topic]:
         voltage, current = read_rail_power(rail, times, columns)
         known = np.isfinite(voltage) | np.isfinite(current)
-        values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
+        values = {
+            **times,
+            "rail": np.full(len(known), rail.name),
+            "voltage_volt": voltage,
+            "current_amp": current - power.offset_amp,
+        }
         parts.append({name: value[known] for name, value in values.items()})
     return parts
 
@@ -226,6 +231,8 @@ def _describe_power(power: PowerReadings) -> PowerSign:
         power.gain_std_fraction,
         power.offset_std_amp,
         power.rest_current_amp,
+        power.offset_amp,
+        power.is_charging,
     )
 
 

@@ -47,6 +47,7 @@ def read_power_of_topics(
         platform=known.robots[assignment.robot].platform,
         husky_power=config.husky_power,
         current_sign=config.current_sign,
+        offset_amp=config.current_offset_amp,
     )
 
 
@@ -61,19 +62,20 @@ def name_counter_columns(rail: str) -> tuple[str, str]:
 
 
 def select_power_rows(columns: Columns, rails: Sequence[RailReadings]) -> Readings:
-    """Return the rows of a power topic on which at least one rail carries a voltage or a current."""
+    """Return the rows in which a rail has a voltage or a current; only rows between them count as not used."""
     values = {
         name: values
         for rail in rails
         for name, values in zip(name_rail_columns(rail.name), (rail.voltage_volt, rail.current_amp), strict=True)
     }
-    row = np.flatnonzero(np.any([np.isfinite(value) for value in values.values()], axis=0))
+    is_live = np.any([np.isfinite(value) for value in values.values()], axis=0)
+    row = np.flatnonzero(is_live)
     for rail in rails:
         if rail.counter is not None:
             energy, resets = name_counter_columns(rail.name)
             values |= {energy: rail.counter.energy_joule, resets: rail.counter.resets.astype(np.float64)}
     stamps = read_header_ns(columns)
-    lost = len(columns[LOG_TIME]) - len(row)
+    lost = int(np.count_nonzero(~is_live[row[0] : row[-1]])) if len(row) else len(is_live)
     return Readings(
         row,
         columns[LOG_TIME][row].astype(np.int64),
