@@ -31,14 +31,14 @@ _CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
 _FEWEST_BRAKED = 5
 _LIKELY = 8.0
 """Logarithm of a ratio of likelihoods: of three thousand segments one by chance."""
-SETTLED_S = 0.3
-"""After a stop and before a start the motors still draw power for this long [s]."""
+_SETTLED_NS = 300_000_000
+"""After a stop and before a start the motors still draw."""
 _SHORTEST_HALT_NS = 1_000_000_000
 
 
 def measure_rest_currents(rail: Rail, still_ns: Stamps) -> Floats:
     """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), begin and end [ns]."""
-    settled = still_ns + np.rint(1e9 * np.array([SETTLED_S, -SETTLED_S])).astype(np.int64)
+    settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
     settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
     first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
     sums = np.concatenate(([0.0], np.cumsum(rail.current.value)))
@@ -104,13 +104,6 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
     volt, amp = (signal - _compute_moving_mean(signal, rows) for signal in (volt, amp))
     return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
-
-
-def correlate_sag(rails: Sequence[Rail]) -> float:
-    """Return the correlation of the voltage with the whole current, of either sign; 0 where it is unknown."""
-    sag = measure_sag(rails)
-    size = 0.0 if sag is None else float(np.linalg.norm(sag.volt) * np.linalg.norm(sag.amp))
-    return abs(float(sag.volt @ sag.amp)) / size if sag is not None and size > 0.0 else 0.0
 
 
 def _compute_moving_mean(values: Floats, rows: int) -> Floats:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from tcpipe.power.audit import correlate_sag
-from tcpipe.power.plausibility import find_isolated, find_missing_rows
-from tcpipe.power.rails import Rail, is_power_only, make_rail, make_samples
+from tcpipe.power.audit import measure_sag
+from tcpipe.power.plausibility import EXCLUDED, find_isolated, find_missing_rows, undo_overflow
+from tcpipe.power.rails import UNIT_VOLT, make_rail, make_samples
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
@@ -35,7 +35,9 @@ from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_find
 
 _LOG_TIME = "log_time_ns"
 _POWER = Subject("role", "power")
-_EXCLUDED, _ASSUMED, _WRAPPED = "power-values-excluded", "current-sign-assumed", "current-wrapped"
+_ASSUMED, _WRAPPED, _NOMINAL = "current-sign-assumed", "current-wrapped", "voltage-assumed"
+_STATUS, _CHARGING = "power_supply_status", 1
+"""Of sensor_msgs/BatteryState."""
 _SIGNS = ("drawn_negative", "drawn_positive")
 
 Rails = Mapping[str, list[RailReadings]]
@@ -63,7 +65,7 @@ class PowerReadings:
     """Lowest and highest current of a rail at rest [A]; None where a source does not state it."""
     offset_amp: float = 0.0
     """Zero of each rail's current that the recipe states [A]; it is not subtracted yet."""
-    is_charging: bool = False
+    charging: bool = False
     """Whether messages state that the battery is charged."""
 
     @property
@@ -127,7 +129,7 @@ def read_power(
     includes = tuple(dict.fromkeys(source.other_loads for source in sources if source.other_loads))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
     nominal = list(_find_nominal(sources))
-    constant = [] if nominal else list(_find_constant_voltages(rails, log_times))
+    constant = [] if nominal else list(_find_constant_voltages(rails, _sum_currents(rails, log_times)[1]))
     findings += [*of_sign, *loads, *nominal, *constant]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(source.energy for source in sources)
@@ -141,36 +143,14 @@ def read_power(
         tuple(dict.fromkeys(findings)),
         told_by,
         includes,
-        gain_std_fraction=math.hypot(max(gains), read_threshold(_CONSTANT, "std_fraction") if constant else 0.0),
+        gain_std_fraction=math.hypot(max(gains), *(found.numbers["std_fraction"] for found in constant)),
         offset_std_amp=max(source.zero_std for source in sources),
         rest_current_amp=(min(range_amp[0] for range_amp in rest), max(range_amp[1] for range_amp in rest))
         if rest and len(rest) == sum(bool(source.current or source.energy) for source in sources)
         else None,
         offset_amp=offset_amp,
-        is_charging=any(np.any(columns.get(_STATUS, ()) == _CHARGING) for _, columns in topics.values()),
+        charging=any(np.any(columns.get(_STATUS, ()) == _CHARGING) for _, columns in topics.values()),
     )
-
-
-_STATUS, _CHARGING = "power_supply_status", 1
-"""Of sensor_msgs/BatteryState."""
-
-
-def _find_constant_voltages(rails: Rails, log_times: Mapping[str, Floats]) -> Iterator[Finding]:
-    """Yield the rails whose voltage has too few levels to be measured, while their current changes."""
-    for rail in _make_rails(rails, log_times):
-        levels, currents = (np.unique(signal.value).size for signal in (rail.voltage, rail.current))
-        if (
-            not is_power_only(rail.voltage.value)
-            and levels < read_threshold(_CONSTANT, "min_levels_count") <= currents / 4
-        ):
-            numbers = {
-                "voltage_volt": np.median(rail.voltage.value),
-                "std_fraction": read_threshold(_CONSTANT, "std_fraction"),
-            }
-            yield make_finding(_CONSTANT, _POWER, names={"rail": rail.name}, **numbers)
-
-
-_CONSTANT = "voltage-constant"
 
 
 def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
@@ -178,7 +158,18 @@ def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
     for source in sources:
         if (volt := source.nominal_voltage_volt) is not None:
             names, fraction = {"rail": source.rail or source.topic or source.type}, source.nominal_voltage_std_fraction
-            yield make_finding("voltage-assumed", _POWER, names=names, voltage_volt=volt, std_fraction=fraction)
+            yield make_finding(_NOMINAL, _POWER, names=names, voltage_volt=volt, std_fraction=fraction)
+
+
+def _find_constant_voltages(rails: Rails, amp: Floats) -> Iterator[Finding]:
+    """Yield the rails whose voltage has too few levels to be measured, while the whole current [A] changes."""
+    fraction, least = (read_threshold(_NOMINAL, f"constant_{name}") for name in ("std_fraction", "levels_count"))
+    for rail in (rail for found in rails.values() for rail in found):
+        levels = np.unique(rail.voltage_volt[np.isfinite(rail.voltage_volt)])
+        if 0 < levels.size < least and levels[0] != UNIT_VOLT and np.unique(amp).size > 4 * least:
+            yield make_finding(
+                _NOMINAL, _POWER, names={"rail": rail.name}, voltage_volt=levels.mean(), std_fraction=fraction
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,66 +330,60 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
     A row is one measurement: where its voltage or its current is missing or implausible, both are excluded. A driver sends such rows before
     the sensor starts and after it stops; these are not counted.
     """
-    kept: dict[str, list[RailReadings]] = {}
+    kept: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
     findings = []
-    for topic, found in rails.items():
-        kept[topic] = []
-        for rail in found:
-            volt, amp = (
-                rail.voltage_volt,
-                np.where(np.abs(rail.current_amp) > rail.largest_amp, np.nan, rail.current_amp),
-            )
-            excluded = find_missing_rows(volt, amp) | (np.isnan(amp) & np.isfinite(rail.current_amp))
-            isolated, is_rejected = find_isolated(np.where(excluded, np.nan, amp), log_times[topic] / 1e9)
-            excluded |= isolated
-            if is_rejected:
-                findings.append(reject_power(topic, "isolated-values", names={"rail": rail.name}))
-            live = np.flatnonzero((np.isfinite(volt) | np.isfinite(amp)) & ~excluded)
-            inner = excluded[live[0] : live[-1]] if live.size else excluded[:0]
-            if count := max(int(np.count_nonzero(inner)), rail.unmeasured_count):
-                numbers = {"rows_count": count, "rows_fraction": count / len(volt)}
-                findings.append(make_finding(_EXCLUDED, _POWER, names={"rail": rail.name}, **numbers))
-            volt, amp = np.where(excluded, np.nan, volt), np.where(excluded, np.nan, amp)
-            kept[topic].append(replace(rail, voltage_volt=volt, current_amp=amp))
+    for topic, rail in ((topic, rail) for topic, found in rails.items() for rail in found):
+        volt, amp, names = rail.voltage_volt, rail.current_amp, {"rail": rail.name}
+        excluded = np.abs(amp) > rail.largest_amp
+        # The first row of a counter has no current.
+        excluded |= find_missing_rows(
+            volt, np.full_like(amp, np.nan) if rail.counter else np.where(excluded, np.nan, amp)
+        )
+        isolated, is_rejected = find_isolated(np.where(excluded, np.nan, amp), log_times[topic] / 1e9)
+        excluded |= isolated
+        live = np.flatnonzero((np.isfinite(volt) | np.isfinite(amp)) & ~excluded)
+        count = max(
+            np.count_nonzero(excluded[live.min(initial=len(volt)) : live.max(initial=0)]), rail.unmeasured_count
+        )
+        if is_rejected:
+            findings.append(reject_power(topic, "isolated-values", names=names))
+        elif count:
+            fraction = count / len(volt)
+            findings.append(make_finding(EXCLUDED, _POWER, names=names, rows_count=count, rows_fraction=fraction))
+        volt, amp = np.where(excluded, np.nan, volt), np.where(excluded, np.nan, amp)
+        kept[topic].append(replace(rail, voltage_volt=volt, current_amp=amp))
     return kept, findings
 
 
 def _undo_overflows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Rails, list[Finding]]:
-    """Return the rails with overflows of signed currents undone where the voltage confirms it, and findings, also that it does not."""
-    whole, findings = {topic: list(found) for topic, found in rails.items()}, []
-    for topic, found in whole.items():
-        for at, rail in enumerate(found):
-            if rail.overflow is not None:
-                changed = np.isfinite(rail.current_amp) & (rail.overflow.current_amp != rail.current_amp)
-                current_amp = np.where(np.isfinite(rail.current_amp), rail.overflow.current_amp, np.nan)
-                found[at] = replace(rail, current_amp=current_amp)
-                numbers = {"currents_count": int(np.count_nonzero(changed)), "wraps_amp": rail.overflow.span_amp}
-                findings.append(make_finding(_WRAPPED, _POWER, names={"rail": rail.name}, **numbers))
-                if not rail.overflow.is_clear:
-                    findings.append(reject_power(topic, "current-overflow", names={"rail": rail.name}))
+    """Return the rails without overflows of signed currents, and findings; power is rejected where the voltage does not confirm them."""
+    whole: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
+    findings, are_clear = [], True
+    for topic, rail in ((topic, rail) for topic, found in rails.items() for rail in found):
+        current_amp, span_amp, is_clear = undo_overflow(rail.current_amp)
+        whole[topic].append(replace(rail, current_amp=current_amp))
+        if span_amp and not rail.counter:
+            count = np.count_nonzero(np.abs(current_amp - rail.current_amp) > span_amp / 2)
+            names, are_clear = {"rail": rail.name}, are_clear and is_clear
+            findings.append(make_finding(_WRAPPED, _POWER, names=names, currents_count=count, wraps_amp=span_amp))
     if not findings:
         return rails, []
-    before, after = (correlate_sag(_make_rails(each, log_times)) for each in (rails, whole))
+    before, after = (_correlate_voltage(each, log_times) for each in (rails, whole))
     if before >= max(after, read_threshold(_WRAPPED, "min_correlation")):
         return rails, []
-    rejected = [found for found in findings if found.code == REJECTED]
-    if not rejected and after <= before:
-        rejected = [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
-    return whole, rejected or findings
+    if not are_clear or after <= before:
+        return rails, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
+    return whole, findings
 
 
-def _make_rails(rails: Rails, log_times: Mapping[str, Floats]) -> list[Rail]:
-    """Return the rails by log time, each with the voltages and currents of all its topics."""
-    parts: dict[str, list[tuple[Floats, Floats, Floats]]] = {}
-    for topic, found in rails.items():
-        for rail in found:
-            parts.setdefault(rail.name, []).append((log_times[topic], rail.voltage_volt, rail.current_amp))
-    made = []
-    for name, columns in parts.items():
-        time_ns, volt, amp = (np.concatenate(column) for column in zip(*columns, strict=True))
-        samples = (make_samples(time_ns.astype(np.int64), value) for value in (volt, amp))
-        made.append(make_rail(name, *samples, averaged=False))
-    return made
+def _correlate_voltage(rails: Rails, log_times: Mapping[str, Floats]) -> float:
+    """Return the correlation of voltage and whole current within seconds, of either sign; 0 where it is unknown."""
+    time_s, amp = _sum_currents(rails, log_times)
+    volts = ((log_times[topic], rail.voltage_volt) for topic, found in rails.items() for rail in found)
+    at_ns, volt = next(each for each in volts if np.isfinite(each[1]).any())
+    samples = [make_samples(at.astype(np.int64), value) for at, value in ((at_ns, volt), (1e9 * time_s, amp))]
+    sag = measure_sag([make_rail("", *samples, averaged=False)])
+    return 0.0 if sag is None or not sag.amp.any() else abs(float(np.corrcoef(sag.volt, sag.amp)[0, 1]))
 
 
 def _sign(

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter as Counts
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.plausibility import find_marked, find_overflow, undo_overflow
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
@@ -97,20 +96,11 @@ REJECTED = "power-rejected"
 
 
 @dataclass(frozen=True, slots=True)
-class Overflow:
-    """An overflow of signed currents: its span [A], whether usual steps are clearly smaller, and currents without it [A], shape (N,)."""
-
-    span_amp: float
-    is_clear: bool
-    current_amp: Floats
-
-
-@dataclass(frozen=True, slots=True)
 class RailReadings:
-    """Measurements of a rail, NaN where a row has none: voltage [V] and current [A], shape (N,).
+    """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,).
 
-    The current of an energy counter is preliminary: its clock is not aligned yet. In ``unmeasured_count`` rows one of the summed currents
-    was constant, clipped or marked as not measured: there the current is NaN.
+    Of a counter of energy the current is a first one, by times that nobody has judged yet. In ``unmeasured_count`` rows one of the summed
+    currents stood still or was clipped: there the current is NaN.
     """
 
     name: str
@@ -119,7 +109,6 @@ class RailReadings:
     counter: Counter | None = None
     joints: JointPower | None = None
     unmeasured_count: int = 0
-    overflow: Overflow | None = None
 
     @property
     def largest_amp(self) -> float:
@@ -316,27 +305,12 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
         current = np.divide(watt, voltage, out=np.full(len(watt), np.nan), where=voltage > 0.0)
     if source.wraps_amp is not None:
         current = unwrap_currents(current, source.wraps_amp)
-    recorded = [_read_values(columns, field) for field in parse_fields(source.current)]
-    overflow = None
+    currents = [source.current_scale * _read_values(columns, field) for field in parse_fields(source.current)]
     unmeasured = np.zeros(len(current), np.bool_)
-    if recorded:
-        parts = source.current_scale * np.column_stack(recorded)
-        unmeasured = find_unmeasured(parts, _choose_stamps(columns), wraps_amp=source.wraps_amp)
-        if source.wraps_amp is None and find_wrap(parts) is None:
-            unmeasured |= np.any([find_marked(values) for values in recorded], axis=0)
-            overflow = _find_overflow(parts.T, [field.sign for field in parse_fields(source.current)])
+    if currents:
+        unmeasured = find_unmeasured(np.column_stack(currents), _choose_stamps(columns), wraps_amp=source.wraps_amp)
     current = np.where(unmeasured, np.nan, current)
-    return RailReadings(name, voltage, current, unmeasured_count=int(unmeasured.sum()), overflow=overflow)
-
-
-def _find_overflow(parts: Iterable[Floats], signs: Iterable[int]) -> Overflow | None:
-    """Return the overflow of the sum of several currents."""
-    found = [(values, find_overflow(values)) for values in parts]
-    if not any(each for _, each in found):
-        return None
-    whole = [undo_overflow(values, each[0]) if each else values for values, each in found]
-    total = np.sum([sign * values for sign, values in zip(signs, whole, strict=True)], axis=0)
-    return Overflow(max(each[0] for _, each in found if each), all(each[1] for _, each in found if each), total)
+    return RailReadings(name, voltage, current, unmeasured_count=int(unmeasured.sum()))
 
 
 _FROZEN_NS, _FEWEST_EQUAL = 5_000_000_000, 20
@@ -510,8 +484,7 @@ def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:
 def apply_sign(rail: RailReadings, sign: int) -> RailReadings:
     """Return the rail with its current positive when drawn."""
     counter = None if rail.counter is None else rail.counter.times(sign)
-    overflow = rail.overflow and replace(rail.overflow, current_amp=sign * rail.overflow.current_amp)
-    return replace(rail, current_amp=sign * rail.current_amp, counter=counter, overflow=overflow)
+    return replace(rail, current_amp=sign * rail.current_amp, counter=counter)
 
 
 @dataclass(frozen=True, slots=True)

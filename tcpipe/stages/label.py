@@ -138,12 +138,8 @@ def label_segments(
     start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
     findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
     findings += find_unpowered_motion(table, physics, masked.info, start_ns)
-    rails, step_watt, driving_watt = (
-        next(iter(rails_by_epoch.values()), []),
-        _step_watt(rails_by_epoch),
-        facts.median_power_watt,
-    )
-    findings += find_negative_idle(masked.table, rails, masked.info, driving_watt=driving_watt, step_watt=step_watt)
+    kind, rails = masked.info.report.facts.power, next(iter(rails_by_epoch.values()), [])
+    findings += find_negative_idle(standing, facts.median_power_watt, kind, rails)
     info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 

@@ -13,7 +13,6 @@ from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.power.audit import (
-    SETTLED_S,
     estimate_offset_std,
     find_gain_change,
     find_lost_signs,
@@ -21,7 +20,7 @@ from tcpipe.power.audit import (
     measure_sag,
     summarize_rest,
 )
-from tcpipe.power.rails import Rail, Rule, integrate_energy, sum_power
+from tcpipe.power.rails import IdlePower, Rail, Rule, integrate_energy, sum_power
 from tcpipe.power.sampling import find_smoothing
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
@@ -162,39 +161,24 @@ _NEGATIVE = "idle-power-negative"
 
 
 def find_negative_idle(
-    rows: pa.Table, rails: Sequence[Rail], info: TrackInfo, *, driving_watt: float | None, step_watt: float
+    idle: IdlePower, driving_watt: float | None, power: PowerSign | None, rails: Sequence[Rail]
 ) -> Iterator[Finding]:
-    """Yield that the power is clearly negative in every halt of a masked track, and the lines that correct it; not while charging."""
-    power = info.report.facts.power
-    at_rest = _select_rest(rows, info.rate_hz)
-    if power is None or power.charging or driving_watt is None or not at_rest:
+    """Yield that power is clearly negative in every halt, and the lines that correct it; not while the battery is charged."""
+    if power is None or power.charging or driving_watt is None:
         return
-    fraction, steps = (read_threshold(_NEGATIVE, f"max_{name}") for name in ("driving_fraction", "steps_count"))
-    if max(map(np.median, at_rest)) >= -max(steps * step_watt, fraction * driving_watt):
+    least_watt = read_threshold(_NEGATIVE, "min_driving_fraction") * driving_watt
+    if not (idle.highest_watt < 0.0 and idle.watt < -least_watt):
         return
-    idle_watt = float(np.median(np.concatenate(at_rest)))
-    sum_volt = float(sum(np.median(rail.voltage.value) for rail in rails))
-    low, high = power.rest_current_amp or (0.0, 0.0)
-    net_amp = (driving_watt - idle_watt) / sum_volt
-    unknown_amp = (high - low) / 2 if high > low else read_threshold(_NEGATIVE, "idle_std_fraction") * net_amp
-    offset_amp = power.zero_amp + idle_watt / sum_volt - (low + high) / 2
+    volt = float(sum(np.median(rail.voltage.value) for rail in rails))
+    low_amp, high_amp = power.rest_current_amp or (0.0, 0.0)
+    unknown_amp = (high_amp - low_amp) / 2.0
+    if power.rest_current_amp is None:
+        unknown_amp = read_threshold(_NEGATIVE, "idle_std_fraction") * (driving_watt - idle.watt) / volt
+    offset_amp = power.zero_amp + idle.watt / volt - (low_amp + high_amp) / 2.0
     std_amp = float(np.hypot(_find_prior(power)[1], unknown_amp))
-    keys: Mapping[str, Keys] = {
-        "read": {"current_offset_amp": round(offset_amp, 3)},
-        "label": {"power_offset_std_amp": round(std_amp, 2)},
-    }
-    yield make_finding(
-        _NEGATIVE, _POWER, remedies=suggest("correct", keys), idle_watt=idle_watt, driving_watt=driving_watt
-    )
-
-
-def _select_rest(rows: pa.Table, rate_hz: float) -> list[Floats]:
-    """Return the power [W] in each halt, without the time after its start in which motors still brake."""
-    stamp_ns, watt = to_integers(rows, "stamp_ns"), to_floats(rows, "power_watt")
-    spans = find_stationary_ns(rows, rate_hz, but=DropReason.STUCK)
-    spans = spans + np.rint(1e9 * np.array([read_threshold(_NEGATIVE, "settle_s"), -SETTLED_S])).astype(np.int64)
-    found = [watt[(stamp_ns >= begin) & (stamp_ns <= end) & np.isfinite(watt)] for begin, end in spans.tolist()]
-    return [each for each in found if each.size >= rate_hz]
+    offset, std = {"current_offset_amp": round(offset_amp, 3)}, {"power_offset_std_amp": round(std_amp, 2)}
+    remedies = suggest("correct", {"read": offset, "label": std})
+    yield make_finding(_NEGATIVE, _POWER, remedies=remedies, idle_watt=idle.watt, driving_watt=driving_watt)
 
 
 _FEWEST_UNPOWERED = 5

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
@@ -232,7 +231,11 @@ def find_gaps(
     steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
     jumps[steps] = jumps[steps + 1] = True
     run, findings = Subject("run", track.info.run_id), []
-    share = float(_find_lost_power(without_power, stamp_ns)[moving].mean()) if moving.any() else 0.0
+    lost, live = without_power & moving, ~without_power
+    for outside in (~np.logical_or.accumulate(live), ~np.logical_or.accumulate(live[::-1])[::-1]):
+        if outside.sum() <= read_threshold("power-gaps", "max_edge_s") * track.info.rate_hz:
+            lost &= ~outside
+    share = float(lost.sum() / moving.sum()) if moving.any() else 0.0
     if share > read_threshold("power-gaps", "min_lost_fraction"):
         findings.append(make_finding("power-gaps", Subject("role", "power"), lost_fraction=share))
     share = float(uncertain[moving].mean()) if moving.any() else 0.0
@@ -251,17 +254,6 @@ def find_gaps(
     implausible, too_fast = find_implausible(track, rows, jumps, max_plausible_mps)
     gaps = {"without_power": without_power, "uncertain": uncertain, "jumps": jumps, "contradicted": contradicted}
     return {**gaps, "implausible": implausible}, (*findings, *too_fast)
-
-
-def _find_lost_power(without_power: Mask, stamp_ns: NDArray[np.int64]) -> Mask:
-    """Return the rows without power, but not those of a sensor that starts a little late or stops a little early."""
-    known = np.flatnonzero(~without_power)
-    lost, longest_ns = without_power.copy(), round(1e9 * read_threshold("power-gaps", "max_edge_s"))
-    if known.size and stamp_ns[known[0]] - stamp_ns[0] <= longest_ns:
-        lost[: known[0]] = False
-    if known.size and stamp_ns[-1] - stamp_ns[known[-1]] <= longest_ns:
-        lost[known[-1] :] = False
-    return lost
 
 
 def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: MaskConfig) -> Floats:

@@ -173,13 +173,8 @@ def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings)
     parts = []
     for rail in power.rails[source.topic]:
         voltage, current = read_rail_power(rail, times, columns)
-        known = np.isfinite(voltage) | np.isfinite(current)
-        values = {
-            **times,
-            "rail": np.full(len(known), rail.name),
-            "voltage_volt": voltage,
-            "current_amp": current - power.offset_amp,
-        }
+        known, current = np.isfinite(voltage) | np.isfinite(current), current - power.offset_amp
+        values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
         parts.append({name: value[known] for name, value in values.items()})
     return parts
 
@@ -232,7 +227,7 @@ def _describe_power(power: PowerReadings) -> PowerSign:
         power.offset_std_amp,
         power.rest_current_amp,
         power.offset_amp,
-        power.is_charging,
+        power.charging,
     )
 
 

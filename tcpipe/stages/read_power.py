@@ -68,14 +68,13 @@ def select_power_rows(columns: Columns, rails: Sequence[RailReadings]) -> Readin
         for rail in rails
         for name, values in zip(name_rail_columns(rail.name), (rail.voltage_volt, rail.current_amp), strict=True)
     }
-    is_live = np.any([np.isfinite(value) for value in values.values()], axis=0)
-    row = np.flatnonzero(is_live)
+    row = np.flatnonzero(np.any([np.isfinite(value) for value in values.values()], axis=0))
     for rail in rails:
         if rail.counter is not None:
             energy, resets = name_counter_columns(rail.name)
             values |= {energy: rail.counter.energy_joule, resets: rail.counter.resets.astype(np.float64)}
     stamps = read_header_ns(columns)
-    lost = int(np.count_nonzero(~is_live[row[0] : row[-1]])) if len(row) else len(is_live)
+    lost = row[-1] + 1 - row[0] - len(row) if len(row) else len(columns[LOG_TIME])
     return Readings(
         row,
         columns[LOG_TIME][row].astype(np.int64),
