@@ -38,7 +38,7 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     """Return the rows whose value is isolated, shape (N,), and whether such values are too many, or too many in a row.
 
     One or two values in a row are isolated if they are far from the median of five. An exact value that may mean "not measured" is so if it
-    is farther from both neighbours than usual steps.
+    is farther from both neighbours than usual steps, and repeated no longer than other values.
     """
     rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), np.bool_)
     new = _find_changes(values[rows])
@@ -50,7 +50,8 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     after = np.clip(np.searchsorted(rest, np.arange(value.size)), 1, rest.size - 1)
     distance = np.minimum(*(np.abs(value - value[rest[at]]) for at in (after - 1, after)))
     steps = np.abs(np.diff(value[rest]))
-    isolated = marked & (distance > np.quantile(steps[steps > 0.0], 0.99))
+    repeats = np.bincount(np.cumsum(new) - 1)
+    isolated = marked & (distance > np.quantile(steps[steps > 0.0], 0.99)) & (repeats <= 2 * np.median(repeats[rest]))
     far, far_by_most, far_by_many = (_is_far(value[rest], *by) for by in ((5, 0.99), (5, 0.9), (11, 0.99)))
     isolated[rest] = far
     found[rows] = isolated[np.cumsum(new) - 1]

@@ -371,7 +371,7 @@ def _undo_overflows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Rail
     before, after = (_correlate_voltage(each, log_times) for each in (rails, whole))
     if before >= max(after, read_threshold(_WRAPPED, "min_correlation")):
         return rails, []
-    if not are_clear or after <= before:
+    if not are_clear or after < max(before, read_threshold(_WRAPPED, "min_correlation")):
         return rails, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
     return whole, findings
 
