@@ -37,8 +37,9 @@ def find_missing_rows(voltage_volt: Floats, current_amp: Floats) -> Mask:
 def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     """Return the rows whose value is isolated, shape (N,), and whether such values are too many, or too many in a row.
 
-    One or two values in a row are isolated if they are far from the median of five. An exact value that may mean "not measured" is so if it
-    is farther from both neighbours than usual steps, and repeated no longer than other values.
+    One or two values in a row are isolated if they are far from the median of five, by the largest usual value, or by half of it where
+    other values are near their medians. An exact value that may mean "not measured" is isolated if it is farther from both neighbours than
+    usual steps, and repeated no longer than other values.
     """
     rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), np.bool_)
     new = _find_changes(values[rows])
@@ -49,16 +50,20 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
         return found, False
     after = np.clip(np.searchsorted(rest, np.arange(value.size)), 1, rest.size - 1)
     distance = np.minimum(*(np.abs(value - value[rest[at]]) for at in (after - 1, after)))
-    steps = np.abs(np.diff(value[rest]))
-    repeats = np.bincount(np.cumsum(new) - 1)
+    steps, repeats = np.abs(np.diff(value[rest])), np.bincount(np.cumsum(new) - 1)
     isolated = marked & (distance > np.quantile(steps[steps > 0.0], 0.99)) & (repeats <= 2 * np.median(repeats[rest]))
-    far, far_by_most, far_by_many = (_is_far(value[rest], *by) for by in ((5, 0.99), (5, 0.9), (11, 0.99)))
-    isolated[rest] = far
+    by_most, deviation = _compare_with_median(value[rest], 5, 0.9)
+    relative, _ = _compare_with_median(value[rest], 5, 0.99)
+    limit, low_limit, scatter = (
+        read_threshold(EXCLUDED, f"max_{name}") for name in ("of_top", "of_top_clear", "scatters")
+    )
+    far = relative > limit
+    isolated[rest] = far | ((relative > low_limit) & (deviation > scatter * np.quantile(deviation, 0.9)))
     found[rows] = isolated[np.cumsum(new) - 1]
-    block = np.flatnonzero(far_by_many)
+    block = np.flatnonzero(_compare_with_median(value[rest], 11, 0.99)[0] > limit)
     runs = np.split(rest[block], np.flatnonzero(np.diff(block) > 1) + 1)
     is_block = any(run.size > 2 and at_s[run[-1]] - at_s[run[0]] < _SHORTEST_DRIVE_S for run in runs)
-    share = max(far.mean(), far_by_most.mean())
+    share = max(far.mean(), np.mean(by_most > limit))
     return found, bool(is_block or share > read_threshold(REJECTED, "max_isolated_fraction"))
 
 
@@ -66,12 +71,11 @@ def _find_changes(values: Floats) -> Mask:
     return np.concatenate((np.ones(min(values.size, 1), np.bool_), values[1:] != values[:-1]))
 
 
-def _is_far(values: Floats, width: int, quantile: float) -> Mask:
-    """Return where a value is far from the median of ``width`` around it, by that and by its quantile over the run."""
+def _compare_with_median(values: Floats, width: int, quantile: float) -> tuple[Floats, Floats]:
+    """Return deviations from the median of ``width`` values: relative to that or to its quantile over the run, and absolute."""
     middle = np.median(sliding_window_view(np.pad(values, width // 2, mode="edge"), width), axis=1)
-    size = np.abs(middle)
-    top = np.quantile(size[size > 0.0], quantile) if size.any() else 0.0
-    return np.asarray(np.abs(values - middle) > read_threshold(EXCLUDED, "max_of_neighbours") * np.maximum(size, top))
+    size, deviation = np.abs(middle), np.abs(values - middle)
+    return deviation / np.maximum(size, np.quantile(size[size > 0.0], quantile) if size.any() else 1.0), deviation
 
 
 def undo_overflow(current_amp: Floats) -> tuple[Floats, float, bool]:

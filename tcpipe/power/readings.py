@@ -339,7 +339,7 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
         excluded |= find_missing_rows(
             volt, np.full_like(amp, np.nan) if rail.counter else np.where(excluded, np.nan, amp)
         )
-        isolated, is_rejected = find_isolated(np.where(excluded, np.nan, amp), log_times[topic] / 1e9)
+        isolated, is_rejected = find_isolated(undo_overflow(np.where(excluded, np.nan, amp))[0], log_times[topic] / 1e9)
         excluded |= isolated
         live = np.flatnonzero((np.isfinite(volt) | np.isfinite(amp)) & ~excluded)
         count = max(

@@ -31,7 +31,12 @@ VOLT = np.round(26.2 - 0.03 * AMP + 0.01 * np.random.default_rng(2).normal(size=
 
 def read(volt=VOLT, amp=AMP, **columns):
     """Read messages of a battery that reports drawn currents as negative."""
-    fields = {"log_time_ns": TIME_NS, "voltage": volt, "current": -np.asarray(amp), "percentage": np.full(COUNT, np.nan)}
+    fields = {
+        "log_time_ns": TIME_NS,
+        "voltage": volt,
+        "current": -np.asarray(amp),
+        "percentage": np.full(COUNT, np.nan),
+    }
     known = load_shipped_profiles().power_sources
     return readings.read_power({"/battery": (BATTERY_STATE, fields | columns)}, known)
 
@@ -58,7 +63,16 @@ def change(values, rows, new):
 @pytest.mark.parametrize("rows", [ROW % 5 == 0, np.random.default_rng(3).random(COUNT) < 0.3], ids=["fifth", "random"])
 @pytest.mark.parametrize(
     ("volt", "amp"),
-    [(-1.0, 1.0), (np.nan, 0.0), (np.nan, 1.0), (0.0, 0.0), (-1.0, 0.0), (65.535, 0.0), (655.35, 327.67), (np.nan, 9.0)],
+    [
+        (-1.0, 1.0),
+        (np.nan, 0.0),
+        (np.nan, 1.0),
+        (0.0, 0.0),
+        (-1.0, 0.0),
+        (65.535, 0.0),
+        (655.35, 327.67),
+        (np.nan, 9.0),
+    ],
 )
 def test_a_row_whose_voltage_is_marked_as_missing_is_no_measurement(rows, volt, amp):
     found = read(change(VOLT, rows, volt), change(AMP, rows, amp))
@@ -120,7 +134,9 @@ def test_a_drive_has_no_isolated_values():
         assert read(amp=make_amp(seed)).findings == ()
 
 
-@pytest.mark.parametrize("rows", [np.isin(ROW % 200, (7, 8, 9)), ROW % 5 == 0, ROW % 8 == 0], ids=["3 in a row", "1/5", "1/8"])
+@pytest.mark.parametrize(
+    "rows", [np.isin(ROW % 200, (7, 8, 9)), ROW % 5 == 0, ROW % 8 == 0], ids=["3 in a row", "1/5", "1/8"]
+)
 def test_too_many_isolated_values_reject_the_power(rows):
     assert find_reasons(read(amp=change(AMP, rows, 12 * AMP))) == ["isolated-values"]
 
