@@ -18,6 +18,7 @@ from tcpipe.logs.fix_quality import Columns, classify_fixes, find_status
 from tcpipe.logs.messages import GNSS
 from tcpipe.logs.roles import GPS_FIXES
 from tcpipe.logs.topics import AutopilotKind
+from tcpipe.robots import UNMEASURED_AMP
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Int64 = NDArray[np.int64]
@@ -204,8 +205,8 @@ def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) ->
 
 
 def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
-    voltage, current = f["voltage_v"], f["current_a"]  # 0 and -1 where it is not known
-    drawn = np.where(current == -1, np.nan, -current)  # negative in BatteryState
+    voltage, current = f["voltage_v"], f["current_a"]
+    drawn = np.where(np.isin(current, UNMEASURED_AMP["battery_status"]), np.nan, -current)  # negative in BatteryState
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
 
 

@@ -28,7 +28,6 @@ _FEWEST_BLOCKS = 6
 _FEWEST_SAMPLES = 400
 _CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
 """Standard deviations that show the resistance itself, a change of it, and that it is not gradual (a battery warms up)."""
-"""Median of the absolute value of a normal variate of unit variance."""
 _FEWEST_BRAKED = 5
 _LIKELY = 8.0
 """Logarithm of a ratio of likelihoods: of three thousand segments one by chance."""

@@ -247,10 +247,14 @@ which stands once for seconds, gives 12 % of that more while driving than the dr
 
 @dataclass(frozen=True, slots=True)
 class IdlePower:
-    """Idle power of a run: the median of the means of seconds [W], and its standard deviation for any second of the run; NaN if unknown."""
+    """Idle power of a run: the median of the means of seconds [W], and its standard deviation for any second of the run; NaN if unknown.
+
+    ``highest_watt``: highest median of a halt, from a second after its start, when motors no longer brake, plus three steps of the record.
+    """
 
     watt: float
     std_watt: float
+    highest_watt: float = np.nan
 
 
 def estimate_idle_power(
@@ -278,7 +282,9 @@ def estimate_idle_power(
     lasting = max(scatter - _estimate_noise_variance(seconds), 0.0)
     levels = 1 + np.count_nonzero(np.diff(power_watt[used]))
     unseen = _UNSEEN_SHARE * watt / means.size
-    return IdlePower(watt, float(np.sqrt(lasting + scatter / means.size + step_watt**2 / 12.0 / levels + unseen**2)))
+    std_watt = float(np.sqrt(lasting + scatter / means.size + step_watt**2 / 12.0 / levels + unseen**2))
+    medians = [float(np.median(each[window_rows:])) for each in halts if each.size >= 2 * window_rows]
+    return IdlePower(watt, std_watt, max(medians, default=np.nan) + 3.0 * step_watt)
 
 
 def _split_halts(halts: list[Floats], rows: int) -> list[Floats]:

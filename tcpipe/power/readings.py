@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 
-from tcpipe.power.rails import is_power_only
+from tcpipe.power.audit import measure_sag
+from tcpipe.power.plausibility import EXCLUDED, find_isolated, find_missing_rows, undo_overflow
+from tcpipe.power.rails import UNIT_VOLT, is_power_only, make_rail, make_samples
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
@@ -39,11 +40,13 @@ from tcpipe.robots import (
     PowerSource,
     parse_fields,
 )
-from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold, select_findings
 
 _LOG_TIME = "log_time_ns"
 _POWER = Subject("role", "power")
-_ODD, _ASSUMED = "power-values-excluded", "current-sign-assumed"
+_ASSUMED, _WRAPPED, _NOMINAL = "current-sign-assumed", "current-wrapped", "voltage-assumed"
+_STATUS, _CHARGING = "power_supply_status", 1
+"""Of sensor_msgs/BatteryState."""
 _SIGNS = ("drawn_negative", "drawn_positive")
 
 Rails = Mapping[str, list[RailReadings]]
@@ -84,6 +87,10 @@ class PowerReadings:
     """Slope of a second meter's power over this one; None without a second meter that follows it."""
     sides: Sides | None = None
     """Currents of both sides of the drive; None where they are not told apart."""
+    offset_amp: float = 0.0
+    """Zero of each rail's current that the recipe states [A]; it is not subtracted yet."""
+    charging: bool = False
+    """Whether messages state that the battery is charged."""
 
     @property
     def is_rejected(self) -> bool:
@@ -99,6 +106,7 @@ def read_power(
     husky_power: HuskyPower = "battery",
     current_sign: CurrentSign = "auto",
     current_scale: float = 1.0,
+    offset_amp: float = 0.0,
 ) -> PowerReadings:
     """Return the rails of all power topics, with every current positive when drawn.
 
@@ -130,20 +138,26 @@ def read_power(
         gains += [_find_gain_std(source, rail.joints) for source, rail in zip(found.sources, found.rails, strict=True)]
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
-    rejected = rejected or _find_incomplete(rails) or _find_too_small(rails)
+    rejected = rejected or _find_incomplete(rails)
+    log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
+    if not rejected:
+        rails, excluded = _exclude_rows(rails, log_times)
+        rails, wrapped = _undo_overflows(rails, log_times)
+        findings += [*excluded, *wrapped]
+        rejected = select_findings(findings, REJECTED) or _find_too_small(rails)
     if rejected:
         if len(scaled) == len(topics) and all(scaled.values()):
             rejected[0] = replace(rejected[0], remedies=_propose_sources(scaled))
         return PowerReadings(findings=tuple(rejected))
-    rails, odd = _exclude_implausible(rails)
-    log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
     given: CurrentSign = "auto" if any(source.joints for source in sources) else current_sign
     sign, of_sign, told_by = _sign(rails, log_times, sources, given)
     if sign == 0:
         return PowerReadings(findings=of_sign)
     includes = tuple(dict.fromkeys(source.other_loads for source in sources if source.other_loads))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
-    findings += [*of_sign, *odd, *loads, *_find_nominal(sources)]
+    nominal = list(_find_nominal(sources))
+    constant = [] if nominal else list(_find_constant_voltages(rails, _sum_currents(rails, log_times)[1]))
+    findings += [*of_sign, *loads, *nominal, *constant]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(source.energy for source in sources)
     unknown = any(source.averaging_unknown for source in sources) and not counts
@@ -156,13 +170,15 @@ def read_power(
         tuple(dict.fromkeys(findings)),
         told_by,
         includes,
-        gain_std_fraction=max(gains),
+        gain_std_fraction=math.hypot(max(gains), *(found.numbers["std_fraction"] for found in constant)),
         offset_std_amp=max(source.zero_std for source in sources),
         rest_current_amp=(min(range_amp[0] for range_amp in rest), max(range_amp[1] for range_amp in rest))
         if rest and len(rest) == sum(bool(source.current or source.energy) for source in sources)
         else None,
         charge_ratio=_compare_charges(topics, signed),
         sides=_find_sides(topics, sources, signed, sign),
+        offset_amp=offset_amp,
+        charging=any(np.any(columns.get(_STATUS, ()) == _CHARGING) for _, columns in topics.values()),
     )
 
 
@@ -264,7 +280,18 @@ def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
     for source in sources:
         if (volt := source.nominal_voltage_volt) is not None:
             names, fraction = {"rail": source.rail or source.topic or source.type}, source.nominal_voltage_std_fraction
-            yield make_finding("voltage-assumed", _POWER, names=names, voltage_volt=volt, std_fraction=fraction)
+            yield make_finding(_NOMINAL, _POWER, names=names, voltage_volt=volt, std_fraction=fraction)
+
+
+def _find_constant_voltages(rails: Rails, amp: Floats) -> Iterator[Finding]:
+    """Yield the rails whose voltage has too few levels to be measured, while the whole current [A] changes."""
+    fraction, least = (read_threshold(_NOMINAL, f"constant_{name}") for name in ("std_fraction", "levels_count"))
+    for rail in (rail for found in rails.values() for rail in found):
+        levels = np.unique(rail.voltage_volt[np.isfinite(rail.voltage_volt)])
+        if 0 < levels.size < least and levels[0] != UNIT_VOLT and np.unique(amp).size > 4 * least:
+            yield make_finding(
+                _NOMINAL, _POWER, names={"rail": rail.name}, voltage_volt=levels.mean(), std_fraction=fraction
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,7 +387,7 @@ def _unwrap_currents(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
     if wraps_amp is None:
         return rail, []
     count = int(np.count_nonzero(rail.current_amp > wraps_amp / 2))
-    found = make_finding("current-wrapped", _POWER, names=names, currents_count=count, wraps_amp=wraps_amp)
+    found = make_finding(_WRAPPED, _POWER, names=names, currents_count=count, wraps_amp=wraps_amp)
     return replace(rail, current_amp=unwrap_currents(rail.current_amp, wraps_amp)), [found]
 
 
@@ -419,33 +446,66 @@ def _find_too_few(topic: str, log_time_ns: Floats) -> list[Finding]:
     )
 
 
-def _exclude_implausible(rails: Rails) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
-    """Return the rails with NaN for single values that no battery and no drive has (saturated, lost), and a finding for each rail.
+def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
+    """Return the rails with NaN in all rows that are no measurement, and findings: on their number, or that the power is rejected.
 
-    Without current a low voltage may be true: a drive that is not switched on yet sends zeros.
+    A row is one measurement: where its voltage or its current is missing or implausible, both are excluded. A driver sends such rows before
+    the sensor starts and after it stops; these are not counted.
     """
-    low, high = read_threshold(_ODD, "min_of_median"), read_threshold(_ODD, "max_of_median")
-    kept: dict[str, list[RailReadings]] = {}
+    kept: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
     findings = []
-    for topic, found in rails.items():
-        kept[topic] = []
-        for rail in found:
-            known = rail.voltage_volt[np.isfinite(rail.voltage_volt)]
-            usual = float(np.median(known)) if known.size else np.nan
-            low_volt, high_volt = usual * low, usual * high
-            odd_volt = ((rail.voltage_volt < low_volt) & (rail.current_amp != 0.0)) | (rail.voltage_volt > high_volt)
-            odd_amp = np.abs(rail.current_amp) > rail.largest_amp
-            counts: dict[str, Any] = {
-                "voltages_count": int(np.count_nonzero(odd_volt)),
-                "currents_count": int(np.count_nonzero(odd_amp)) + rail.unmeasured_count,
-            }
-            if any(counts.values()):
-                numbers = counts | {"low_volt": low_volt, "high_volt": high_volt, "high_amp": rail.largest_amp}
-                numbers = {name: value for name, value in numbers.items() if np.isfinite(value)}
-                findings.append(make_finding(_ODD, _POWER, names={"rail": rail.name}, **numbers))
-            volt, amp = np.where(odd_volt, np.nan, rail.voltage_volt), np.where(odd_amp, np.nan, rail.current_amp)
-            kept[topic].append(replace(rail, voltage_volt=volt, current_amp=amp))
+    for topic, rail in ((topic, rail) for topic, found in rails.items() for rail in found):
+        volt, amp, names = rail.voltage_volt, rail.current_amp, {"rail": rail.name}
+        excluded = np.abs(amp) > rail.largest_amp
+        # The first row of a counter has no current.
+        excluded |= find_missing_rows(
+            volt, np.full_like(amp, np.nan) if rail.counter else np.where(excluded, np.nan, amp)
+        )
+        isolated, is_rejected = find_isolated(undo_overflow(np.where(excluded, np.nan, amp))[0], log_times[topic] / 1e9)
+        excluded |= isolated
+        live = np.flatnonzero((np.isfinite(volt) | np.isfinite(amp)) & ~excluded)
+        count = max(
+            np.count_nonzero(excluded[live.min(initial=len(volt)) : live.max(initial=0)]), rail.unmeasured_count
+        )
+        if is_rejected:
+            findings.append(reject_power(topic, "isolated-values", names=names))
+        elif count:
+            fraction = count / len(volt)
+            findings.append(make_finding(EXCLUDED, _POWER, names=names, rows_count=count, rows_fraction=fraction))
+        volt, amp = np.where(excluded, np.nan, volt), np.where(excluded, np.nan, amp)
+        kept[topic].append(replace(rail, voltage_volt=volt, current_amp=amp))
     return kept, findings
+
+
+def _undo_overflows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Rails, list[Finding]]:
+    """Return the rails without overflows of signed currents, and findings; power is rejected where the voltage does not confirm them."""
+    whole: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
+    findings, are_clear = [], True
+    for topic, rail in ((topic, rail) for topic, found in rails.items() for rail in found):
+        current_amp, span_amp, is_clear = undo_overflow(rail.current_amp)
+        whole[topic].append(replace(rail, current_amp=current_amp))
+        if span_amp and not rail.counter:
+            count = np.count_nonzero(np.abs(current_amp - rail.current_amp) > span_amp / 2)
+            names, are_clear = {"rail": rail.name}, are_clear and is_clear
+            findings.append(make_finding(_WRAPPED, _POWER, names=names, currents_count=count, wraps_amp=span_amp))
+    if not findings:
+        return rails, []
+    before, after = (_correlate_voltage(each, log_times) for each in (rails, whole))
+    if before >= max(after, read_threshold(_WRAPPED, "min_correlation")):
+        return rails, []
+    if not are_clear or after < max(before, read_threshold(_WRAPPED, "min_correlation")):
+        return rails, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
+    return whole, findings
+
+
+def _correlate_voltage(rails: Rails, log_times: Mapping[str, Floats]) -> float:
+    """Return the correlation of voltage and whole current within seconds, of either sign; 0 where it is unknown."""
+    time_s, amp = _sum_currents(rails, log_times)
+    volts = ((log_times[topic], rail.voltage_volt) for topic, found in rails.items() for rail in found)
+    at_ns, volt = next(each for each in volts if np.isfinite(each[1]).any())
+    samples = [make_samples(at.astype(np.int64), value) for at, value in ((at_ns, volt), (1e9 * time_s, amp))]
+    sag = measure_sag([make_rail("", *samples, averaged=False)])
+    return 0.0 if sag is None or not sag.amp.any() else abs(float(np.corrcoef(sag.volt, sag.amp)[0, 1]))
 
 
 def _sign(

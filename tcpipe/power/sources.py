@@ -427,7 +427,8 @@ def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding 
     Each rule needs every row to agree, or the median; a single odd row is no evidence.
     """
     voltage, current = (values[np.isfinite(values)] for values in (rail.voltage_volt, rail.current_amp))
-    volt = float(np.median(voltage)) if len(voltage) else np.nan
+    live = voltage[voltage > 0.0]
+    volt = float(np.median(live if len(live) else voltage)) if len(voltage) else np.nan
     amp = float(np.median(np.abs(current))) if len(current) else np.nan
     reason = _check_voltage(voltage, volt, rail.voltage_volt, columns) or _check_current(current, amp, rail.largest_amp)
     if 2 * rail.unmeasured_count > len(rail.current_amp):

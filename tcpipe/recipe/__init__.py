@@ -101,6 +101,8 @@ class ReadConfig(_Section):
     """Factor on all currents, powers and counters of energy: 0.001 if a driver publishes milliamperes as amperes."""
     current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"
     """Sign of currents: auto uses that of the message type; for BatteryState, which differs by robot, the mean over the run decides."""
+    current_offset_amp: Annotated[float, Bounds(ge=-1e4, le=1e4)] = field(default=0.0, metadata={"json": (0.0,)})
+    """Zero of each rail's current, positive as drawn, that is subtracted [A]; of a power without voltage [W]."""
     power_averaged: Literal["auto", "yes", "no"] = "auto"
     """Whether the power source averages over its message period: auto uses the value of the message type."""
     husky_power: Literal["battery", "drivers"] = "battery"

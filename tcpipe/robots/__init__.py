@@ -43,6 +43,13 @@ a stated loss: copper's resistance rises by 0.39 % a kelvin."""
 TABLE_POWER = "tcpipe/msg/TablePower"
 """The type of a table of power, where that is neither a voltage nor a current as it stands."""
 
+UNMEASURED_AMP = {
+    "battery_status": (-1.0,),
+    "": (1.0, 1e-3, *(limit / 10**digits for limit in (32767, 32768, 65535) for digits in range(4))),
+}
+"""Currents [A] that mean "not measured", by message: PX4 defines -1. In all others (""), -1 and the limits of 16-bit registers, of either
+sign, may be real: they count only where both neighbours are far. NaN, and a voltage of 0 V or less, are never a measurement."""
+
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
 

@@ -47,6 +47,7 @@ from tcpipe.stages.label_motion import (
 from tcpipe.stages.label_uncertainty import (
     audit_power_sensor,
     count_confirming_sensors,
+    find_negative_idle,
     find_sensor_findings,
     find_stationary_ns,
     find_unpowered_motion,
@@ -141,6 +142,8 @@ def label_segments(
     findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
     findings += find_unpowered_motion(table, physics, masked.info, start_ns)
     findings += find_witnesses(table, replace(masked.info.report.facts, label=facts), robot)
+    kind, rails = masked.info.report.facts.power, next(iter(rails_by_epoch.values()), [])
+    findings += find_negative_idle(standing, facts.median_power_watt, kind, rails)
     info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 

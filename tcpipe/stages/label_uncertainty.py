@@ -22,7 +22,7 @@ from tcpipe.power.audit import (
     measure_sag,
     summarize_rest,
 )
-from tcpipe.power.rails import Rail, Rule, integrate_energy, sum_power
+from tcpipe.power.rails import IdlePower, Rail, Rule, integrate_energy, sum_power
 from tcpipe.power.sampling import find_smoothing
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
@@ -31,7 +31,7 @@ from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, Smoothing, StageFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
 
 Floats = NDArray[np.float64]
@@ -160,6 +160,30 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
         )  # fmt: skip
     if facts.lost_signs:
         yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
+
+
+_NEGATIVE = "idle-power-negative"
+
+
+def find_negative_idle(
+    idle: IdlePower, driving_watt: float | None, power: PowerSign | None, rails: Sequence[Rail]
+) -> Iterator[Finding]:
+    """Yield that power is clearly negative in every halt, and the lines that correct it; not while the battery is charged."""
+    if power is None or power.charging or driving_watt is None:
+        return
+    least_watt = read_threshold(_NEGATIVE, "min_driving_fraction") * driving_watt
+    if not (idle.highest_watt < 0.0 and idle.watt < -least_watt):
+        return
+    volt = float(sum(np.median(rail.voltage.value) for rail in rails))
+    low_amp, high_amp = power.rest_current_amp or (0.0, 0.0)
+    unknown_amp = (high_amp - low_amp) / 2.0
+    if power.rest_current_amp is None:
+        unknown_amp = read_threshold(_NEGATIVE, "idle_std_fraction") * (driving_watt - idle.watt) / volt
+    offset_amp = power.zero_amp + idle.watt / volt - (low_amp + high_amp) / 2.0
+    std_amp = float(np.hypot(_find_prior(power)[1], unknown_amp))
+    offset, std = {"current_offset_amp": round(offset_amp, 3)}, {"power_offset_std_amp": round(std_amp, 2)}
+    remedies = suggest("correct", {"read": offset, "label": std})
+    yield make_finding(_NEGATIVE, _POWER, remedies=remedies, idle_watt=idle.watt, driving_watt=driving_watt)
 
 
 _FEWEST_UNPOWERED = 5

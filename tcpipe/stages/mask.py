@@ -231,7 +231,11 @@ def find_gaps(
     steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
     jumps[steps] = jumps[steps + 1] = True
     run, findings = Subject("run", track.info.run_id), []
-    share = float(without_power[moving].mean()) if moving.any() else 0.0
+    lost, live = without_power & moving, ~without_power
+    for outside in (~np.logical_or.accumulate(live), ~np.logical_or.accumulate(live[::-1])[::-1]):
+        if outside.sum() <= read_threshold("power-gaps", "max_edge_s") * track.info.rate_hz:
+            lost &= ~outside
+    share = float(lost.sum() / moving.sum()) if moving.any() else 0.0
     if share > read_threshold("power-gaps", "min_lost_fraction"):
         findings.append(make_finding("power-gaps", Subject("role", "power"), lost_fraction=share))
     share = float(uncertain[moving].mean()) if moving.any() else 0.0

@@ -181,7 +181,7 @@ def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings)
     parts = []
     for rail in power.rails[source.topic]:
         voltage, current = read_rail_power(rail, times, columns)
-        known = np.isfinite(voltage) | np.isfinite(current)
+        known, current = np.isfinite(voltage) | np.isfinite(current), current - power.offset_amp
         values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
         parts.append({name: value[known] for name, value in values.items()})
     return parts
@@ -235,6 +235,8 @@ def _describe_power(power: PowerReadings, side_share: float | None) -> PowerSign
         power.gain_std_fraction,
         power.offset_std_amp,
         power.rest_current_amp,
+        power.offset_amp,
+        power.charging,
         charge_ratio=power.charge_ratio,
         meter_slope=power.meter_slope,
         side_share=side_share,

@@ -55,6 +55,7 @@ def read_power_of_topics(
         husky_power=config.husky_power,
         current_sign=config.current_sign,
         current_scale=config.current_scale,
+        offset_amp=config.current_offset_amp,
     )
     return compare_second_meters(power, topics, meters, known.power_sources, platform=platform)
 
@@ -104,7 +105,7 @@ def name_counter_columns(rail: str) -> tuple[str, str]:
 
 
 def select_power_rows(columns: Columns, rails: Sequence[RailReadings]) -> Readings:
-    """Return the rows of a power topic on which at least one rail carries a voltage or a current."""
+    """Return the rows in which a rail has a voltage or a current; only rows between them count as not used."""
     values = {
         name: values
         for rail in rails
@@ -116,7 +117,7 @@ def select_power_rows(columns: Columns, rails: Sequence[RailReadings]) -> Readin
             energy, resets = name_counter_columns(rail.name)
             values |= {energy: rail.counter.energy_joule, resets: rail.counter.resets.astype(np.float64)}
     stamps = read_header_ns(columns)
-    lost = len(columns[LOG_TIME]) - len(row)
+    lost = row[-1] + 1 - row[0] - len(row) if len(row) else len(columns[LOG_TIME])
     return Readings(
         row,
         columns[LOG_TIME][row].astype(np.int64),

@@ -71,6 +71,7 @@ class PowerSign:
 
     ``includes``: known loads besides the drives (computers, payload). ``gain_std_fraction`` and ``offset_std_amp`` are the σ of gain and
     zero of a sensor of this kind, ``rest_current_amp`` the currents that a rail of it can have at rest, None where nothing is known.
+    ``zero_amp``: zero of each current that the recipe states [A]. ``charging``: something charges the battery.
     """
 
     current_sign: str
@@ -79,6 +80,8 @@ class PowerSign:
     gain_std_fraction: float | None = field(default=None, metadata=LEFT_OUT)
     offset_std_amp: float | None = field(default=None, metadata=LEFT_OUT)
     rest_current_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    zero_amp: float = field(default=0.0, metadata={"json": (0.0,)})
+    charging: bool = field(default=False, metadata={"json": (False,)})
     charge_ratio: float | None = field(default=None, metadata=LEFT_OUT)
     """Integral of the current over the fall of the battery's charge."""
     meter_slope: float | None = field(default=None, metadata=LEFT_OUT)

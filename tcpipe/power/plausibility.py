@@ -1,0 +1,103 @@
+"""Which rows of a power topic are no measurement: missing or marked values, values far from their neighbours, and overflows.
+
+A meter may be read less often than its messages are sent: the neighbours of a value are the nearest different values.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from tcpipe.robots import UNMEASURED_AMP
+from tcpipe.tables.findings import read_threshold
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+EXCLUDED, REJECTED = "power-values-excluded", "power-rejected"
+_FEWEST_VALUES = 20
+_SHORTEST_DRIVE_S = 1.0
+"""No robot starts and stops within this."""
+_JUMP, _ASYMMETRY, _FEWEST_JUMPS = 0.6, 0.02, 4
+"""An overflow: smallest step and largest difference of both ends, as fractions of the span, and smallest number of steps."""
+
+
+def find_missing_rows(voltage_volt: Floats, current_amp: Floats) -> Mask:
+    """Return the rows without a possible voltage, or with only one of both where most rows have both, shape (N,)."""
+    has_voltage, has_current = np.isfinite(voltage_volt), np.isfinite(current_amp)
+    live = voltage_volt[has_voltage & (voltage_volt > 0.0)]
+    usual = np.median(live) if live.size else np.nan
+    low, high = (read_threshold(EXCLUDED, name) * usual for name in ("min_of_median", "max_of_median"))
+    missing: Mask = has_voltage & ~((voltage_volt >= low) & (voltage_volt <= high))
+    is_paired = 2 * np.count_nonzero(has_voltage & has_current) > np.count_nonzero(has_voltage | has_current)
+    return missing | (has_voltage != has_current) if is_paired else missing
+
+
+def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
+    """Return the rows whose value is isolated, shape (N,), and whether such values are too many, or too many in a row.
+
+    One or two values in a row are isolated if they are far from the median of five, by the largest usual value, or by half of it where
+    other values are near their medians. An exact value that may mean "not measured" is isolated if it is farther from both neighbours than
+    usual steps, and repeated no longer than other values.
+    """
+    rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), np.bool_)
+    new = _find_changes(values[rows])
+    value, at_s = values[rows][new], time_s[rows][new]
+    marked = np.isclose(np.abs(value)[:, None], UNMEASURED_AMP[""], rtol=1e-6, atol=0.0).any(axis=1)
+    rest = np.flatnonzero(~marked)
+    if rest.size < _FEWEST_VALUES:
+        return found, False
+    after = np.clip(np.searchsorted(rest, np.arange(value.size)), 1, rest.size - 1)
+    distance = np.minimum(*(np.abs(value - value[rest[at]]) for at in (after - 1, after)))
+    steps, repeats = np.abs(np.diff(value[rest])), np.bincount(np.cumsum(new) - 1)
+    isolated = marked & (distance > np.quantile(steps[steps > 0.0], 0.99)) & (repeats <= 2 * np.median(repeats[rest]))
+    by_most, deviation = _compare_with_median(value[rest], 5, 0.9)
+    relative, _ = _compare_with_median(value[rest], 5, 0.99)
+    limit, low_limit, scatter = (
+        read_threshold(EXCLUDED, f"max_{name}") for name in ("of_top", "of_top_clear", "scatters")
+    )
+    far = relative > limit
+    isolated[rest] = far | ((relative > low_limit) & (deviation > scatter * np.quantile(deviation, 0.9)))
+    found[rows] = isolated[np.cumsum(new) - 1]
+    block = np.flatnonzero(_compare_with_median(value[rest], 11, 0.99)[0] > limit)
+    runs = np.split(rest[block], np.flatnonzero(np.diff(block) > 1) + 1)
+    is_block = any(run.size > 2 and at_s[run[-1]] - at_s[run[0]] < _SHORTEST_DRIVE_S for run in runs)
+    share = max(far.mean(), np.mean(by_most > limit))
+    return found, bool(is_block or share > read_threshold(REJECTED, "max_isolated_fraction"))
+
+
+def _find_changes(values: Floats) -> Mask:
+    return np.concatenate((np.ones(min(values.size, 1), np.bool_), values[1:] != values[:-1]))
+
+
+def _compare_with_median(values: Floats, width: int, quantile: float) -> tuple[Floats, Floats]:
+    """Return deviations from the median of ``width`` values: relative to that or to its quantile over the run, and absolute."""
+    middle = np.median(sliding_window_view(np.pad(values, width // 2, mode="edge"), width), axis=1)
+    size, deviation = np.abs(middle), np.abs(values - middle)
+    return deviation / np.maximum(size, np.quantile(size[size > 0.0], quantile) if size.any() else 1.0), deviation
+
+
+def undo_overflow(current_amp: Floats) -> tuple[Floats, float, bool]:
+    """Return currents [A] without the overflow of a signed register, its span [A], and whether usual steps are clearly smaller.
+
+    The span is 0 where nothing overflows. Values end at plus and minus half of it, and jump from one end to the other. A driver may scale
+    or round after the overflow, so that the span need not be a power of two of the resolution.
+    """
+    rows = np.flatnonzero(np.isfinite(current_amp))
+    value = current_amp[rows]
+    levels = np.unique(np.round(value, 6))
+    if levels.size < _FEWEST_VALUES:
+        return current_amp, 0.0, False
+    quantum = float(np.diff(levels).min())
+    span = float(levels[-1] - levels[0]) + quantum
+    step = np.diff(value)
+    jumps = np.abs(step) > _JUMP * span
+    if abs(levels[-1] + levels[0]) > max(2.0 * quantum, _ASYMMETRY * span) or jumps.sum() < _FEWEST_JUMPS:
+        return current_amp, 0.0, False
+    whole = current_amp.copy()
+    whole[rows[1:]] -= span * np.cumsum(np.where(jumps, np.sign(step), 0.0))
+    usual = float(np.quantile(np.abs(step[~jumps & (step != 0.0)]), 0.99))
+    if np.quantile(np.abs(np.diff(whole[rows]))[jumps], 0.9) > max(usual, 3.0 * quantum):
+        return current_amp, 0.0, False
+    return whole, span, usual < span / 4.0
