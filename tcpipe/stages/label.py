@@ -121,22 +121,28 @@ def label_segments(
                 **{name: getattr(cost, name) for name in Labels.__slots__},
                 **net,
                 voltage_volt=mean_between(to_integers(rows, "stamp_ns"), to_floats(rows, "voltage_volt"), *spans),
-                physics_power_watt=np.full(cut.num_rows, np.nan),
                 power_samples=count,
                 confirming_sensor_count=count_confirming_sensors(cut, streams, masked.info.report.facts),
                 quality=combine_flags(flags, cut.num_rows),
                 geometry=make_lines(*(read_lonlat_deg(cut, end) for end in ("start", "end"))),
             )
         )
-    table, physics = add_physics(pa.concat_tables(parts).combine_chunks(), standing.watt)
+    table = pa.concat_tables(parts).combine_chunks()
+    needed_watt, physics = fit_run_physics(table, standing.watt)
+    start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
+    unpowered = list(find_unpowered_motion(table, needed_watt, physics, masked.info, start_ns))
+    quality = to_numbers(table["quality"]).copy()
+    for rows, _ in unpowered:
+        quality[rows] |= np.uint32(Quality.UNPOWERED)
+    column = table.schema.get_field_index("quality")
+    table = table.set_column(column, table.schema.field(column), pa.array(quality))
     distance_by_reason_m, velocity = segments.distance_by_reason_m, config.velocity
     facts = make_label_facts(
         table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
     facts = replace(facts, power_sensor=None if facts.energy_joule is None else power)
-    start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
     findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
-    findings += find_unpowered_motion(table, physics, masked.info, start_ns)
+    findings += [finding for _, finding in unpowered]
     info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 
@@ -260,23 +266,18 @@ def make_fit_samples(table: pa.Table) -> FitSamples:
     )
 
 
-def add_physics(table: pa.Table, idle_watt: float) -> tuple[pa.Table, PhysicsFacts]:
-    """Return the labelled segments of a run with the power that the physical model predicts, and the fit.
+def fit_run_physics(table: pa.Table, idle_watt: float) -> tuple[NDArray[np.float64], PhysicsFacts]:
+    """Return the power [W] that speed, slope and turning of each segment need, NaN without a fit, and the fit of the run.
 
-    The model has idle power ``idle_watt`` (NaN where unknown), drivetrain, rolling, grade and turning.
+    The classes of the ground are unknown here: of mud in a meadow the residual is large, and shows no error.
     """
     metres = make_fit_samples(table)
     watt = idle_watt if np.isfinite(idle_watt) else None
     found = fit_physics(metres, idle_watt=watt)
     if found is None or not found.is_plausible():
-        return table, PhysicsFacts(fitted=False, idle_watt=watt)
-    predicted = np.where(np.isfinite(metres.power_watt), found.power_watt(metres), np.nan)
-    odd = found.is_outlier(metres.power_watt - predicted)
-    quality = to_numbers(table["quality"]) | np.where(odd, np.uint32(Quality.PHYSICS_OUTLIER), np.uint32(0))
-    columns = {"physics_power_watt": predicted, "quality": quality.astype(np.uint32)}
-    table = LABELLED_SEGMENTS.table(**{name: columns.get(name, table[name]) for name in table.column_names})
+        return np.full(table.num_rows, np.nan), PhysicsFacts(fitted=False, idle_watt=watt)
     resistance, rolling, drive = found.rolling_resistance(), found.of("rolling"), found.of("grade")
-    return table, PhysicsFacts(
+    return found.power_watt(metres), PhysicsFacts(
         fitted=True,
         idle_watt=watt,
         weight_over_efficiency_newton=None if drive is None else drive[0],
@@ -285,6 +286,5 @@ def add_physics(table: pa.Table, idle_watt: float) -> tuple[pa.Table, PhysicsFac
         recovered_downhill=found.recovered,
         residual_watt=found.residual_watt,
         segments=found.segments,
-        outliers=int(odd.sum()),
         fit=fit_and_validate_physics(metres, idle_watt=watt),
     )

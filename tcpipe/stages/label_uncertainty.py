@@ -164,9 +164,14 @@ _IDLE_FRACTION = 0.1
 _MISSING_RESIDUALS = 3.0
 
 
-def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInfo, start_ns: int) -> Iterator[Finding]:
-    """Yield where the robot moves over several segments with the power of rest, though speed and slope need clearly more."""
-    watt, needed_watt = to_floats(table, "power_watt"), to_floats(table, "physics_power_watt")
+def find_unpowered_motion(
+    table: pa.Table, needed_watt: Floats, physics: PhysicsFacts, info: TrackInfo, start_ns: int
+) -> Iterator[tuple[slice, Finding]]:
+    """Yield the rows and the finding of each span in which the robot moves with its idle power.
+
+    The power [W] that speed and slope of these segments need, of ``needed_watt``, shape (M,), exceeds the idle power clearly.
+    """
+    watt = to_floats(table, "power_watt")
     idle_watt, residual_watt = physics.idle_watt, physics.residual_watt
     if idle_watt is None or residual_watt is None or not table.num_rows:
         return
@@ -180,7 +185,7 @@ def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInf
             (table[name][row].as_py() - start_ns) * 1e-9 for name, row in (("start_ns", first), ("end_ns", last))
         )
         window: Keys = {"run": info.run_id, "start": float(np.floor(begin_s)), "end": float(np.ceil(end_s))}
-        yield make_finding(
+        finding = make_finding(
             "motion-without-power",
             _POWER,
             remedies=suggest("drop", {"mask.windows": [window]}),
@@ -188,6 +193,7 @@ def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInf
             segments_count=last + 1 - first,
             missing_watt=missing_watt,
         )
+        yield slice(first, last + 1), finding
 
 
 def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts, *, rule: Rule) -> SensorError:

@@ -363,7 +363,6 @@ class PhysicsFacts:
     recovered_downhill: float | None = field(default=None, metadata=LEFT_OUT)
     residual_watt: float | None = field(default=None, metadata=LEFT_OUT)
     segments: int | None = field(default=None, metadata=LEFT_OUT)
-    outliers: int | None = field(default=None, metadata=LEFT_OUT)
     fit: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
 
 
