@@ -23,7 +23,7 @@ from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, find_common_scale_std
-from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
+from tcpipe.power.noise import estimate_delay_variance, estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import (
     IdlePower,
     Rail,
@@ -55,7 +55,7 @@ from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
-from tcpipe.tables.facts import PhysicsFacts, Smoothing
+from tcpipe.tables.facts import PhysicsFacts, PowerSensorFacts, Smoothing
 from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,
     MASKED_TRACK,
@@ -97,7 +97,7 @@ def label_segments(
         sensor = make_sensor_error(cut, rails, power, rule=rule)
         power = replace(power, lost_signs=power.lost_signs + int(np.count_nonzero(sensor.sign_joule)))
         cost, net, causes = compute_segment_costs(
-            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor, smoothing=power.smoothing
+            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor, power=power
         )
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
@@ -160,7 +160,7 @@ def compute_segment_costs(
     rule: Rule,
     standing: IdlePower,
     sensor: SensorError,
-    smoothing: Smoothing | None = None,
+    power: PowerSensorFacts | None = None,
 ) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
     """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
@@ -168,10 +168,14 @@ def compute_segment_costs(
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, find_stationary_ns(rows, info.rate_hz)
+    smoothing = None if power is None else power.smoothing
     noise = estimate_energy_noise(rails, *spans, smoothing=smoothing)
     better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ, smoothing=smoothing)
     ground_mps = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
-    end_watt, noise_joule = compute_power_watt(rails, end_ns), noise.std_joule()
+    end_watt, delay_j2 = compute_power_watt(rails, end_ns), np.zeros(cut.num_rows)
+    if power is not None and power.delay_s is not None and power.delay_std_s is not None:
+        delay_j2 = estimate_delay_variance(rails, start_ns, end_ns, power.delay_s, power.delay_std_s, rule=rule)
+    noise_joule = np.sqrt(noise.std_joule() ** 2 + delay_j2)
     scale_std = find_common_scale_std(info.report.facts.fuse, start_ns, to_integers(cut, "clock_epoch"))
     cost = compute_labels(
         chord_m=to_floats(cut, "chord_m"),
@@ -194,8 +198,8 @@ def compute_segment_costs(
     )
     position = end_watt**2 * (cost.duration_std_s**2 - cost.duration_common_std_s**2)
     causes = {"position": position, "rate": noise.rate, "current": noise.current, "voltage": noise.voltage}
-    causes["common"] = cost.energy_common_std_joule**2
-    return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
+    causes |= {"common": cost.energy_common_std_joule**2, "delay": delay_j2}
+    return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise.std_joule()) ** 2}
 
 
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> NDArray[np.float64]:

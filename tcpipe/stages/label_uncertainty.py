@@ -21,7 +21,7 @@ from tcpipe.power.audit import (
     summarize_rest,
 )
 from tcpipe.power.rails import Rail, Rule, integrate_energy, sum_power
-from tcpipe.power.sampling import find_smoothing
+from tcpipe.power.sampling import PowerFit, find_delay, find_smoothing, make_power_fit
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
@@ -29,7 +29,7 @@ from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, Smoothing, StageFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
 
 Floats = NDArray[np.float64]
@@ -52,11 +52,15 @@ def audit_power_sensor(
     ``rows`` are those of the masked track.
     """
     power = info.report.facts.power
-    clocks = info.report.facts.clock_offsets
-    late = clocks is not None and "power" in clocks.offsets and clocks.offsets["power"].noted  # flags every label
+    fits = _fit_power(rows, rails_by_epoch)
     corrected_s = info.report.facts.time_offset_s.get("power", 0.0)
-    smoothing = None if late else _find_longest_smoothing(rows, rails_by_epoch, corrected_s)
-    facts = PowerSensorFacts(*_find_prior(power), smoothing=smoothing)
+    found = [smoothing for fit in fits if (smoothing := find_smoothing(fit, corrected_s=corrected_s))]
+    smoothing = max(found, key=lambda of_epoch: of_epoch.width_s, default=None)
+    delays = [] if smoothing else [delay for fit in fits if (delay := find_delay(fit))]
+    delay_s, delay_std_s = min(delays, key=lambda delay: delay[1], default=(None, None))
+    facts = PowerSensorFacts(
+        *_find_prior(power), smoothing=smoothing, delay_s=delay_s, delay_std_s=delay_std_s
+    )
     if config.power_gain_std_fraction is not None:
         facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
     else:
@@ -98,11 +102,9 @@ def _add_gain_change(facts: PowerSensorFacts, rails_by_epoch: Mapping[int, list[
     return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
 
 
-def _find_longest_smoothing(
-    rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], corrected_s: float
-) -> Smoothing | None:
-    """Return how power is smoothed in the clock epoch in which it is most; None where none shows it."""
-    found = []
+def _fit_power(rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]]) -> list[PowerFit]:
+    """Return the power of each clock epoch beside the motion of the track, where both are known for long enough."""
+    fits = []
     for epoch, rails in rails_by_epoch.items():
         mine = select_rows(rows, "clock_epoch", epoch)
         motion = np.column_stack(
@@ -112,8 +114,8 @@ def _find_longest_smoothing(
         known = np.isfinite(motion).all(axis=1)
         if (power := sum_power(rails)) is not None:
             stamp_ns, averaged = to_integers(mine, "stamp_ns")[known], any(rail.averaged for rail in rails)
-            found.append(find_smoothing(power, stamp_ns, motion[known], averaged=averaged, corrected_s=corrected_s))
-    return max(filter(None, found), key=lambda smoothing: smoothing.width_s, default=None)
+            fits.append(make_power_fit(power, stamp_ns, motion[known], averaged=averaged))
+    return [fit for fit in fits if fit is not None]
 
 
 _POWER = Subject("role", "power")
@@ -153,6 +155,20 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
             remedies=suggest("correct", {"read.time_offset_s": {"power": given_s - smoothing.late_s}}) if smoothing.late_s else (),
             width_s=smoothing.width_s, late_s=smoothing.late_s,
         )  # fmt: skip
+    error_fraction = label.energy_budget.delay if label.energy_budget else None
+    if (
+        facts.delay_s is not None and facts.delay_std_s is not None and error_fraction is not None
+        and abs(facts.delay_s) > read_threshold("power-delayed", "min_std_ratio") * facts.delay_std_s
+        and error_fraction > read_threshold("power-delayed", "min_error_fraction")
+    ):
+        yield make_finding(
+            "power-delayed",
+            _POWER,
+            remedies=suggest("correct", {"read.time_offset_s": {"power": round(given_s - facts.delay_s, 2)}}),
+            delay_s=facts.delay_s,
+            delay_2std_s=2.0 * facts.delay_std_s,
+            error_fraction=error_fraction,
+        )
     if facts.lost_signs:
         yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
 

@@ -308,6 +308,8 @@ class EnergyBudget:
     """The total with power at 20 Hz."""
     common: float | None = field(default=None, metadata=LEFT_OUT)
     """The error that all segments of a run share, which is not part of the total; None in documents of earlier versions."""
+    delay: float | None = field(default=None, metadata=LEFT_OUT)
+    """The error by the delay of power against motion, which is not part of the total."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -394,7 +396,8 @@ class PowerSensorFacts:
     """What is not known of the power sensor: σ of its gain and of the zero of a rail [A], and what the log shows (`tcpipe.power.audit`).
 
     ``rest_amp``: lowest and highest current of a rail in halts; the gain changed by ``gain_ratio`` at ``gain_changed_ns``;
-    ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None where none shows.
+    ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None where none shows; ``delay_s``: of power behind
+    the motion that it follows, with its standard deviation; None where motion explains too little of it.
     """
 
     gain_std_fraction: float
@@ -404,6 +407,8 @@ class PowerSensorFacts:
     gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
     lost_signs: int = 0
     smoothing: Smoothing | None = field(default=None, metadata=LEFT_OUT)
+    delay_s: float | None = field(default=None, metadata=LEFT_OUT)
+    delay_std_s: float | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
