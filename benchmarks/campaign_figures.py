@@ -20,7 +20,6 @@ OF_THE_DRIVE = (
     | Quality.BELOW_FULL_SPEED
     | Quality.NO_COMMAND
     | Quality.LOW_POWER_RATE
-    | Quality.PHYSICS_OUTLIER  # ground unlike the rest of the run's
 )
 """Bits that describe what was driven and recorded; all others doubt a label, and those are what is judged here."""
 LABELS = ("T", "v", "w", "E")

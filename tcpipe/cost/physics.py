@@ -46,7 +46,6 @@ _MOST_RECOVERED = 0.9
 _BEND = 0.1
 _STEPS = 100  # of reweighting at most
 _HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)
-_OUTLIER = 4.0  # robust standard deviations
 _FINEST = 0.02  # of the power: no such model is better
 _PLAUSIBLE_RESISTANCE = 1.5  # coefficient of rolling resistance: tracks in deep sand stay below
 _BLOCK, _FEWEST_BLOCKS = 20, 20  # consecutive segments that may err alike, and how many such blocks there are at least
@@ -145,11 +144,6 @@ class Physics:
         return bool(self.value[rolling].max() > 0.0 and (climb is None or climb[0] > 0.0)) and all(
             resistance is None or resistance[0] < _PLAUSIBLE_RESISTANCE for resistance in resistances
         )
-
-    def is_outlier(self, residual_watt: Floats) -> NDArray[np.bool_]:
-        """Return which residuals [W] are beyond four robust standard deviations; NaN is none."""
-        found: NDArray[np.bool_] = np.abs(residual_watt) > _OUTLIER * self.residual_watt
-        return found
 
 
 def fit_physics(metres: FitSamples, *, idle_watt: float | None = None) -> Physics | None:

@@ -11,7 +11,7 @@ page.start(async () => {
   const kinds = {
     split: ["split"], class: ["terrain class"], quality: ["quality"], run: ["run"],
     power: ["power w", "W", 0], velocity: ["velocity v", "m/s", 3], duration: ["time T", "s", 3], energy: ["energy E", "J", 0],
-    slope: ["slope along travel", "°", 1], turn: ["turn", "°", 1], residual: ["w beyond physics", "W", 0], power_std: ["σ of w", "W", 1],
+    slope: ["slope along travel", "°", 1], turn: ["turn", "°", 1], power_std: ["σ of w", "W", 1],
     apart: ["way to the nearest train metre", "m", 2],
   };
   const label = (name) => kinds[name][0] + (kinds[name][1] ? ` [${kinds[name][1]}]` : "");
@@ -46,7 +46,7 @@ page.start(async () => {
   const fillKinds = (id, names) => fillSelect(at(id), there(names), (name) => kinds[name][0]);
   const numeric = Object.keys(kinds).filter((name) => kinds[name].length > 1);
   fillKinds("colour", Object.keys(kinds));
-  fillKinds("across", ["slope", "velocity", "turn", "residual"]);
+  fillKinds("across", ["slope", "velocity", "turn"]);
   fillKinds("up", ["power", "energy", "velocity"]);
   fillKinds("quantity", numeric);
   page.chooseGround(facts.ground);
@@ -186,7 +186,7 @@ page.start(async () => {
   const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${facts.count} patches; 'tcpipe report --patches' puts all beside it.` : "";
   const labelsOf = (i) => [
     ...["power", "velocity", "duration", "energy"].map((name) => [kinds[name][0], withStd(i, name)]),
-    ["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")], ...(c.residual ? [["beyond physics", digits(c.residual[i], "residual")]] : []),
+    ["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")],
     ["ground", className(i)],
   ];
   function originOf(i) {
@@ -233,12 +233,11 @@ page.start(async () => {
   let first = 0;
   const orders = {
     "order of the dataset": null,
-    "|w beyond physics|": c.residual && ((i) => Math.abs(c.residual[i])),
     "σ of w": (i) => c.power_std[i],
     "w, largest first": (i) => c.power[i],
     "w, smallest first": (i) => -c.power[i],
   };
-  fillSelect(at("sort"), Object.keys(orders).filter((name) => orders[name] !== undefined));
+  fillSelect(at("sort"), Object.keys(orders));
   page.fillLayers(at("layer"), sheets?.layers ?? []);
   function drawPage() {
     const key = orders[at("sort").value], rows = [...(filters.size ? selected : sheets?.rows ?? [])];
@@ -267,7 +266,7 @@ page.start(async () => {
     at("page-after").disabled = first + perPage >= rows.length;
     const columns = [
       ["sample_id", idOf], ["split", splitName], ["class", className], ["w", (i) => withStd(i, "power")], ["v", (i) => withStd(i, "velocity")],
-      ["E", (i) => withStd(i, "energy")], ...(c.residual ? [["w beyond physics", (i) => digits(c.residual[i], "residual")]] : []), ["quality", flagsOf],
+      ["E", (i) => withStd(i, "energy")], ["quality", flagsOf],
     ];
     const line = (tag, texts) => {
       const row = make("tr");

@@ -52,7 +52,7 @@ MOST_SAMPLES = 100_000
 
 SAMPLE_COLUMNS = (
     *("sample_id", "split", "run_id", "start_ns", "start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg"),
-    *("terrain_class", "terrain_name", "slope_rad", "yaw_change_rad", "physics_power_watt", "quality"),
+    *("terrain_class", "terrain_name", "slope_rad", "yaw_change_rad", "quality"),
     *(column for *columns, _ in LABELS.values() for column in columns),
 )
 """Of samples.parquet that the page needs."""
@@ -332,8 +332,6 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
         columns[f"{name}_std"] = ("half", to_floats(table, std))
     for name, column in (("slope", "slope_rad"), ("turn", "yaw_change_rad")):
         columns[name] = ("half", np.degrees(to_floats(table, column)))
-    if card.physics:
-        columns["residual"] = ("half", to_floats(table, "power_watt") - to_floats(table, "physics_power_watt"))
     run = _find_indices(table, "run_id", [source.run_id for source in card.runs])
     after = table.column("start_ns").to_numpy() - starts_ns[run]
     near = (apart_m < np.sqrt(2.0) * card.patch_m) & (nearest < count)

@@ -36,9 +36,9 @@ QUALITY_WORDS = {
     Quality.NO_COMMAND: "no command topic: full speed is unverified",
     Quality.VOLTAGE_OUT_OF_RANGE: "voltage leaves the robot's range",
     Quality.CLOCK_DOUBTFUL: "a clock is uncertain",
-    Quality.PHYSICS_OUTLIER: "power differs much from the physics model",
     Quality.BELOW_FULL_SPEED: "commanded below full speed",
     Quality.SENSORS_DISAGREE: "sensors disagree",
+    Quality.UNPOWERED: "the robot moves with its idle power",
 }
 """Meaning of each bit."""
 
@@ -88,6 +88,7 @@ _BUDGET_ROWS = {
     "total": "all together",
     "at_20_hz": "all together, with power at 20 Hz",
     "common": "one error of the whole run: power sensor, scale of a lone odometry (apart)",
+    "delay": "delay of power against the motion (apart)",
 }
 
 

@@ -11,7 +11,7 @@ page.start(async () => {
   const panels = [];
   const range = model("gates").x_range;
   const names = { w: ["power w", "power", "W", 1], v: ["velocity v", "velocity", "m/s", 4], T: ["time T", "duration", "s", 4], E: ["energy E", "energy", "J", 1],
-    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 3], residual: ["w beyond physics", "residual", "W", 1], sigma: ["σ of position", "position_std", "m", 3] };
+    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 3], sigma: ["σ of position", "position_std", "m", 3] };
   const ofTrack = { w: "power", v: "speed", sigma: "position_std" };  // columns that colour the whole track, segments or not
   const there = Object.keys(names).filter((key) => s[names[key][1]]?.some(Number.isFinite));
   const finite = Number.isFinite;

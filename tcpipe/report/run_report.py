@@ -246,7 +246,6 @@ def _make_segments_data(
     columns["turn"], columns["turn_std"] = (
         ("f32", np.degrees(to_floats(segments, f"yaw_change_{part}rad"))) for part in ("", "std_")
     )
-    columns["residual"] = "f32", to_floats(segments, "power_watt") - to_floats(segments, "physics_power_watt")
     columns["position_std"] = "half", to_floats(segments, "position_std_m")
     columns["quality"] = "u16", to_integers(segments, "quality")
     columns["severity"] = "u8", _find_severities(columns, findings, spans)

@@ -174,7 +174,11 @@ def correct_clocks(
     found = replace(found, offsets={role: offset for role, offset in found.offsets.items() if role not in unsteady})
     middle_ns, span_s = find_middle_ns(inputs.measurements[epoch])
     off = {role: offset for role, offset in found.offsets.items() if offset.noted}
-    findings = [_find_offset(found, role, offset, streams, span_s) for role, offset in off.items()]
+    findings = [
+        _find_offset(found, role, offset, streams, span_s)
+        for role, offset in off.items()
+        if role != POWER or offset.drift_ppm  # labels include its delay, measured against the track
+    ]
     aligned = {
         number: m.replace_sensors(
             {

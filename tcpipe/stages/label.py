@@ -23,7 +23,7 @@ from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, find_common_scale_std
-from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
+from tcpipe.power.noise import estimate_delay_variance, estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import (
     IdlePower,
     Rail,
@@ -58,7 +58,7 @@ from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
-from tcpipe.tables.facts import PhysicsFacts, Smoothing
+from tcpipe.tables.facts import PhysicsFacts, PowerSensorFacts, Smoothing
 from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,
     MASKED_TRACK,
@@ -101,7 +101,7 @@ def label_segments(
         sensor = make_sensor_error(cut, rails, power, rule=rule)
         power = replace(power, lost_signs=power.lost_signs + int(np.count_nonzero(sensor.sign_joule)))
         cost, net, causes = compute_segment_costs(
-            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor, smoothing=power.smoothing
+            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor, power=power
         )
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
@@ -125,22 +125,28 @@ def label_segments(
                 **{name: getattr(cost, name) for name in Labels.__slots__},
                 **net,
                 voltage_volt=mean_between(to_integers(rows, "stamp_ns"), to_floats(rows, "voltage_volt"), *spans),
-                physics_power_watt=np.full(cut.num_rows, np.nan),
                 power_samples=count,
                 confirming_sensor_count=count_confirming_sensors(cut, streams, masked.info.report.facts),
                 quality=combine_flags(flags, cut.num_rows),
                 geometry=make_lines(*(read_lonlat_deg(cut, end) for end in ("start", "end"))),
             )
         )
-    table, physics = add_physics(pa.concat_tables(parts).combine_chunks(), standing.watt)
+    table = pa.concat_tables(parts).combine_chunks()
+    needed_watt, physics = fit_run_physics(table, standing.watt)
+    start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
+    unpowered = list(find_unpowered_motion(table, needed_watt, physics, masked.info, start_ns))
+    quality = to_numbers(table["quality"]).copy()
+    for rows, _ in unpowered:
+        quality[rows] |= np.uint32(Quality.UNPOWERED)
+    column = table.schema.get_field_index("quality")
+    table = table.set_column(column, table.schema.field(column), pa.array(quality))
     distance_by_reason_m, velocity = segments.distance_by_reason_m, config.velocity
     facts = make_label_facts(
         table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
     facts = replace(facts, power_sensor=None if facts.energy_joule is None else power)
-    start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
     findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
-    findings += find_unpowered_motion(table, physics, masked.info, start_ns)
+    findings += [finding for _, finding in unpowered]
     findings += find_witnesses(table, replace(masked.info.report.facts, label=facts), robot)
     kind, rails = masked.info.report.facts.power, next(iter(rails_by_epoch.values()), [])
     findings += find_negative_idle(standing, facts.median_power_watt, kind, rails)
@@ -161,7 +167,7 @@ def compute_segment_costs(
     rule: Rule,
     standing: IdlePower,
     sensor: SensorError,
-    smoothing: Smoothing | None = None,
+    power: PowerSensorFacts | None = None,
 ) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
     """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
@@ -169,10 +175,14 @@ def compute_segment_costs(
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, find_stationary_ns(rows, info.rate_hz)
+    smoothing = None if power is None else power.smoothing
     noise = estimate_energy_noise(rails, *spans, smoothing=smoothing)
     better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ, smoothing=smoothing)
     ground_mps = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
-    end_watt, noise_joule = compute_power_watt(rails, end_ns), noise.std_joule()
+    end_watt, delay_j2 = compute_power_watt(rails, end_ns), np.zeros(cut.num_rows)
+    if power is not None and power.delay_s is not None and power.delay_std_s is not None:
+        delay_j2 = estimate_delay_variance(rails, start_ns, end_ns, power.delay_s, power.delay_std_s, rule=rule)
+    noise_joule = np.sqrt(noise.std_joule() ** 2 + delay_j2)
     scale_std = find_common_scale_std(info.report.facts.fuse, start_ns, to_integers(cut, "clock_epoch"))
     cost = compute_labels(
         chord_m=to_floats(cut, "chord_m"),
@@ -195,8 +205,8 @@ def compute_segment_costs(
     )
     position = end_watt**2 * (cost.duration_std_s**2 - cost.duration_common_std_s**2)
     causes = {"position": position, "rate": noise.rate, "current": noise.current, "voltage": noise.voltage}
-    causes["common"] = cost.energy_common_std_joule**2
-    return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
+    causes |= {"common": cost.energy_common_std_joule**2, "delay": delay_j2}
+    return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise.std_joule()) ** 2}
 
 
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> NDArray[np.float64]:
@@ -267,23 +277,18 @@ def make_fit_samples(table: pa.Table) -> FitSamples:
     )
 
 
-def add_physics(table: pa.Table, idle_watt: float) -> tuple[pa.Table, PhysicsFacts]:
-    """Return the labelled segments of a run with the power that the physical model predicts, and the fit.
+def fit_run_physics(table: pa.Table, idle_watt: float) -> tuple[NDArray[np.float64], PhysicsFacts]:
+    """Return the power [W] that speed, slope and turning of each segment need, NaN without a fit, and the fit of the run.
 
-    The model has idle power ``idle_watt`` (NaN where unknown), drivetrain, rolling, grade and turning.
+    The classes of the ground are unknown here: of mud in a meadow the residual is large, and shows no error.
     """
     metres = make_fit_samples(table)
     watt = idle_watt if np.isfinite(idle_watt) else None
     found = fit_physics(metres, idle_watt=watt)
     if found is None or not found.is_plausible():
-        return table, PhysicsFacts(fitted=False, idle_watt=watt)
-    predicted = np.where(np.isfinite(metres.power_watt), found.power_watt(metres), np.nan)
-    odd = found.is_outlier(metres.power_watt - predicted)
-    quality = to_numbers(table["quality"]) | np.where(odd, np.uint32(Quality.PHYSICS_OUTLIER), np.uint32(0))
-    columns = {"physics_power_watt": predicted, "quality": quality.astype(np.uint32)}
-    table = LABELLED_SEGMENTS.table(**{name: columns.get(name, table[name]) for name in table.column_names})
+        return np.full(table.num_rows, np.nan), PhysicsFacts(fitted=False, idle_watt=watt)
     resistance, rolling, drive = found.rolling_resistance(), found.of("rolling"), found.of("grade")
-    return table, PhysicsFacts(
+    return found.power_watt(metres), PhysicsFacts(
         fitted=True,
         idle_watt=watt,
         weight_over_efficiency_newton=None if drive is None else drive[0],
@@ -292,6 +297,5 @@ def add_physics(table: pa.Table, idle_watt: float) -> tuple[pa.Table, PhysicsFac
         recovered_downhill=found.recovered,
         residual_watt=found.residual_watt,
         segments=found.segments,
-        outliers=int(odd.sum()),
         fit=fit_and_validate_physics(metres, idle_watt=watt),
     )

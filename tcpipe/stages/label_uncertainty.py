@@ -23,14 +23,14 @@ from tcpipe.power.audit import (
     summarize_rest,
 )
 from tcpipe.power.rails import IdlePower, Rail, Rule, integrate_energy, sum_power
-from tcpipe.power.sampling import find_smoothing
+from tcpipe.power.sampling import PowerFit, find_delay, find_smoothing, make_power_fit
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
 from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, Smoothing, StageFacts
+from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
 
@@ -54,14 +54,18 @@ def audit_power_sensor(
     ``rows`` are those of the masked track.
     """
     power = info.report.facts.power
-    clocks = info.report.facts.clock_offsets
-    late = clocks is not None and "power" in clocks.offsets and clocks.offsets["power"].noted  # flags every label
+    fits = _fit_power(rows, rails_by_epoch)
     corrected_s = info.report.facts.time_offset_s.get("power", 0.0)
-    smoothing = None if late else _find_longest_smoothing(rows, rails_by_epoch, corrected_s)
     sags = [measure_sag(rails) for rails in rails_by_epoch.values()]
     resistances_ohm = [ohm for sag in sags if (ohm := estimate_resistance_ohm(sag)) is not None]
     battery_ohm = float(np.median(resistances_ohm)) if resistances_ohm else None
-    facts = PowerSensorFacts(*_find_prior(power), battery_ohm=battery_ohm, smoothing=smoothing)
+    found = [smoothing for fit in fits if (smoothing := find_smoothing(fit, corrected_s=corrected_s))]
+    smoothing = max(found, key=lambda of_epoch: of_epoch.width_s, default=None)
+    delays = [] if smoothing else [delay for fit in fits if (delay := find_delay(fit))]
+    delay_s, delay_std_s = min(delays, key=lambda delay: delay[1], default=(None, None))
+    facts = PowerSensorFacts(
+        *_find_prior(power), battery_ohm=battery_ohm, smoothing=smoothing, delay_s=delay_s, delay_std_s=delay_std_s
+    )
     if config.power_gain_std_fraction is not None:
         facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
     else:
@@ -103,11 +107,9 @@ def _add_gain_change(facts: PowerSensorFacts, sags: Sequence[Sag | None]) -> Pow
     return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
 
 
-def _find_longest_smoothing(
-    rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], corrected_s: float
-) -> Smoothing | None:
-    """Return how power is smoothed in the clock epoch in which it is most; None where none shows it."""
-    found = []
+def _fit_power(rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]]) -> list[PowerFit]:
+    """Return the power of each clock epoch beside the motion of the track, where both are known for long enough."""
+    fits = []
     for epoch, rails in rails_by_epoch.items():
         mine = select_rows(rows, "clock_epoch", epoch)
         motion = np.column_stack(
@@ -117,8 +119,8 @@ def _find_longest_smoothing(
         known = np.isfinite(motion).all(axis=1)
         if (power := sum_power(rails)) is not None:
             stamp_ns, averaged = to_integers(mine, "stamp_ns")[known], any(rail.averaged for rail in rails)
-            found.append(find_smoothing(power, stamp_ns, motion[known], averaged=averaged, corrected_s=corrected_s))
-    return max(filter(None, found), key=lambda smoothing: smoothing.width_s, default=None)
+            fits.append(make_power_fit(power, stamp_ns, motion[known], averaged=averaged))
+    return [fit for fit in fits if fit is not None]
 
 
 _POWER = Subject("role", "power")
@@ -158,6 +160,22 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
             remedies=suggest("correct", {"read.time_offset_s": {"power": given_s - smoothing.late_s}}) if smoothing.late_s else (),
             width_s=smoothing.width_s, late_s=smoothing.late_s,
         )  # fmt: skip
+    error_fraction = label.energy_budget.delay if label.energy_budget else None
+    if (
+        facts.delay_s is not None
+        and facts.delay_std_s is not None
+        and error_fraction is not None
+        and abs(facts.delay_s) > read_threshold("power-delayed", "min_std_ratio") * facts.delay_std_s
+        and error_fraction > read_threshold("power-delayed", "min_error_fraction")
+    ):
+        yield make_finding(
+            "power-delayed",
+            _POWER,
+            remedies=suggest("correct", {"read.time_offset_s": {"power": round(given_s - facts.delay_s, 2)}}),
+            delay_s=facts.delay_s,
+            delay_2std_s=2.0 * facts.delay_std_s,
+            error_fraction=error_fraction,
+        )
     if facts.lost_signs:
         yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
 
@@ -193,9 +211,14 @@ _IDLE_FRACTION = 0.1
 _MISSING_RESIDUALS = 3.0
 
 
-def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInfo, start_ns: int) -> Iterator[Finding]:
-    """Yield where the robot moves over several segments with the power of rest, though speed and slope need clearly more."""
-    watt, needed_watt = to_floats(table, "power_watt"), to_floats(table, "physics_power_watt")
+def find_unpowered_motion(
+    table: pa.Table, needed_watt: Floats, physics: PhysicsFacts, info: TrackInfo, start_ns: int
+) -> Iterator[tuple[slice, Finding]]:
+    """Yield the rows and the finding of each span in which the robot moves with its idle power.
+
+    The power [W] that speed and slope of these segments need, of ``needed_watt``, shape (M,), exceeds the idle power clearly.
+    """
+    watt = to_floats(table, "power_watt")
     idle_watt, residual_watt = physics.idle_watt, physics.residual_watt
     if idle_watt is None or residual_watt is None or not table.num_rows:
         return
@@ -209,7 +232,7 @@ def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInf
             (table[name][row].as_py() - start_ns) * 1e-9 for name, row in (("start_ns", first), ("end_ns", last))
         )
         window: Keys = {"run": info.run_id, "start": float(np.floor(begin_s)), "end": float(np.ceil(end_s))}
-        yield make_finding(
+        finding = make_finding(
             "motion-without-power",
             _POWER,
             remedies=suggest("drop", {"mask.windows": [window]}),
@@ -217,6 +240,7 @@ def find_unpowered_motion(table: pa.Table, physics: PhysicsFacts, info: TrackInf
             segments_count=last + 1 - first,
             missing_watt=missing_watt,
         )
+        yield slice(first, last + 1), finding
 
 
 def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts, *, rule: Rule) -> SensorError:

@@ -56,13 +56,14 @@ class Quality(IntFlag):
     VOLTAGE_OUT_OF_RANGE = 1 << 7
     """The voltage leaves the range of the robot profile."""
     CLOCK_DOUBTFUL = 1 << 8
-    """A clock of the run stepped, two clocks differ, that of power has an offset, or log time replaces the stamps."""
-    PHYSICS_OUTLIER = 1 << 9
-    """The power is more than four robust standard deviations from the physics model fitted on the run."""
+    """A clock of the run stepped, two clocks differ, that of power drifts, or log time replaces the stamps."""
+    # 1 << 9 stays unassigned: it was `physics_outlier` until 1.0.0.
     BELOW_FULL_SPEED = 1 << 10
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the terrain does not limit the speed."""
     SENSORS_DISAGREE = 1 << 11
     """The track moves unlike every sensor, or contradicted the fixes for seconds."""
+    UNPOWERED = 1 << 12
+    """The robot moves with its idle power over several segments, though their speed and slope need clearly more."""
 
 
 class Loss(IntFlag):

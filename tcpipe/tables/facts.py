@@ -317,6 +317,8 @@ class EnergyBudget:
     """The total with power at 20 Hz."""
     common: float | None = field(default=None, metadata=LEFT_OUT)
     """The error that all segments of a run share, which is not part of the total; None in documents of earlier versions."""
+    delay: float | None = field(default=None, metadata=LEFT_OUT)
+    """The error by the delay of power against motion, which is not part of the total."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,7 +374,6 @@ class PhysicsFacts:
     recovered_downhill: float | None = field(default=None, metadata=LEFT_OUT)
     residual_watt: float | None = field(default=None, metadata=LEFT_OUT)
     segments: int | None = field(default=None, metadata=LEFT_OUT)
-    outliers: int | None = field(default=None, metadata=LEFT_OUT)
     fit: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
 
 
@@ -405,7 +406,7 @@ class PowerSensorFacts:
 
     ``rest_amp``: lowest and highest current of a rail in halts; ``battery_ohm``: resistance of the battery by its sag [ohm]; the gain
     changed by ``gain_ratio`` at ``gain_changed_ns``; ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None
-    if power is not smoothed.
+    if power is not smoothed; ``delay_s``: of power behind the motion, with its σ; None if motion explains too little of power.
     """
 
     gain_std_fraction: float
@@ -416,6 +417,8 @@ class PowerSensorFacts:
     gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
     lost_signs: int = 0
     smoothing: Smoothing | None = field(default=None, metadata=LEFT_OUT)
+    delay_s: float | None = field(default=None, metadata=LEFT_OUT)
+    delay_std_s: float | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

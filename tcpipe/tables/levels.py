@@ -352,11 +352,6 @@ _LABEL_COLUMNS = (
     _make_nullable("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
     *_NET_COLUMNS,
     *_COMMON_COLUMNS,
-    _make_nullable(
-        "physics_power_watt",
-        "W",
-        "power predicted by the physics model fitted on the run; null without power or fit",
-    ),
     Column("power_samples", pa.int32(), "1", "power samples inside the segment"),
     Column(
         "confirming_sensor_count",

@@ -18,6 +18,7 @@ from tcpipe.simulation.scenarios import RasterSpec
 from tcpipe.stages.fuse_sections import make_power_columns
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.segment import segment_track
+from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import MASKED_TRACK, STREAMS
 
@@ -111,12 +112,17 @@ def test_the_line_that_a_finding_suggests_removes_it_and_keeps_the_uncertainty(d
 def test_motion_with_the_power_of_rest_is_named_with_its_span_and_a_line_that_drops_it(drive):
     """Pushed for a seventh of the drive; a robot that rolls downhill without power is driven."""
     pushed = lambda amp, share: np.where((share > 0.40) & (share < 0.55), amp[:40].mean(), amp)  # noqa: E731
-    found = find_codes(label(drive, pushed))
+    labelled = label(drive, pushed)
+    found = find_codes(labelled)
     stamp_ns = to_integers(drive[0].tables["power"], "stamp_ns")
     whole_s = (stamp_ns[-1] - stamp_ns[0]) * 1e-9
     assert set(found) == {"motion-without-power"}
     begin_s, end_s = found["motion-without-power"].span_s
     assert 0.38 * whole_s < begin_s < 0.50 * whole_s < end_s < 0.58 * whole_s
+    unpowered = (to_integers(labelled.table, "quality") & int(Quality.UNPOWERED)) != 0
+    inside_s = (to_integers(labelled.table, "start_ns")[unpowered] - stamp_ns[0]) * 1e-9
+    assert len(inside_s) == found["motion-without-power"].numbers["segments_count"]
+    assert begin_s - 2.0 < inside_s.min() < inside_s.max() < end_s
     (remedy,) = found["motion-without-power"].remedies
     assert remedy.recipe["mask.windows"] == [{"run": "run", "start": np.floor(begin_s), "end": np.ceil(end_s)}]
     assert not find_codes(label(drive, lambda amp, _: np.maximum(amp, amp[:40].mean())))

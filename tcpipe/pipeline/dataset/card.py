@@ -101,7 +101,7 @@ def make_dataset_card(
         runs=runs,
         run_tags=options.tags,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
-        physics=fit_physics_by_robot(samples),
+        physics=fit_physics_by_robot(samples.filter(pc.equal(samples.column("split"), "train"))),
         covariates=content.covariates,
         exclusions=content.exclusions,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
@@ -177,7 +177,7 @@ _MOST_FITTED = 200_000
 
 
 def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
-    """Return the fit of each robot's samples of all splits, for robots that can be fitted."""
+    """Return the fit of each robot's samples, in the order of driving, for robots that can be fitted."""
     found, start_ns = {}, to_integers(samples, "start_ns")
     for robot in sorted(pc.unique(samples.column("robot")).to_pylist()):
         rows = np.flatnonzero(pc.equal(samples.column("robot"), robot).to_numpy())
