@@ -136,7 +136,6 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
         yield make_finding(
             "current-offset",
             _POWER,
-            remedies=suggest("state_offset", {"label": {"power_offset_std_amp": round(facts.offset_std_amp, 2)}}),
             lowest_amp=facts.rest_amp[0],
             highest_amp=facts.rest_amp[1],
             least_amp=power.rest_current_amp[0],
@@ -148,7 +147,6 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
         yield make_finding(
             "current-gain-changes",
             _POWER,
-            remedies=suggest("state_gain", {"label": {"power_gain_std_fraction": round(facts.gain_std_fraction, 3)}}),
             span_s=(at_s, at_s),
             gain_ratio=facts.gain_ratio,
             at_s=at_s,
