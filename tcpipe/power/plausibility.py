@@ -58,7 +58,9 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
         read_threshold(EXCLUDED, f"max_{name}") for name in ("of_top", "of_top_clear", "scatters")
     )
     far = relative > limit
-    isolated[rest] = far | ((relative > low_limit) & (deviation > scatter * np.quantile(deviation, 0.9)))
+    isolated[rest] = far | (
+        (relative > low_limit) & (deviation > scatter * max(np.quantile(deviation, 0.9), np.median(steps)))
+    )
     found[rows] = isolated[np.cumsum(new) - 1]
     block = np.flatnonzero(_compare_with_median(value[rest], 11, 0.99)[0] > limit)
     runs = np.split(rest[block], np.flatnonzero(np.diff(block) > 1) + 1)
