@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 EXCLUDED, REJECTED = "power-values-excluded", "power-rejected"
-_FEWEST_VALUES = 20
+_FEWEST_VALUES, _MARKS = 20, 2
 _SHORTEST_DRIVE_S = 1.0
 """No robot starts and stops within this."""
 _JUMP, _ASYMMETRY, _FEWEST_JUMPS = 0.6, 0.02, 4
@@ -24,13 +24,17 @@ _JUMP, _ASYMMETRY, _FEWEST_JUMPS = 0.6, 0.02, 4
 
 
 def find_missing_rows(voltage_volt: Floats, current_amp: Floats) -> Mask:
-    """Return the rows without a possible voltage, or with only one of both where most rows have both, shape (N,)."""
+    """Return the rows without a possible voltage, or with only one of both, shape (N,).
+
+    If most rows have only one of both, and currents without a voltage change, two sensors of different rates share a table.
+    """
     has_voltage, has_current = np.isfinite(voltage_volt), np.isfinite(current_amp)
     live = voltage_volt[has_voltage & (voltage_volt > 0.0)]
     usual = np.median(live) if live.size else np.nan
     low, high = (read_threshold(EXCLUDED, name) * usual for name in ("min_of_median", "max_of_median"))
     missing: Mask = has_voltage & ~((voltage_volt >= low) & (voltage_volt <= high))
-    is_paired = 2 * np.count_nonzero(has_voltage & has_current) > np.count_nonzero(has_voltage | has_current)
+    both, lone = np.count_nonzero(has_voltage & has_current), current_amp[has_current & ~has_voltage]
+    is_paired = 2 * both > np.count_nonzero(has_voltage | has_current) or (both and 0 < np.unique(lone).size <= _MARKS)
     return missing | (has_voltage != has_current) if is_paired else missing
 
 
@@ -42,7 +46,7 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     usual steps, and repeated no longer than other values.
     """
     rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), np.bool_)
-    new = _find_changes(values[rows])
+    new = np.diff(values[rows], prepend=np.nan) != 0.0
     value, at_s = values[rows][new], time_s[rows][new]
     marked = np.isclose(np.abs(value)[:, None], UNMEASURED_AMP[""], rtol=1e-6, atol=0.0).any(axis=1)
     rest = np.flatnonzero(~marked)
@@ -51,14 +55,15 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     after = np.clip(np.searchsorted(rest, np.arange(value.size)), 1, rest.size - 1)
     distance = np.minimum(*(np.abs(value - value[rest[at]]) for at in (after - 1, after)))
     steps, repeats = np.abs(np.diff(value[rest])), np.bincount(np.cumsum(new) - 1)
-    isolated = marked & (distance > np.quantile(steps[steps > 0.0], 0.99)) & (repeats <= 2 * np.median(repeats[rest]))
+    isolated = marked & (distance > _compute_usual(steps)) & (repeats <= 2 * np.median(repeats[rest]))
     by_most, deviation = _compare_with_median(value[rest], 5, 0.9)
     relative, _ = _compare_with_median(value[rest], 5, 0.99)
-    limit, low_limit, scatter = (
+    limit, low_limit, times = (
         read_threshold(EXCLUDED, f"max_{name}") for name in ("of_top", "of_top_clear", "scatters")
     )
+    scatter = max(np.quantile(deviation, 0.9), np.median(steps))
     far = relative > limit
-    isolated[rest] = far | ((relative > low_limit) & (deviation > scatter * np.quantile(deviation, 0.9)))
+    isolated[rest] = far | ((relative > low_limit) & (deviation > times * scatter))
     found[rows] = isolated[np.cumsum(new) - 1]
     block = np.flatnonzero(_compare_with_median(value[rest], 11, 0.99)[0] > limit)
     runs = np.split(rest[block], np.flatnonzero(np.diff(block) > 1) + 1)
@@ -67,8 +72,9 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     return found, bool(is_block or share > read_threshold(REJECTED, "max_isolated_fraction"))
 
 
-def _find_changes(values: Floats) -> Mask:
-    return np.concatenate((np.ones(min(values.size, 1), np.bool_), values[1:] != values[:-1]))
+def _compute_usual(steps: Floats) -> float:
+    """Return the 99 % quantile of the absolute steps between different values; 0 without any."""
+    return float(np.quantile(np.abs(np.append(0.0, steps[steps != 0.0])), 0.99))
 
 
 def _compare_with_median(values: Floats, width: int, quantile: float) -> tuple[Floats, Floats]:
@@ -97,7 +103,7 @@ def undo_overflow(current_amp: Floats) -> tuple[Floats, float, bool]:
         return current_amp, 0.0, False
     whole = current_amp.copy()
     whole[rows[1:]] -= span * np.cumsum(np.where(jumps, np.sign(step), 0.0))
-    usual = float(np.quantile(np.abs(step[~jumps & (step != 0.0)]), 0.99))
+    usual = _compute_usual(step[~jumps])
     if np.quantile(np.abs(np.diff(whole[rows]))[jumps], 0.9) > max(usual, 3.0 * quantum):
         return current_amp, 0.0, False
     return whole, span, usual < span / 4.0

@@ -457,16 +457,13 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
     for topic, rail in ((topic, rail) for topic, found in rails.items() for rail in found):
         volt, amp, names = rail.voltage_volt, rail.current_amp, {"rail": rail.name}
         excluded = np.abs(amp) > rail.largest_amp
-        # The first row of a counter has no current.
-        excluded |= find_missing_rows(
-            volt, np.full_like(amp, np.nan) if rail.counter else np.where(excluded, np.nan, amp)
-        )
+        stated = np.nan if rail.counter else np.where(excluded, np.nan, amp)  # a counter's first row has no current
+        excluded |= find_missing_rows(volt, np.broadcast_to(stated, amp.shape))
         isolated, is_rejected = find_isolated(undo_overflow(np.where(excluded, np.nan, amp))[0], log_times[topic] / 1e9)
         excluded |= isolated
         live = np.flatnonzero((np.isfinite(volt) | np.isfinite(amp)) & ~excluded)
-        count = max(
-            np.count_nonzero(excluded[live.min(initial=len(volt)) : live.max(initial=0)]), rail.unmeasured_count
-        )
+        inner = excluded[live.min(initial=len(volt)) : live.max(initial=0)]
+        count = max(np.count_nonzero(inner), rail.unmeasured_count)
         if is_rejected:
             findings.append(reject_power(topic, "isolated-values", names=names))
         elif count:
@@ -491,9 +488,10 @@ def _undo_overflows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Rail
     if not findings:
         return rails, []
     before, after = (_correlate_voltage(each, log_times) for each in (rails, whole))
-    if before >= max(after, read_threshold(_WRAPPED, "min_correlation")):
+    least = read_threshold(_WRAPPED, "min_correlation")
+    if before >= max(after, least):
         return rails, []
-    if not are_clear or after < max(before, read_threshold(_WRAPPED, "min_correlation")):
+    if not are_clear or after < least:
         return rails, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
     return whole, findings
 

@@ -186,3 +186,17 @@ def test_a_stated_nominal_voltage_is_reported_once():
 @pytest.mark.parametrize(("status", "charging"), [(1, True), (2, False), (0, False)])
 def test_a_battery_states_that_it_is_charged(status, charging):
     assert read(power_supply_status=np.full(COUNT, status)).charging is charging
+
+
+@pytest.mark.parametrize("amp", [0.0, -1.0])
+def test_most_rows_may_be_marked(amp):
+    rows = np.random.default_rng(8).random(COUNT) < 0.6
+    (rail,) = read(change(VOLT, rows, np.nan), change(AMP, rows, amp)).rails["/battery"]
+    np.testing.assert_array_equal(np.isnan(rail.current_amp), rows)
+
+
+def test_a_constant_current_with_marks_has_no_steps():
+    known = [PowerSource("my_msgs/msg/Battery", "v", "i")]
+    columns = {"log_time_ns": TIME_NS, "v": VOLT, "i": np.where(ROW % 3 == 0, 32.767, 5.0)}
+    (rail,) = readings.read_power({"/b": ("my_msgs/msg/Battery", columns)}, known).rails["/b"]
+    assert np.nanmax(rail.current_amp) == 5.0

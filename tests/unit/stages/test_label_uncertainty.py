@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from made_tracks import power_streams, stamps, straight_track
 
-from tcpipe.recipe import LabelConfig, MaskConfig, SegmentConfig
+from tcpipe.recipe import LabelConfig, MaskConfig, Recipe, SegmentConfig
+from tcpipe.recipe.checking import from_values
 from tcpipe.robots import Robot
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track
@@ -30,7 +31,7 @@ def rails(*, gain=1.0, offset_amp=0.0, count=2):
     return {f"rail {k}": (stamp_ns, 26.0 - 0.1 * amp, gain * amp / (k + 1) + offset_amp) for k in range(count)}
 
 
-def label(power, *, facts=None, config=None, tables=None):
+def label_run(power, *, facts=None, config=None, tables=None):
     power_watt = sum(volt * amp for _, volt, amp in power.values())
     track = straight_track(SPEED, power_watt=power_watt)
     masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
@@ -40,7 +41,11 @@ def label(power, *, facts=None, config=None, tables=None):
     streams = replace(streams, tables={**streams.tables, **(tables or {})})
     return label_segments(
         segment_track(masked, SegmentConfig()), masked, streams, config or LabelConfig(), robot=Robot()
-    ).table
+    )
+
+
+def label(power, **options):
+    return label_run(power, **options).table
 
 
 def test_the_common_columns_are_what_a_wrong_gain_and_offset_change():
@@ -117,3 +122,49 @@ def test_a_segment_counts_the_sensors_that_measured_in_it_and_agree():
     assert set(wanted) == {0, 1, 2}
     got = to_integers(table, "confirming_sensor_count")
     assert (got == wanted).all(), (start_s[got != wanted], end_s[got != wanted], got[got != wanted])
+
+
+def find_negative_idle(power, kind=KIND):
+    found = label_run(power, facts={"power": kind}).info.report.findings
+    return next((finding for finding in found if finding.code == "idle-power-negative"), None)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("rest_amp", [None, (0.0, 0.8)])
+@pytest.mark.parametrize("zero_amp", [0.0, -0.5])
+def test_a_negative_idle_power_is_an_error_whose_lines_correct_the_labels_within_their_uncertainty(
+    count, rest_amp, zero_amp
+):
+    kind = replace(KIND, rest_current_amp=rest_amp, zero_amp=zero_amp)
+    found = find_negative_idle(rails(offset_amp=-1.6, count=count), kind)
+    assert found.severity == "error"
+    assert found.numbers["idle_watt"] < -0.03 * found.numbers["driving_watt"]
+    (remedy,) = found.remedies
+    recipe = from_values(Recipe, dict(remedy.recipe), where="suggested")
+    further_amp = recipe.read.current_offset_amp - zero_amp
+    corrected = rails(offset_amp=-1.6 - further_amp, count=count)
+    assert find_negative_idle(corrected, kind) is None
+    true, after = label(rails(count=count)), label(corrected, config=recipe.label, facts={"power": kind})
+    error, std = (
+        to_floats(after, "energy_joule") - to_floats(true, "energy_joule"),
+        to_floats(after, "energy_std_joule"),
+    )
+    assert (np.abs(error) < 2.0 * std).all()
+    before = label(rails(offset_amp=-1.6, count=count), facts={"power": replace(kind, rest_current_amp=None)})
+    assert (std > to_floats(before, "energy_std_joule")).all()
+
+
+def test_no_zero_is_off_while_charging_or_where_one_halt_draws_power_or_within_the_scatter():
+    assert find_negative_idle(rails(offset_amp=-1.6), replace(KIND, charging=True)) is None
+    assert find_negative_idle(rails()) is None
+    assert find_negative_idle(rails(offset_amp=-0.42, count=1)) is None
+    charged = {
+        name: (stamp_ns, volt, np.where(T < 18.0, -4.0, amp)) for name, (stamp_ns, volt, amp) in rails(count=1).items()
+    }
+    assert find_negative_idle(charged) is None
+
+
+def test_an_offset_below_the_idle_current_is_in_the_uncertainty():
+    true, off = label(rails(count=1)), label(rails(offset_amp=-0.35, count=1))
+    error = to_floats(off, "energy_joule") - to_floats(true, "energy_joule")
+    assert (np.abs(error) < 2.0 * to_floats(off, "energy_std_joule")).all()

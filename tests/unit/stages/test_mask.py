@@ -123,6 +123,13 @@ def test_a_power_gap_is_a_gap_and_a_run_without_power_is_none():
     assert finding.numbers["lost_fraction"] == pytest.approx(0.83, abs=0.01)
 
 
+def test_a_sensor_that_starts_and_stops_within_seconds_has_no_gaps():
+    power = np.where((T > 4.7) & (T[-1] - 3.0 > T), 150.0, np.nan)
+    masked = gate(straight_track(np.full(len(T), 0.9), power_watt=power))
+    assert not select_findings(masked.info.report.findings, "power-gaps")
+    assert rows_of(masked, DropReason.GAP).tolist() == np.isnan(power).tolist()
+
+
 def test_a_jump_is_a_gap_and_not_driven():
     """Fixes that move to another place by 1000 km: rows beside it are a gap, and the ledger holds what was driven."""
     track = straight_track(np.full(len(T), 0.9))

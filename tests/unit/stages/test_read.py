@@ -117,7 +117,7 @@ def odometry(rows: int = 500, speed_mps: float = 0.5, child: str = "base_link") 
 def battery(amp: float, rows: int = 200) -> tuple[str, pa.Table]:
     current = pa.array(amp + 0.1 * np.sin(np.arange(rows)), pa.float32())
     columns = {
-        "voltage": pa.array(full(rows, 48.0), pa.float32()),
+        "voltage": pa.array(48.0 + 0.25 * (np.arange(rows) % 4), pa.float32()),
         "current": current,
         "percentage": full(rows, np.nan),
     }
