@@ -189,7 +189,6 @@ def pool_budgets(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
     squares = {
         name: sum(each["segments"] * (each[name] * each["mean_energy_joule"]) ** 2 for each in known) / count
         for name in ("total", *CAUSES, "at_20_hz", "common")
-        if all(each[name] is not None for each in known)
     }
     return EnergyBudget(
         count, mean_joule, **{name: float(np.sqrt(square)) / mean_joule for name, square in squares.items()}

@@ -272,7 +272,9 @@ def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> Datase
             return parse_typed(found, DatasetCard, where)
     if found.get("kind") != KIND:
         raise DatasetError(f"{where}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
-    raise DatasetError(describe_other_data_model(str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")))
+    raise DatasetError(
+        describe_other_data_model(str(where).removesuffix(f"/{CARD}"), str(found.get("data_model_version")))
+    )
 
 
 def read_intact_card(directory: Path) -> DatasetCard:

@@ -25,7 +25,7 @@ DATA_MODEL_VERSION = "4.0"
 TABLES_VERSION = "4.0"  # in which a table last changed
 
 
-def describe_other_data_model(where: object, version: object) -> str:
+def describe_other_data_model(where: str, version: str) -> str:
     """Return the error on a store, dataset or map that another data model wrote."""
     maker = "tcpipe 1.x" if version == "3.0" else "another version of tcpipe"
     return f"{where}: made by {maker} (data model {version}), expected {DATA_MODEL_VERSION}: ingest the logs again"
