@@ -3,7 +3,6 @@
 import json
 import shutil
 import sys
-import tarfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -95,7 +94,7 @@ def _directory(name: str, **files: str) -> Run:
 _RUN = command("ingest", LOG, "--quiet")
 _BUILD = ("build-dataset", *STORE, "--split", f"{INPUTS}/region.geojson", "--quiet")
 _MAP = ("add-map", "site", *LAYERS, "--quiet")
-_LOG, _WORLD, _MODEL, _OLD = (frozenset({name}) for name in ("log", "world", "model", "old"))
+_LOG, _WORLD, _MODEL = (frozenset({name}) for name in ("log", "world", "model"))
 _CLUSTER = frozenset({"cluster"})
 
 URL = f"s3://{BUCKET}/a case"
@@ -109,7 +108,6 @@ _FORCED_THERE = command("build-dataset", f"{URL}/dataset", *_BUILD[1:], "--seed"
 _OTHER_RUN = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q")
 _AT_ONCE = ("--min-age", "0")
 """What a killed prune left goes with the next one where it is a day old; here it is not."""
-_OLD_STORE = f"{INPUTS}/old/store"
 _ARRAY_TASK, _OTHER_TASK = (command("ingest", f"{INPUTS}/logs", *_THERE, "--shard", f"{n}/2") for n in (1, 2))
 
 
@@ -163,8 +161,6 @@ CASES = (
     Case("ingest beside build-dataset", _RUN, wants=_LOG | _WORLD, extra_features=command(*_BUILD)),
     Case("ingest beside prune", _OTHER_RUN, (_RUN,), _LOG, extra_features=command("prune")),
     Case("prune", command("prune", *_AT_ONCE), (_OTHER_RUN, _RUN), _LOG),
-    Case("migrate", command("migrate", "tcpipe-store"), (_copy(_OLD_STORE, "tcpipe-store"),), _OLD),
-    Case("migrate elsewhere", command("migrate", _OLD_STORE, "tcpipe-store"), wants=_OLD),
     Case("ingest into a bucket", _RUN_THERE, wants=_LOG, url=URL),
     Case("ingest --force there", command("ingest", LOG, "--force", *_THERE), (_RUN_THERE,), _LOG, URL),
     Case("ingest there beside prune", _OTHER_THERE, (_RUN_THERE,), _LOG, URL, command(*_PRUNE_THERE)),
@@ -172,15 +168,6 @@ CASES = (
     Case("build-dataset there", _BUILD_THERE, wants=_WORLD, url=URL),
     Case("build-dataset --force there", _FORCED_THERE, (_BUILD_THERE,), _WORLD, URL),
     Case("prune there", command(*_PRUNE_THERE, *_AT_ONCE), (_OTHER_THERE, _RUN_THERE), _LOG, URL),
-    Case("migrate into a bucket", command("migrate", _OLD_STORE, f"{URL}/store"), wants=_OLD, url=URL),
-    Case("migrate in a bucket", command("migrate", f"{URL}/store"), (_copy(_OLD_STORE, f"{URL}/store"),), _OLD, URL),
-    Case(
-        "migrate from bucket to bucket",
-        command("migrate", f"{URL}/old", f"{URL}/store"),
-        (_copy(_OLD_STORE, f"{URL}/old"),),
-        _OLD,
-        URL,
-    ),
     Case("ingest --shard 1/2 there", _ARRAY_TASK, wants=_LOG, url=URL, extra_features=_OTHER_TASK, partner=_OTHER_TASK),
     Case("ingest on a cluster", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL),
     Case("build-dataset on a cluster", _BUILD_THERE, wants=_WORLD | _CLUSTER, url=URL),
@@ -232,10 +219,6 @@ def make_inputs(place: Path, wanted: set[str]) -> None:
         _make_world(place)
     if "model" in wanted:
         _make_model(place)
-    if "old" in wanted:
-        (place / "old").mkdir()
-        with tarfile.open(Path(__file__).parents[1] / "tests" / "data" / "store-2.1.tar.xz") as archive:
-            archive.extractall(place / "old", filter="data")
 
 
 def _make_logs(place: Path) -> None:

@@ -316,9 +316,8 @@ def is_passing(path: str) -> bool:
 
 
 def without_unfinished(found: Tree) -> Tree:
-    """Leave out what waits for the next call; all of a store whose mark, which a migration writes last, is not there."""
-    begun = f"{STORE}/store.json" not in found
-    return {path: what for path, what in found.items() if not _is_unfinished(path) and not (begun and _in_store(path))}
+    """Leave out what waits for the next call."""
+    return {path: what for path, what in found.items() if not _is_unfinished(path)}
 
 
 def _in_store(path: str) -> bool:

@@ -18,6 +18,7 @@ from typing import cast
 import click
 from stable import FILE, describe_stable, find_lost_names
 
+from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.cli.site_commands import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
@@ -142,7 +143,6 @@ def _rows(documents: Mapping[str, type]) -> str:
 _COLUMNS = f"""# Columns
 
 Data model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. A type with `?` allows null.
-A column marked *since 2.1* is null in files of 2.0.
 """
 
 
@@ -178,7 +178,7 @@ def _column_rows(columns: Sequence[Column]) -> str:
     head = "\n| column | type | unit, frame | meaning |\n|---|---|---|---|\n"
     rows = [
         f"| {', '.join(f'`{c.name}`' for c in group)} | {group[0].dtype}{'?' if group[0].nullable else ''} "
-        f"| {', '.join(filter(None, (*_units(group), group[0].frame)))} | {_join_texts(group)}{_since(group[0])} |\n"
+        f"| {', '.join(filter(None, (*_units(group), group[0].frame)))} | {_join_texts(group)} |\n"
         for group in _group_columns(columns)
     ]
     return "".join((head, *rows)) if rows else ""
@@ -226,10 +226,6 @@ def _end(word: str, forms: Sequence[str]) -> str:
 
 
 _SHARED_COLUMNS = 8
-
-
-def _since(column: Column) -> str:
-    return f"; *since {column.since}*" if column.since and column.since >= "2.1" else ""
 
 
 def _bits(column: str, flags: type[IntFlag]) -> str:
@@ -348,7 +344,8 @@ def _robots() -> str:
 
 if __name__ == "__main__":
     REFERENCE.mkdir(exist_ok=True)
-    if FILE.exists() and (lost := find_lost_names(json.loads(FILE.read_text(encoding="utf-8")), describe_stable())):
+    is_kept = FILE.exists() and ".dev" not in __version__
+    if is_kept and (lost := find_lost_names(json.loads(FILE.read_text(encoding="utf-8")), describe_stable())):
         raise SystemExit(lost)
     for name, text in pages().items():
         (REFERENCE / name).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""docs/reference/stable.json: every name that a version 1.x keeps. `docs/generate.py` adds to it and never takes away."""
+"""docs/reference/stable.json: every name that a version 2.x keeps. `docs/generate.py` adds to it and never takes away."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import click
 
 import tcpipe
 from tcpipe.cli import cli
-from tcpipe.cli.options import RenamedOption
 from tcpipe.cli.site_commands import json_output_types
 from tcpipe.dataset import Dataset, Split
 from tcpipe.formats.contracts import DOCUMENTS, make_contracts
@@ -27,7 +26,6 @@ from tcpipe.planning.path_cost import PATH_SEGMENTS
 from tcpipe.planning.path_files import PathResult, PlanResult
 from tcpipe.tables.columns import Column
 from tcpipe.tables.levels import LABELLED_SEGMENTS, MASKED_TRACK, REJECTIONS, SAMPLES, STREAMS
-from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_COLUMNS, EARLIER_KEYS
 
 FILE = Path(__file__).parent / "reference" / "stable.json"
 _RESULTS = (
@@ -35,8 +33,8 @@ _RESULTS = (
 )  # fmt: skip
 _TABLES = (*STREAMS.values(), MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PATH_SEGMENTS)
 _LOST = (
-    "version 1.x keeps every name in docs/reference/stable.json, and these are gone:\n{names}\nKeep each of them, as a hidden alias if it "
-    "is renamed. A removal belongs into the next major version: delete the file, run 'make docs' and state it in the changelog."
+    "version 2.x keeps every name in docs/reference/stable.json, and these are gone:\n{names}\nKeep each of them. A removal belongs "
+    "into the next major version: delete the file, run 'make docs' and state it in the changelog."
 )
 
 
@@ -54,10 +52,10 @@ def describe_stable() -> dict[str, list[str]]:
     return {
         "python": [*_iterate_python()],
         "commands": [line for name, command in cli.commands.items() for line in _iterate_options(name, command)],
-        "recipe": recipe + [f"{key} = {name}" for key, name in EARLIER_KEYS.items()],
+        "recipe": recipe,
         "columns": [
             line for table in _TABLES for column in table.columns for line in _iterate_column(table.name, column)
-        ] + [f"{earlier} = {name}" for earlier, name in EARLIER_COLUMNS.items()],
+        ],
         "documents": [f"{name}: {key}" for name, found in sorted(keys.items()) for key in found],
     }  # fmt: skip
 
@@ -86,10 +84,7 @@ def _iterate_options(name: str, command: click.Command) -> Iterator[str]:
     yield name
     for parameter in command.params:
         flags = [*parameter.opts, *parameter.secondary_opts]
-        if isinstance(parameter, RenamedOption):
-            flags.append(parameter.earlier)
         choices = [*parameter.type.choices] if isinstance(parameter.type, click.Choice) else []
-        choices += [earlier for earlier, choice in EARLIER_CHOICES.items() if choice in choices]
         if not isinstance(parameter, click.Option):
             flags = [str(parameter.make_metavar(click.Context(command)))]
         for flag in flags:

@@ -71,13 +71,13 @@ from tcpipe.formats.stored_runs import (
 )
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
-    EARLIER_VERSIONS,
-    READ_TABLES,
+    TABLES_VERSION,
     LabelledSegments,
     MaskedTrack,
     Streams,
     Track,
     add_metadata,
+    describe_other_data_model,
     read_metadata,
 )
 
@@ -343,7 +343,7 @@ class Store:
             for role, path in self.stream_files(run_id, known).items():
                 table = read_table(path)
                 infos[role] = info = parse_typed(read_metadata(table), StreamInfo, path)
-                if info.key != key or info.data_model_version not in READ_TABLES:
+                if info.key != key or info.data_model_version != TABLES_VERSION:
                     return None
                 tables[role] = table.replace_schema_metadata(None)
             if not tables:
@@ -394,25 +394,25 @@ def is_named_after(run_id: str, sha256: str) -> bool:
 
 
 def is_store(path: Path | str) -> bool:
-    """Return whether a place is a store; `UsageError` if it is one of an earlier data model, or incomplete."""
+    """Return whether a place is a store; `UsageError` if it is one of another data model, or incomplete."""
     if is_url(path) and not is_bucket(path):
         return False
     place = open_place(path)
     if place.read(MARK) is None:  # not its size: only what is asked for with a body is refused with a reason
         if is_unmarked_store(place):
-            raise UsageError(
-                f"{place.where()}: an incomplete copy of a store (no {MARK}), or one of data model 1, which is not read; copy it again"
-            )
+            raise UsageError(f"{place.where()}: an incomplete copy of a store (no {MARK}); copy it again")
         return False
     with suppress(StoreError):
-        _refuse_earlier(place, read_layout(place))
+        _read_layout(place)
     return True
 
 
-def _refuse_earlier(place: Place, version: str | None) -> None:
-    if version in EARLIER_VERSIONS:
-        what = f"is a store of data model {version}; 'tcpipe migrate {place.where()}' brings it to data model {DATA_MODEL_VERSION}"
-        raise UsageError(f"{place.where()}: {what}")
+def _read_layout(place: Place) -> str | None:
+    """Return the data model of a store, None where there is none; `UsageError` where it is another one."""
+    version = read_layout(place)
+    if version not in (None, DATA_MODEL_VERSION):
+        raise UsageError(describe_other_data_model(place.where(), version))
+    return version
 
 
 def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
@@ -446,8 +446,7 @@ def find_store_above(path: Path | str) -> tuple[Store, str, str | None] | None:
 def open_store(root: str | Path, *, create: bool = False) -> Store:
     """Return the store at a path or URL; unless with ``create`` it has to be there.
 
-    `UsageError`: it is missing, a file, or of an earlier data model; `StoreError`: it cannot be reached or made, or is of one that this
-    version does not know.
+    `UsageError`: it is missing, a file, or of another data model; `StoreError`: it cannot be reached or made.
     """
     if is_url(root) and not is_bucket(root):
         raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
@@ -457,13 +456,9 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         store.place.check()
     elif store.place.path.is_file():
         raise UsageError(f"{root}: is a file, expected a directory for the store")
-    version = read_layout(store.place)
-    _refuse_earlier(store.place, version)
-    found = version is not None or is_store(root)
+    found = _read_layout(store.place) is not None or is_store(root)
     if not found and not create and not (store.place.path and store.place.path.exists()):
         raise UsageError(f"{root}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
-    if version not in (None, DATA_MODEL_VERSION):
-        raise StoreError(f"{root}: is of data model {version}, this version knows {DATA_MODEL_VERSION}")
     if create:
         if not found:
             mark_store(store.place)

@@ -14,10 +14,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import copy
 from functools import cache
 from importlib import import_module
-from itertools import chain
 from typing import Any, NoReturn, TypeVar
 
 import click
@@ -56,32 +54,24 @@ _COMMANDS = {
     "export": ("dataset_commands", "Export topics as Parquet"),
     "explain": ("dataset_commands", "Trace a sample to its log and compute it again"),
     "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
-    "migrate": ("dataset_commands", "Convert a store, map or dataset to this data model"),
     "diff": ("dataset_commands", "List the differences of two datasets, by cause"),
     "schemas": ("site_commands", "Write the JSON Schemas of tables and documents"),
     "simulate": ("site_commands", "Write a simulated site with its true values"),
 }
 """The module and the purpose of each command, in the order a user meets them; the command NAME-X is the function NAME_X there."""
 
-_OLD_NAMES = {"accept": "acknowledge"}
-"""Before data model 3.0."""
-
 
 class _Commands(Mapping[str, click.Command]):
     """Commands by name; each is imported when it is asked for, so that ``--help`` and every other command start fast."""
 
     def __getitem__(self, name: str) -> click.Command:
-        if name in _OLD_NAMES:
-            command = copy(self[_OLD_NAMES[name]])
-            command.hidden = True
-            return command
         return _load(name, *_COMMANDS[name])
 
     def __iter__(self) -> Iterator[str]:
-        return chain(_COMMANDS, _OLD_NAMES)
+        return iter(_COMMANDS)
 
     def __len__(self) -> int:
-        return len(_COMMANDS) + len(_OLD_NAMES)
+        return len(_COMMANDS)
 
 
 @cache

@@ -11,7 +11,6 @@ import click
 from tcpipe.cli.options import (
     LOG,
     OUTPUT_DIRECTORY,
-    PUBLISHED,
     SEALED,
     add_options,
     add_path_or_store,
@@ -186,24 +185,6 @@ def verify(path: str, *, as_json: bool) -> int:
     found = run(path)
     print_result(found, as_json=as_json)
     return 1 if found.problems else 0
-
-
-@click.command()
-@add_path_or_store(SEALED)
-@click.argument("to", type=PUBLISHED, required=False, metavar="[TO]")
-@json_option
-def migrate(path: str, to: str | None, *, as_json: bool) -> int:
-    """Convert the map or dataset at PATH, or the store, from an earlier data model to this one, or copy a store to another place.
-
-    With TO, a directory or URL, the store at PATH is not changed, and TO is a store of this data model with the same content.
-
-    Documents of this data model are not changed. After an interruption, run the same command again.
-    """
-    from tcpipe.pipeline.migrate import migrate as run
-
-    found = run(path, to)
-    print_result(found, as_json=as_json)
-    return found.exit_code
 
 
 @click.command()

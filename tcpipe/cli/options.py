@@ -19,7 +19,6 @@ from click.shell_completion import CompletionItem
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats import atomic
 from tcpipe.tables import options
-from tcpipe.tables.options import EARLIER_CHOICES
 
 if TYPE_CHECKING:
     from tcpipe.store import Store
@@ -71,29 +70,6 @@ class LonLat(click.ParamType[tuple[float, float]]):
         if not (isfinite(lon) and isfinite(lat)):
             self.fail(f"{value!r}: expected LON,LAT in degrees, as 15.45,47.07", param, ctx)
         return lon, lat
-
-
-class _Choice(click.Choice[str]):
-    """One of several values, each also by its earlier name."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the value by its name of today."""
-        name = EARLIER_CHOICES.get(value, value)
-        return super().convert(name if name in self.choices else value, param, ctx)
-
-
-class RenamedOption(click.Option):
-    """An option that is also read by its earlier name, which help and errors do not show."""
-
-    def __init__(self, *declarations: Any, earlier: str, **settings: Any) -> None:
-        super().__init__(*declarations, **settings)
-        self.earlier = earlier
-
-    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
-        """Let click read both names."""
-        self.opts.append(self.earlier)
-        super().add_to_parser(parser, ctx)
-        self.opts.remove(self.earlier)
 
 
 Option: TypeAlias = Callable[[Any], Any]
@@ -269,7 +245,7 @@ def make_click_option(name: str, default: Any, shown: options.Option) -> Option:
         case options.Range(least, most, is_open):
             settings["type"] = FloatRange(least, most, min_open=is_open)
         case tuple(choices):
-            settings["type"] = _Choice(choices)
+            settings["type"] = click.Choice(choices)
         case kind if kind:
             settings |= KINDS[kind]
     if shown.shown is not None or default not in (MISSING, None, ()):
@@ -280,7 +256,6 @@ def make_click_option(name: str, default: Any, shown: options.Option) -> Option:
     settings |= {"is_flag": True} if isinstance(default, bool) else {}
     flags = shown.flags or (f"--{name.replace('_', '-')}",)
     multiple = settings.pop("multiple", shown.repeatable)
-    settings |= {"cls": RenamedOption, "earlier": shown.earlier} if shown.earlier else {}
     return click.option(*flags, name, help=shown.about or None, envvar=shown.envvar, multiple=multiple, **settings)
 
 

@@ -140,7 +140,6 @@ _ANSWERS = {
     "inspect-run.answer": "pipeline.inspect.InspectedRun",
     "inspect-store.answer": "pipeline.inspect.InspectedStore",
     "inspect-tables.answer": "pipeline.inspect.InspectedTables",
-    "migrate.answer": "pipeline.migrate.Migrated",
     "overlay.answer": "pipeline.overlay.Overlay",
     "plan-path.answer": "planning.path_files.PlanResult",
     "predict-path.answer": "planning.path_files.PathResult",

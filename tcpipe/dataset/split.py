@@ -364,8 +364,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     column = read_samples(directory, [energy.power]).column(energy.power)
     if card.samples and column.null_count == len(column):
         raise DatasetError(
-            f"{directory}: no sample has {energy.power}: the robot was never stationary for long, or the data model is older than 1.3; "
-            "ingest the logs and build it again, or take the label total"
+            f"{directory}: no sample has {energy.power}: the robot was never stationary for long; take the label total"
         )
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers

@@ -5,7 +5,7 @@ What is built to a URL lies in folders, one for each build; a log of commits say
     log/0000000002.json                         the commit of the second build
     generations/0000000002-1f0c8a3be2d94c57/    its files: the number of its commit, and the digest of its card
 
-What lies at a URL without a log, as tcpipe 0.8 or a copy put it there, is read as it is.
+What lies at a URL without a log, as a copy put it there, is read as it is.
 """
 
 from __future__ import annotations

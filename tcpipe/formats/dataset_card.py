@@ -299,7 +299,7 @@ class DatasetCard:
     balance: Balance
     runs: tuple[RunSource, ...]
     run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
-    """The tags that a run had to carry; None in cards of before 0.9, migrated, and of a redacted dataset."""
+    """The tags that a run had to carry; None in cards of redacted datasets."""
     maps: tuple[MapSource, ...]
     flagged_samples: FlaggedSamples
     """How many samples carry a quality flag."""

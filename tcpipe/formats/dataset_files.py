@@ -36,8 +36,7 @@ from tcpipe.formats.place import Place, find_changed_files, prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
-from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
+from tcpipe.tables.levels import DATA_MODEL_VERSION, describe_other_data_model
 from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
 
 FileFormat = Literal["zarr", "parquet"]
@@ -273,9 +272,9 @@ def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> Datase
             return parse_typed(found, DatasetCard, where)
     if found.get("kind") != KIND:
         raise DatasetError(f"{where}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
-    directory, version = str(where).removesuffix(f"/{CARD}"), found.get("data_model_version")
-    remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
-    raise DatasetError(f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}")
+    raise DatasetError(
+        describe_other_data_model(str(where).removesuffix(f"/{CARD}"), str(found.get("data_model_version")))
+    )
 
 
 def read_intact_card(directory: Path) -> DatasetCard:
@@ -291,16 +290,9 @@ def read_intact_card(directory: Path) -> DatasetCard:
 
 
 def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the samples table of a dataset, or some of its columns; `DatasetError` if it cannot be read.
-
-    Columns that an earlier data model lacks are null.
-    """
-    later = {column.name for column in SAMPLES_SCHEMA.columns if column.since}
-    asked = SAMPLES_SCHEMA.names() if columns is None else list(columns)
+    """Return the samples table of a dataset, or some of its columns; `DatasetError` if it cannot be read."""
     with _convert_errors():
-        absent = later.intersection(asked).difference(read_column_names(directory / SAMPLES))
-        there = None if columns is None else [name for name in columns if name not in absent]
-        return SAMPLES_SCHEMA.select_columns(*asked).add_missing_columns(read_table(directory / SAMPLES, there))
+        return read_table(directory / SAMPLES, None if columns is None else list(columns))
 
 
 def sample_columns(directory: Path) -> list[str]:

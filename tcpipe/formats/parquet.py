@@ -26,7 +26,6 @@ from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import to_json_line
 from tcpipe.tables.columns import read_lonlat_deg
 from tcpipe.tables.levels import GEOMETRY, Datum
-from tcpipe.tables.options import EARLIER_COLUMNS
 
 N = TypeVar("N", bound=np.generic)
 
@@ -106,10 +105,7 @@ def _convert_damage(where: Path | str) -> Iterator[None]:
 
 
 def read_table(path: Path, columns: list[str] | None = None, *, group: int | None = None) -> pa.Table:
-    """Read a Parquet file with its schema metadata, or one of its row groups, `EARLIER_COLUMNS` by their new names.
-
-    `StoreError` names a file that cannot be read.
-    """
+    """Read a Parquet file with its schema metadata, or one of its row groups; `StoreError` names a file that cannot be read."""
     with _convert_damage(path), pa.memory_map(str(path)) as file:
         return _read_bounded(file.read_buffer(), columns, group)
 
@@ -120,9 +116,6 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
     most = max(MOST_BYTES, MOST_TIMES * data.size)
     groups = [n for n in range(about.num_row_groups) if group in (None, n) and about.row_group(n).num_rows]
     schema = about.schema.to_arrow_schema()
-    if columns is not None:
-        own = {name: earlier for earlier, name in EARLIER_COLUMNS.items() if earlier in schema.names}
-        columns = [own.get(name, name) for name in columns]
     size, at_most = 0, dict.fromkeys((field.name for field in schema if pa.types.is_string(field.type)), 0)
     for name, least, longest in _iterate_column_sizes(
         memoryview(data), about, groups, None if columns is None else set(columns)
@@ -144,10 +137,7 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
                 raise ValueError(f"its texts unfold to more than {most / 1e6:.0f} MB")
             plain = schema.field(field.name)
             table = table.set_column(at, plain, table.column(at).cast(plain.type))
-    if EARLIER_COLUMNS.keys().isdisjoint(table.column_names):
-        return table
-    named = [field.with_name(EARLIER_COLUMNS.get(field.name, field.name)) for field in table.schema]
-    return pa.Table.from_arrays(table.columns, schema=pa.schema(named, table.schema.metadata))
+    return table
 
 
 def _count_text_bytes(chunk: pa.DictionaryArray) -> int:
@@ -239,8 +229,8 @@ def _read_varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def read_column_names(path: Path) -> list[str]:
-    """Return the names of the columns of a Parquet file from its footer, as `read_table` gives them."""
-    return [EARLIER_COLUMNS.get(name, name) for name in read_schema(path).names]
+    """Return the names of the columns of a Parquet file from its footer."""
+    return list(read_schema(path).names)
 
 
 def read_schema(path: Path) -> pa.Schema:

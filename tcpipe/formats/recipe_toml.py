@@ -18,19 +18,12 @@ from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import IngestSections, Recipe, TableMapping, TimeWindow
 from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots import GENERIC, PowerSource, Profiles, Robot
-from tcpipe.tables.options import EARLIER_KEYS, REMOVED_KEYS
 
 logger = logging.getLogger(__name__)
 
 FILE_NAME = "tcpipe.toml"
 _MOST_BYTES = 1_000_000
 _OWN_TABLES = ("robots", "power_sources", "tables")
-_EARLIER_OF_MASK = {path.replace("gate.", "mask."): name for path, name in EARLIER_KEYS.items() if "gate." in path}
-_EARLIEST_NAMES = {
-    f"{above.replace('gate', 'mask')}{dot}{name}": key
-    for (above, dot, key), name in ((path.rpartition("."), name) for path, name in EARLIER_KEYS.items())
-}
-"""By the path of a key of today."""
 
 
 def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
@@ -108,37 +101,8 @@ def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:
 
 
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
-    """Check recipe values; `RecipeError` carries one line for every wrong key. Earlier keys are read, with a note."""
-    renamed: dict[str, str] = {}
-    values = _rename(values, EARLIER_KEYS | _EARLIER_OF_MASK | dict.fromkeys(REMOVED_KEYS, ""), renamed)
-    if renamed:
-        notes = (f"{old} is {new}" if new else f"{old} has no effect" for old, new in renamed.items())
-        logger.warning("%s: keys of earlier versions: %s", where, ", ".join(notes))
+    """Check recipe values; `RecipeError` carries one line for every wrong key."""
     return from_values(Recipe, values, where=where)
-
-
-def rename_earlier_keys(values: Mapping[str, Any]) -> Any:
-    """Return recipe values with `EARLIER_KEYS` by their names of today."""
-    return _rename(values, EARLIER_KEYS | _EARLIER_OF_MASK, {})
-
-
-def _rename(values: Any, names: Mapping[str, str], renamed: dict[str, str], path: str = "") -> Any:
-    if isinstance(values, list):
-        return [_rename(item, names, renamed, f"{path}.*") for item in values]
-    if not isinstance(values, Mapping):
-        return values
-    found = {}
-    for key, value in values.items():
-        below = f"{path}.*" if path == "robots" else f"{path}.{key}" if path else key
-        name = names.get(below, key)
-        if name != key and name in values:  # both are given: the earlier one stays, an unknown key
-            name = key
-        elif name != key:
-            renamed[below] = name
-        if not name:  # it has no effect any more
-            continue
-        found[name] = _rename(value, names, renamed, below)
-    return found
 
 
 def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
@@ -160,22 +124,13 @@ _KEYS: dict[int, tuple[Recipe, str]] = {}
 def _hash_values(values: Mapping[str, Json]) -> str:
     names = [section.name for section in fields(IngestSections)]
     counted = {name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES}
-    for path, default in REMOVED_KEYS.items():
-        section, _, key = path.partition(".")
-        if isinstance(known := counted[section], Mapping):
-            counted[section] = {key: default, **known}
-    return _digest(counted)
-
-
-def _digest(values: Any) -> str:
-    """Return the hash of recipe values by their earliest names: a recipe keeps its id when a key gets another name."""
-    return digest(_rename(to_plain(values), _EARLIEST_NAMES, {}))
+    return digest(counted)
 
 
 def read_key(recipe: Recipe | IngestSections, robot: str | None, *, definitions: str) -> str:
     """Return the hash (hex) of what rules the streams beside the log: the read section, the robot asked for, the definitions given."""
     own = {name: values for name in _OWN_TABLES if (values := getattr(recipe, name))}
-    return _digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
+    return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
 
 
 def make_recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:

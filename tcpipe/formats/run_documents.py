@@ -233,7 +233,7 @@ def name_folder(checksums: Mapping[str, Checksum]) -> str:
 
 
 MARK = "store.json"
-"""Is written first where a store is new, and last where one is brought over."""
+"""Is written first where a store is new."""
 COPY_MARK = f"copy it from any store of data model {DATA_MODEL_VERSION}: it is the same in all of them"
 SPOOL = "spool"
 """Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store, and claims; they go in the end."""

@@ -21,7 +21,7 @@ from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest, name_folder, read_as_at
 from tcpipe.tables.findings import judge_again
-from tcpipe.tables.levels import LABELLED_SEGMENTS, MASKED_TRACK, MaskedTrack, Streams
+from tcpipe.tables.levels import MaskedTrack, Streams
 
 FilesState: TypeAlias = tuple[tuple[int, int], ...]
 """Size [byte] and modification time [ns] of each file of an ingestion."""
@@ -80,12 +80,12 @@ class RunDirectory:
         return read_table(self.file(f"{name}.parquet"), columns).replace_schema_metadata(None)
 
     def segments(self) -> pa.Table:
-        """Read the labelled segments (schema LABELLED_SEGMENTS; columns that an earlier data model lacks are null)."""
-        return LABELLED_SEGMENTS.add_missing_columns(self.table("segments"))
+        """Read the labelled segments (schema LABELLED_SEGMENTS)."""
+        return self.table("segments")
 
     def track(self) -> MaskedTrack:
-        """Read the masked track as a checked level; columns that an earlier data model lacks are null."""
-        return MaskedTrack(MASKED_TRACK.add_missing_columns(self.table("track")), self.manifest.info)
+        """Read the masked track as a checked level."""
+        return MaskedTrack(self.table("track"), self.manifest.info)
 
     def rejections(self) -> pa.Table:
         """Read the measurements that the filter refused (schema REJECTIONS)."""

@@ -26,7 +26,7 @@ from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
 
 KIND = "tcpipe model"
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Of model.json and the files beside it."""
 
 

@@ -47,9 +47,7 @@ class TrainOptions:
     patience: int | None = option(
         None, Option("Epochs without a better held-out loss before training stops.", kind=Range(1, 100_000), shown=12)
     )
-    batch_size: int | None = option(
-        None, Option("Samples in a batch.", ("--batch-size",), Range(1, 65_536), shown=64, earlier="--batch")
-    )
+    batch_size: int | None = option(None, Option("Samples in a batch.", ("--batch-size",), Range(1, 65_536), shown=64))
     learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
     fold: int | None = option(None, Option("Fold of train held out for early stopping.", kind=Range(0, 99), shown=0))
     mirror: bool | None = option(
@@ -57,7 +55,7 @@ class TrainOptions:
     )
     inverse_variance_weights: bool = option(
         False,
-        Option("Weigh each label by its inverse variance.", ("--inverse-variance-weights",), earlier="--weights"),
+        Option("Weigh each label by its inverse variance.", ("--inverse-variance-weights",)),
     )
     width: int | None = option(
         None,
@@ -74,7 +72,7 @@ class TrainOptions:
         False,
         Option(
             "Give the model the turn and the commanded speed of each segment besides its patch; the paper does not.",
-            ("--extra-features",), earlier="--beside",
+            ("--extra-features",)
         ),
     )  # fmt: skip
     layers: str | Sequence[str] | None = option(
@@ -86,9 +84,7 @@ class TrainOptions:
         ),
     )  # fmt: skip
     seed: int | None = option(None, Option("Seed of weights, shuffles and mirrors.", kind=SEED, shown=0))
-    no_resume: bool = option(
-        False, Option("Start again instead of resuming a stopped training.", ("--no-resume",), earlier="--fresh")
-    )
+    no_resume: bool = option(False, Option("Start again instead of resuming a stopped training.", ("--no-resume",)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +97,7 @@ class EvaluateOptions:
     out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
     noise_draws: int = option(
-        5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000), earlier="--draws")
+        5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000))
     )
     baselines: bool = option(
         True,

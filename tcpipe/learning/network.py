@@ -37,7 +37,7 @@ _CUT_DEVIATION = 0.87962566103423978
 
 _FILED = {"weight": "kernel", "bias": "bias"}
 _FILED_NORM = {"weight": "gamma", "bias": "beta", "running_mean": "moving_mean", "running_var": "moving_variance"}
-"""What torch calls a weight, and its name in a file: those that Keras wrote, with whose layout older models are read as they are."""
+"""What torch calls a weight, and its name in a file, which is that of Keras."""
 
 
 class Normed(nn.Module):

@@ -81,13 +81,13 @@ class PhysicsModel(Predictor):
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> PhysicsModel:
-        """Return the model of these arrays; models before 0.7 have no drivetrain: all of it is in P0."""
+        """Return the model of these arrays."""
         del inputs
-        check_arrays(arrays, {**_FORMS, **list_curve_arrays(1)}, optional=("drivetrain_newton",))
+        check_arrays(arrays, {**_FORMS, **list_curve_arrays(1)})
         speed, rest = read_curves("linear", arrays)
         if not all(np.isfinite(values).all() for values in rest.values()):
             raise ModelError("contains coefficients that are not finite; train the model again")
-        return cls(speed, **{"drivetrain_newton": np.array(0.0), **rest})
+        return cls(speed, **rest)
 
 
 _NUMBERS = tuple(entry.name for entry in fields(PhysicsModel) if entry.name != "speed")

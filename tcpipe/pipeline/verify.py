@@ -38,7 +38,6 @@ from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.store import Store, find_store_above, is_store
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.levels import DATA_MODEL_VERSION
-from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +166,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
         if count != rows:
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
     if card.redaction is not None:
-        table = SAMPLES_SCHEMA.add_missing_columns(read_table(samples))
+        table = read_table(samples)
         yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
 
 

@@ -20,7 +20,7 @@ _ORIGIN = Option(
 
 
 _CELL_SIZE = Option(
-    "Side of a cell; plans on a cost map have its cells.", ("--cell-size",), Range(0.05, 1000.0), "METRES", earlier="--step"
+    "Side of a cell; plans on a cost map have its cells.", ("--cell-size",), Range(0.05, 1000.0), "METRES"
 )  # fmt: skip
 
 
@@ -73,7 +73,7 @@ class PlanPathOptions:
         False,
         Option(
             "Also cross ground outside the training range of the model.",
-            ("--allow-extrapolation",), earlier="--allow-unseen",
+            ("--allow-extrapolation",)
         ),
     )  # fmt: skip
     risk: float | None = option(

@@ -97,7 +97,7 @@ def make_budget_sections(budget: EnergyBudget | None) -> list[Section]:
     if budget is None:
         return []
     shares = {text: getattr(budget, name) for name, text in _BUDGET_ROWS.items()}
-    rows = [(text, f"{100 * share:.2f} %") for text, share in shares.items() if share is not None]
+    rows = [(text, f"{100 * share:.2f} %") for text, share in shares.items()]
     title = "Uncertainty of labels"
     return [Section(title, format_budget(budget), header=("from", "of E"), rows=rows)]
 

@@ -22,10 +22,7 @@ from tcpipe.tables.bits import flag_name
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: name (its suffix is the unit), Arrow type, unit, meaning, frame, whether null is allowed, flag bits.
-
-    ``since`` is the data model that added it, empty for the first: tables of an earlier one lack it (`TableSchema.add_missing_columns`).
-    """
+    """One column: name (its suffix is the unit), Arrow type, unit, meaning, frame, whether null is allowed, flag bits."""
 
     name: str
     dtype: pa.DataType
@@ -34,7 +31,6 @@ class Column:
     frame: str = ""
     nullable: bool = False
     flags: type[IntFlag] | None = None
-    since: str = ""
 
     def field(self) -> pa.Field:
         """Return the Arrow field, with unit, frame, meaning and bit names as metadata."""
@@ -75,20 +71,6 @@ class TableSchema:
     def empty(self) -> pa.Table:
         """Return the table without rows."""
         return pa.Table.from_batches([], self.arrow())
-
-    def add_missing_columns(self, table: pa.Table) -> pa.Table:
-        """Return a table of an earlier data model with the columns added since, null; of this one, as it is.
-
-        A data model is earlier if it lacks all columns of a later one: a table that lacks some of them is damaged, and stays so.
-        """
-        there = set(table.column_names)
-        later = {column.since for column in self.columns if column.since}
-        lacking = {since for since in later if there.isdisjoint(c.name for c in self.columns if c.since == since)}
-        added = [column for column in self.columns if column.since in lacking]
-        for column in added:
-            table = table.append_column(column.field(), pa.nulls(table.num_rows, column.dtype))
-        mine = [name for name in self.names() if name in table.column_names]
-        return table.select([*mine, *(name for name in table.column_names if name not in mine)]) if added else table
 
     def select_columns(self, *names: str) -> TableSchema:
         """Return the schema of some of the columns."""

@@ -315,8 +315,8 @@ class EnergyBudget:
     voltage: float
     at_20_hz: float
     """The total with power at 20 Hz."""
-    common: float | None = field(default=None, metadata=LEFT_OUT)
-    """The error that all segments of a run share, which is not part of the total; None in documents of earlier versions."""
+    common: float
+    """The error that all segments of a run share, which is not part of the total."""
     delay: float | None = field(default=None, metadata=LEFT_OUT)
     """The error by the delay of power against motion, which is not part of the total."""
 

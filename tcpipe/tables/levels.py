@@ -19,16 +19,17 @@ from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.facts import NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import Finding, StageReport
 
-DATA_MODEL_VERSION = "3.0"
+DATA_MODEL_VERSION = "4.0"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
 
-EARLIER_VERSIONS = ("2.0", "2.1")
-"""Versions that `tcpipe migrate` brings to the current one."""
+TABLES_VERSION = "4.0"  # in which a table last changed
 
-TABLES_VERSION = "3.0"  # in which a table last changed
 
-READ_TABLES = (*EARLIER_VERSIONS, TABLES_VERSION)
-"""Versions of tables that are read as they are."""
+def describe_other_data_model(where: str, version: str) -> str:
+    """Return the error on a store, dataset or map that another data model wrote."""
+    maker = "tcpipe 1.x" if version == "3.0" else "another version of tcpipe"
+    return f"{where}: made by {maker} (data model {version}), expected {DATA_MODEL_VERSION}: ingest the logs again"
+
 
 GEOMETRY = "geometry"
 """Column that tells other tools where a row lies (GeoParquet)."""
@@ -53,13 +54,13 @@ def _make_stream_schema(name: str, doc: str, *columns: Column) -> TableSchema:
     return TableSchema(name, "L1", doc, (_STAMP, _LOG_TIME, _EPOCH, *columns))
 
 
-def _make_nullable(name: str, unit: str, doc: str, frame: str = "", since: str = "") -> Column:
+def _make_nullable(name: str, unit: str, doc: str, frame: str = "") -> Column:
     """Return a column of numbers that are not always known."""
-    return Column(name, _F64, unit, doc, frame, nullable=True, since=since)
+    return Column(name, _F64, unit, doc, frame, nullable=True)
 
 
 def _make_geometry(doc: str, frame: str) -> Column:
-    return Column(GEOMETRY, pa.binary(), "", f"{doc}; WKB, longitude first", frame, nullable=True, since="2.1")
+    return Column(GEOMETRY, pa.binary(), "", f"{doc}; WKB, longitude first", frame, nullable=True)
 
 
 GNSS = _make_stream_schema(
@@ -208,9 +209,8 @@ _TRACK_COLUMNS = (
             f"standard deviation of the horizontal displacement over the next {name}, along it, including the correlation of both ends; "
             "null where the track does not go on, and without a smoother",
             "enu",
-            since,
         )
-        for name, since in (("500ms", ""), ("1s", ""), ("2s", ""), ("4s", ""), ("8s", "3.0"), ("16s", "3.0"))
+        for name in ("500ms", "1s", "2s", "4s", "8s", "16s")
     ),
     _make_nullable(
         "wheel_velocity_mps", "m/s", "forward velocity by the wheels, interpolated; null without", "base_link"
@@ -274,7 +274,7 @@ _GAPS = "null where the IMU has gaps or is below 50 Hz"
 _UNSURE = "null without a gyroscope or a smoother"
 
 MOTION_COLUMNS = tuple(
-    _make_nullable(name, unit, doc, frame, since="1.3")
+    _make_nullable(name, unit, doc, frame)
     for name, unit, doc, frame in (
         ("yaw_change_rad", "rad", "change of yaw from start to end, counter-clockwise", "enu"),
         ("yaw_change_std_rad", "rad", f"standard deviation of yaw_change_rad; {_UNSURE}", "enu"),
@@ -312,7 +312,7 @@ MOTION_COLUMNS = tuple(
 """How the robot moves over a segment."""
 
 _NET_COLUMNS = tuple(
-    _make_nullable(name, unit, doc, since="1.3")
+    _make_nullable(name, unit, doc)
     for name, unit, doc in (
         ("voltage_volt", "V", "time-mean of the voltage, over the rails; null if not measured"),
         ("idle_power_watt", "W", "power of the stationary robot in this run; null if it was hardly stationary"),
@@ -329,7 +329,7 @@ _NET_COLUMNS = tuple(
 )
 
 _COMMON_COLUMNS = tuple(
-    _make_nullable(name, unit, f"part of {name.replace('_common', '')} that is one error of the whole run", since="3.0")
+    _make_nullable(name, unit, f"part of {name.replace('_common', '')} that is one error of the whole run")
     for name, unit in (
         ("duration_common_std_s", "s"),
         ("velocity_common_std_mps", "m/s"),
@@ -359,7 +359,6 @@ _LABEL_COLUMNS = (
         "1",
         "GNSS or pose, wheels, camera: how many measured in the segment and agree with the track",
         nullable=True,
-        since="3.0",
     ),
     Column("quality", pa.uint32(), "bits", "limitations of the label, 0 = none", flags=Quality),
 )

@@ -1,13 +1,11 @@
 """The options of a command, declared once: fields of a frozen dataclass that click's options and the public function are made of.
 
 The modules that declare options import neither numpy nor pyarrow, so that ``--help`` starts fast.
-
-Names of tcpipe 0.8 and data model 2.x, with their names since 0.9 and 3.0: tcpipe still reads the earlier ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from inspect import cleandoc, signature
 from math import isfinite
@@ -44,8 +42,6 @@ class Option:
     envvar: str | None = None
     repeatable: bool = False
     is_argument: bool = False
-    earlier: str = ""
-    """The flag of versions before 0.9: still read, and shown nowhere."""
 
 
 STORE = Option("Where runs and maps are kept (or TCPIPE_STORE).", (), "published", "DIR|URL", envvar="TCPIPE_STORE")
@@ -67,7 +63,6 @@ PHYSICS = Option(
     ("--physics-from",),
     "sealed",
     "DATASET",
-    earlier="--physics",
 )
 SPEED = Option(
     "Commanded speed, for a model trained with --extra-features (default: the mean of its training).",
@@ -146,75 +141,3 @@ def _describe_mismatch(kind: Range | tuple[str, ...] | str, value: Any) -> str:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-
-
-EARLIER_COLUMNS = {
-    "epoch": "clock_epoch",
-    "turn_rad": "yaw_change_rad",
-    "turn_std_rad": "yaw_change_std_rad",
-    "turn_rate_radps": "mean_abs_yaw_rate_radps",
-    "turn_rate_std_radps": "mean_abs_yaw_rate_std_radps",
-    "standing_power_watt": "idle_power_watt",
-    "standing_power_std_watt": "idle_power_std_watt",
-    "power_above_standing_watt": "net_power_watt",
-    "power_above_standing_std_watt": "net_power_std_watt",
-    "energy_above_standing_joule": "net_energy_joule",
-    "energy_above_standing_std_joule": "net_energy_std_joule",
-}
-"""Columns of tables; `tcpipe.formats.parquet` gives them their names of today."""
-
-EARLIER_KEYS = {
-    "gate": "mask",
-    "gate.standing_velocity_mps": "stationary_velocity_mps",
-    "gate.standing_yaw_rate_radps": "stationary_yaw_rate_radps",
-    "read.time": "time_source",
-    "read.placement": "extrinsics",
-    "read.pose_from": "pose_sources",
-    "robots.*.called": "topic_words",
-    "power_sources.*.refused": "unsupported_reason",
-    "power_sources.*.includes": "other_loads",
-    "power_sources.*.unknown": "open_questions",
-}
-"""Keys of the recipe by their path; * is any name or item."""
-
-REMOVED_KEYS = {"fuse.engine": "compiled"}
-"""Keys of the recipe that have no effect any more, by their path, with the default that still counts in the recipe's id."""
-
-EARLIER_DOCUMENT_KEYS = {
-    **EARLIER_COLUMNS,
-    "gate": "mask",
-    "ledger_m": "distance_by_reason_m",
-    "ledger_s": "duration_by_reason_s",
-    "standing_watt": "idle_watt",
-    "standing": "stationary",
-    "below_limit": "below_full_speed",
-    "not_at_limit": "below_full_speed",
-    "mean_power_differs": "power_mean_mismatch",
-    "reopenings": "gate_resets",
-    "refused": "excluded",
-    "remarks": "notes",
-    "pitch_m": "pixel_size_m",
-    "doubtful": "flagged_samples",
-}
-"""Keys of manifests and cards; `tcpipe migrate` renames them."""
-
-_EARLIER_PHYSICS = {"standing": "idle", "usual_turn_radpm": "mean_turn_radpm"}
-"""Terms and keys below a key ``physics``."""
-
-
-def rename_keys(document: Any, names: dict[str, str] = EARLIER_DOCUMENT_KEYS) -> Any:
-    """Return a document, or a part of one, with keys by their names of today."""
-    if isinstance(document, list):
-        return [rename_keys(item, names) for item in document]
-    if not isinstance(document, Mapping):
-        return document
-    return {
-        names.get(key, key): _EARLIER_PHYSICS.get(value, value)
-        if key == "term"
-        else rename_keys(value, names | _EARLIER_PHYSICS if key == "physics" else names)
-        for key, value in document.items()
-    }
-
-
-EARLIER_CHOICES = {"table": "boosting", "above_standing": "net"}
-"""Values of options."""

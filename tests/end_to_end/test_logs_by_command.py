@@ -125,7 +125,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
     (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
     refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
     assert f"nosuch: is no run or log with a known problem in tcpipe-store; known problems: {junk}, {run_id}" in refused
-    done = tcpipe("accept", run_id, "logs/junk.bag", cwd=tmp_path)  # the name of the command before
+    done = tcpipe("acknowledge", run_id, "logs/junk.bag", cwd=tmp_path)
     assert (done.returncode, f"acknowledged: {run_id}: " in done.stdout, "[log-damaged]" in done.stdout) == (
         0,
         True,

@@ -96,11 +96,10 @@ def test_patches_of_a_report_lie_beside_it_and_other_answers_are_json(place: Pat
     assert done.returncode == 0, done.stderr
     assert {path.parent for path in place.rglob("*") if path.is_file()} - {path.parent for path in before}
     assert answer("diff", "dataset", "dataset", cwd=place)["same"]
-    assert answer("migrate", "store", cwd=place)["migrated"] == []
 
 
 def test_the_store_is_named_in_the_same_way_everywhere(place: Path) -> None:
-    for command in (("inspect",), ("verify",), ("migrate",), ("report", "--no-runs"), ("status",)):
+    for command in (("inspect",), ("verify",), ("report", "--no-runs"), ("status",)):
         by_option = tcpipe(*command, "--store", "store", cwd=place)
         by_variable = tcpipe(*command, cwd=place, env={"TCPIPE_STORE": "store"})
         as_before = tcpipe(*command, "store", cwd=place)

@@ -82,7 +82,6 @@ def here(tmp_path, monkeypatch):
 
 
 CALLS = [
-    "accept run --store gone",
     "acknowledge run --store gone",
     "add-map site --height gone.tif",
     "add-map site --height empty",
@@ -110,9 +109,6 @@ CALLS = [
     "ingest file --store https://bucket/store",
     "inspect gone",
     "inspect empty",
-    "migrate gone",
-    "migrate file",
-    "migrate empty",
     "overlay gone out.mcap",
     "overlay empty out.mcap",
     "plan-path gone --from 15,47 --to 15.1,47",

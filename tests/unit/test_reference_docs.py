@@ -30,4 +30,4 @@ def test_committed_reference_is_what_the_code_says_and_a_lost_name_is_an_error()
     assert committed == pages, "run 'make docs' and commit the result"
     assert not none, "a new name is no error"
     assert "commands: ingest --store" in one
-    assert "hidden alias" in one
+    assert "next major version" in one

@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from synthetic_store import add_run, commit_run, lanes, segments
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.place import Place
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -176,12 +178,15 @@ def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp
     assert not list(tmp_path.glob("tcpipe-*"))
 
 
-def test_a_store_of_a_later_layout_is_refused(tmp_path, monkeypatch):
+def test_a_store_of_another_data_model_is_refused_in_one_line(tmp_path, monkeypatch):
     with monkeypatch.context() as later:
-        later.setattr("tcpipe.formats.run_documents.DATA_MODEL_VERSION", "4.0")
+        later.setattr("tcpipe.formats.run_documents.DATA_MODEL_VERSION", "3.0")
         open_store(tmp_path / "store", create=True)
-    with pytest.raises(StoreError, match=r"is of data model 4\.0, this version knows 3\.0"):
-        open_store(tmp_path / "store")
+    for ask in (open_store, verify, report, partial(inspect, recipe=Recipe())):
+        with pytest.raises(UsageError) as caught:
+            ask(tmp_path / "store")
+        expected = f"{tmp_path / 'store'}: made by tcpipe 1.x (data model 3.0), expected 4.0: ingest the logs again"
+        assert caught.value.problems == (expected,)
 
 
 def test_a_bucket_that_keeps_no_two_writers_apart_or_cannot_be_written_is_refused(tmp_path, served):

@@ -85,8 +85,7 @@ class MapFacts:
     """Of terrain: share of each class among the pixels that have one."""
     class_shares: Mapping[str, Mapping[str, float]] = field(default_factory=dict, metadata=LEFT_OUT)
     """The same of the user's own layers."""
-    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
-    """Maps of tcpipe 0.8 and earlier have none: they kept sentences."""
+    findings: tuple[Finding, ...] = ()
     classes_from: str
     """``file``, ``names`` of the terrain raster's values, ``store`` or ``default``."""
     inputs: MapInputs

@@ -43,9 +43,9 @@ from tcpipe.formats.place import prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
 from tcpipe.tables.facts import LEFT_OUT
-from tcpipe.tables.options import rename_keys
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
-from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, find_no_data_value
+from tcpipe.terrain.layers import PAPER_LAYERS, Layer, Pixels, find_no_data_value
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
 from tcpipe.terrain.tiles import BandReader, MapReader
@@ -58,9 +58,6 @@ BANDS = "bands"
 
 SHARD_PX = 2048
 """Side of a shard: the unit that is a file, and that is written at once."""
-
-PAPER_VERSION, OWN_VERSION, MAP_VERSION = "1.1", "1.2", "1.3"
-"""1.2: a map has other layers than the paper's, which its key ``described`` tells of; 1.3: some of several bands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,11 +169,13 @@ def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool =
     except StoreError as error:
         raise MapError(f"{path}: not a map ({error.problems[0]}); add one with: tcpipe add-map") from None
     found = attributes.get("tcpipe_map") if isinstance(attributes, dict) else None
-    if not isinstance(found, dict) or found.get("version") not in {PAPER_VERSION, OWN_VERSION, MAP_VERSION}:
+    if not isinstance(found, dict) or found.get("version") != DATA_MODEL_VERSION:
         version = found.get("version") if isinstance(found, dict) else None
-        raise MapError(f"{path}: not a map of this version (got {version}, expected {MAP_VERSION}); add it again")
+        raise MapError(
+            f"{path}: not a map of this version (got {version}, expected {DATA_MODEL_VERSION}); add it again"
+        )
     try:
-        kept = parse_typed(found | {"grid": rename_keys(found.get("grid"))}, _Attributes, path)
+        kept = parse_typed(found, _Attributes, path)
         described = {name: kept.described.get(name, {}) for name in (*kept.layers, *kept.band_grids)}
         every = read_layers(described, kept.class_table, path)
         layers = {name: every[name] for name in kept.layers}
@@ -311,7 +310,7 @@ class MapWriter:
             title = f"{self._name}, {factor} x coarser" if factor > 1 else self._name
             _place(group, make_overview_grid(self._grid, factor), title)
         kept = _Attributes(
-            version=MAP_VERSION if self._band_grids else PAPER_VERSION if set(layers) <= set(LAYERS) else OWN_VERSION,
+            version=DATA_MODEL_VERSION,
             name=self._name,
             grid=self._grid,
             class_table=self._scheme.table.classes,

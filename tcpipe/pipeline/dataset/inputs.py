@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -242,7 +242,7 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
     keys = sorted({*was, *now} - {"robot"})  # the robot of the runs counts, whoever named it
     yield from ((f"recipe {key}", was.get(key), now.get(key)) for key in keys)
     yield "--robot", card.robots, tuple(sorted({run.robot for run in inputs.sources})) if card.robots else ()
-    yield "--tag", _find_chosen_tags(card, options.tags, inputs), dict(options.tags)
+    yield "--tag", dict(card.run_tags or {}), dict(options.tags)
     yield "--map", tuple(entry.name for entry in card.maps), inputs.map_names
     regions = None if options.regions is None else regions_to_json(options.regions)
     yield "--split", _format_region(card.split.region), _format_region(regions)
@@ -255,23 +255,6 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
     yield "--format", card.format, options.file_format
     if not options.keeps_own_split:
         yield "--keep-split", card.split.kept is not None, options.earlier is not None
-
-
-def _find_chosen_tags(card: DatasetCard, wanted: Mapping[str, str], inputs: Inputs) -> dict[str, str]:
-    """Return the tags that selected the runs of a dataset.
-
-    For a card of before 0.9, which lacks them: tags that all its runs share and that are requested or not shared by today's runs.
-    """
-    if card.run_tags is not None:
-        return dict(card.run_tags)
-    shared = _find_shared_tags(run.tags or {} for run in card.runs)
-    still = _find_shared_tags(run.tags or {} for run in inputs.sources)
-    return {key: tag for key, tag in shared.items() if wanted.get(key) == tag or still.get(key) != tag}
-
-
-def _find_shared_tags(tags: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    every = [set(run_tags.items()) for run_tags in tags]
-    return dict(sorted(set.intersection(*every))) if every else {}
 
 
 def _format_region(region: Mapping[str, object] | None) -> str | None:

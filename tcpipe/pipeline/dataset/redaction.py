@@ -298,16 +298,8 @@ def find_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
         yield f"distances are {ratio:.6f} of chord_m: the scale of the maps' plane reveals the place; build it again"
     yield from (f"tells {text!r}" for text in (*card.label.includes, *card.added_columns.values()) if text)
     every = (card.findings, card.verdict.reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
-    others = (
-        finding for findings in every for finding in findings if not _is_cut_sentence(finding, card.tcpipe_version)
-    )
-    revealing = [finding.code for finding in others if _redact_finding(finding) != finding]
+    revealing = [finding.code for findings in every for finding in findings if _redact_finding(finding) != finding]
     yield from (f"a finding {code} contains more than is public" for code in revealing)
-
-
-def _is_cut_sentence(finding: Finding, version: str) -> bool:
-    """Return whether a finding is a sentence from which an earlier version cut names when it built the dataset."""
-    return finding.code == "earlier-warning" and version.startswith(("0.6.", "0.7.", "0.8."))
 
 
 def compute_plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:

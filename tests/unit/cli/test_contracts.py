@@ -24,7 +24,7 @@ def test_every_command_that_prints_json_has_a_contract_of_it() -> None:
         for name, command in cli.commands.items()
         if not command.hidden and any("--json" in option.opts for option in command.params)
     }
-    assert {"status", "prune", "migrate"} <= printing
+    assert {"status", "prune"} <= printing
     assert not {name for name in printing if not any(f"{of}-".startswith(f"{name}-") for of in told)}
 
 

@@ -84,13 +84,13 @@ def test_net_energy_is_not_known_where_either_is_not(idle_watt, energy_joule):
 def made(rng, count):
     energy = rng.uniform(100, 300, count)
     causes = {cause: rng.uniform(0, 9, count) for cause in CAUSES}
-    return energy, {**causes, "at_20_hz": causes["position"] + 1.0}
+    return energy, {**causes, "at_20_hz": causes["position"] + 1.0, "common": causes["rate"]}
 
 
 def test_shares_of_hand_made_variances():
     energy = np.array([90.0, np.nan, 110.0])
     variance = dict(zip(CAUSES, np.array([[4.0], [9.0], [2.0], [1.0]]) * np.ones(3), strict=True))
-    got = estimate_energy_budget(energy, {**variance, "at_20_hz": np.full(3, 5.0)})
+    got = estimate_energy_budget(energy, {**variance, "at_20_hz": np.full(3, 5.0), "common": np.zeros(3)})
     assert got.segments == 2
     assert (got.position, got.rate, got.total) == pytest.approx((0.02, 0.03, 0.04))
     text = format_budget(got)
@@ -103,7 +103,9 @@ def test_shares_of_hand_made_variances():
 @pytest.mark.parametrize(("watt_factor", "noisy"), [(1.0, False), (1.6, True)])
 def test_a_high_noise_floor_is_a_finding_with_its_causes(watt_factor, noisy):
     variance = dict(zip(CAUSES, watt_factor * np.array([[4.0], [9.0], [2.0], [1.0]]) * np.ones(2), strict=True))
-    budget = estimate_energy_budget(np.array([90.0, 110.0]), {**variance, "at_20_hz": np.full(2, 5.0)})
+    budget = estimate_energy_budget(
+        np.array([90.0, 110.0]), {**variance, "at_20_hz": np.full(2, 5.0), "common": np.zeros(2)}
+    )
     found = find_noise(budget, Subject("role", "power"))
     assert [of.code for of in found] == ["energy-noise"] * noisy
     assert all(of.numbers["rate_fraction"] == budget.rate for of in found)

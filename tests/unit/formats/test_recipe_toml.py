@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.recipe_toml import (
     find_recipe,
     format_commented_toml,
     ingest_key,
     load_recipe,
-    make_recipe_id,
     parse_recipe,
-    read_key,
 )
 from tcpipe.recipe import Extrinsics, FuseConfig, ReadConfig, Recipe, SegmentConfig, SplitConfig
 
@@ -108,28 +105,6 @@ def test_one_value_is_one_recipe_however_it_is_written() -> None:
         assert ingest_key(other) == ingest_key(plain)
     assert SplitConfig(folds=np.int64(3)).folds == SplitConfig(folds=3.0).folds == 3  # type: ignore[arg-type]
     assert type(SplitConfig(folds=np.int64(3)).folds) is int  # type: ignore[arg-type]
-
-
-def test_names_of_recipes_are_those_of_0_8() -> None:
-    own = {
-        "robot": "husky",
-        "fuse": {"rate_hz": 10},
-        "read": {"topics": {"imu": ["/a"]}, "extrinsics": {"imu": {"xyz_m": [1, 0, -0.0]}}},
-        "robots": {"r": {"width_m": 1, "voltage_range_volt": [20, 30]}},
-        "power_sources": [{"type": "a/msg/B", "voltage": "v"}],
-    }
-    names = {
-        make_recipe_id(recipe, "husky"): (ingest_key(recipe)[:8], read_key(recipe, "husky", definitions="x")[:8])
-        for recipe in (Recipe(), parse_recipe(own, where="r"))
-    }
-    assert names == {"87f31f5a": ("fd3f3c8a", "4ddf11ad"), "1652ca06": ("92c6ab9a", "0b4c8076")}
-
-
-def test_a_key_without_effect_is_read_with_a_note_and_changes_no_id(caplog: pytest.LogCaptureFixture) -> None:
-    given = parse_recipe({"fuse": {"engine": "filterpy", "rate_hz": 10}}, where="r")
-    assert caplog.messages == ["r: keys of earlier versions: fuse.engine has no effect"]
-    assert given == Recipe(fuse=FuseConfig(rate_hz=10))
-    assert ingest_key(given) == ingest_key({**to_plain(given), "fuse": {**to_plain(given.fuse), "engine": "compiled"}})
 
 
 @pytest.mark.parametrize("value", [{1.0, 2.0, 3.0}, (0.0, float("nan"), 0.0), (0.0, 0.0, float("inf")), b"abc", "abc"])

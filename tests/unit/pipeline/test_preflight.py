@@ -18,7 +18,9 @@ def test_what_is_slow_or_absent_for_most_of_the_time_is_found():
     assert (slow.code, slow.subject.name, slow.names["topic"]) == ("rate-too-low", "imu", "/imu")
     assert slow.numbers == {"rate_hz": 20.0, "wanted_hz": 50.0}
     assert (silent.code, silent.subject.name, silent.numbers) == ("topic-incomplete", "gnss", {"present_fraction": 0.4})
-    budget = EnergyBudget(50, 300.0, total=0.05, position=0.01, rate=0.048, current=0.0, voltage=0.0, at_20_hz=0.012)
+    budget = EnergyBudget(
+        50, 300.0, total=0.05, position=0.01, rate=0.048, current=0.0, voltage=0.0, at_20_hz=0.012, common=0.0
+    )
     (ruled,) = find_slow((), promise(budget=budget), 60.0)
     assert (ruled.code, ruled.numbers["at_20_hz_fraction"]) == ("power-rate-dominates", 0.012)
     assert [of.code for of in find_slow((), promise(segments=0), 20.0)] == ["log-too-short"]

@@ -274,8 +274,8 @@ def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
     assert (shown.return_value, "1 empty" in shown.output) == (3, True)
     assert "1 of 1 runs: No segments [no-segments]" in shown.output
     (run_id,) = Store(tmp_path / "store").run_ids()
-    accepted = run("accept", run_id, *how[:2])
-    assert "[no-segments]" in accepted.output
+    acknowledged = run("acknowledge", run_id, *how[:2])
+    assert "[no-segments]" in acknowledged.output
     shown = run("status", *how)
     assert (shown.return_value, "done, empty, acknowledged" in shown.output) == (0, True)
     assert run(*ingest_it).return_value == 0

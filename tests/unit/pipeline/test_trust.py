@@ -282,7 +282,7 @@ ASK = {
     [
         (
             {"kind": "tcpipe dataset", "data_model_version": "7.0"},
-            f"d: written by data model 7.0, expected {DATA_MODEL_VERSION}; build it again",
+            rf"d: made by another version of tcpipe \(data model 7.0\), expected {DATA_MODEL_VERSION}: ingest the logs again",
         ),
         ({"kind": "shopping list"}, "dataset.json: not the card of a tcpipe dataset"),
     ],

@@ -137,31 +137,22 @@ def reseal(directory: Path, **values: object) -> None:
     (directory / "dataset.json").write_text(json.dumps({key: of for key, of in card.items() if of is not None}))
 
 
-def test_a_dataset_of_an_earlier_version_is_compared_by_what_its_card_tells(here):
-    reseal(here / "dataset", tcpipe_version="0.7.0", run_tags=None, inputs="0" * 64)
-    assert refused(here, map_name="yard") == (OTHER["map_name"][1],)
-    assert refused(here, tags={}) == (OTHER["tags"][1],), "its runs share what the runs now do not"
-    assert refused(here, tags={"weather": "wet"}) == ("--tag: weather=dry in the dataset, weather=wet now",)
-    assert build_dataset(here / "dataset", **usual(here)).status == "done"
-    assert read_card(here / "dataset").run_tags == {"weather": "dry"}
-
-
 def test_a_dataset_of_another_data_model_is_left_alone(here):
-    reseal(here / "dataset", data_model_version="2.1")
+    reseal(here / "dataset", data_model_version="3.0")
     with pytest.raises(DatasetError, match="is not changed, because its inputs are unknown") as caught:
         build_dataset(here / "dataset", **usual(here, force=True))
-    assert "written by data model 2.1, expected 3.0; run 'tcpipe migrate' on it" in caught.value.problems[0]
+    assert "made by tcpipe 1.x (data model 3.0), expected 4.0: ingest the logs again" in caught.value.problems[0]
 
 
 def test_a_dataset_of_another_data_model_in_a_bucket_is_left_alone(here, monkeypatch):
     shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
-    reseal(here / "served" / "sets" / "ds", data_model_version="2.1")
+    reseal(here / "served" / "sets" / "ds", data_model_version="3.0")
     with object_store(here / "served") as (environment, _):
         in_environment(monkeypatch, environment, here / "cache")
         with pytest.raises(DatasetError) as caught:
             build_dataset("s3://sets/ds", **usual(here, force=True))
-    migrate, move = caught.value.problems
-    assert migrate.startswith("s3://sets/ds: written by data model 2.1, expected 3.0; run 'tcpipe migrate' on it")
+    other, move = caught.value.problems
+    assert other == "s3://sets/ds: made by tcpipe 1.x (data model 3.0), expected 4.0: ingest the logs again"
     assert move == "s3://sets/ds: is not changed, because its inputs are unknown; move it or give another OUT"
 
 
