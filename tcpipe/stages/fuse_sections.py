@@ -145,7 +145,7 @@ def make_wheel_column(
 
 
 def make_command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:
-    """Return the last command at each stamp; NaN before the first and without commands."""
+    """Return the last command at each stamp; NaN before the first, while the topic is silent, and without commands."""
     table = streams.tables.get("command")
     names = {"commanded_velocity_mps": "forward_velocity_mps", "commanded_yaw_rate_radps": "yaw_rate_radps"}
     if table is None:

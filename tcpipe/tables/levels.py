@@ -216,9 +216,14 @@ _TRACK_COLUMNS = (
         "wheel_velocity_mps", "m/s", "forward velocity by the wheels, interpolated; null without", "base_link"
     ),
     _make_nullable(
-        "commanded_velocity_mps", "m/s", "commanded forward velocity, last value; null without", "base_link"
+        "commanded_velocity_mps",
+        "m/s",
+        "commanded forward velocity, last value; null without or when silent",
+        "base_link",
     ),
-    _make_nullable("commanded_yaw_rate_radps", "rad/s", "commanded yaw rate, last value; null without", "base_link"),
+    _make_nullable(
+        "commanded_yaw_rate_radps", "rad/s", "commanded yaw rate, last value; null without or when silent", "base_link"
+    ),
     _make_nullable("voltage_volt", "V", "mean voltage over the rails, interpolated; null if not measured"),
     _make_nullable("current_amp", "A", "sum of the rails' currents, interpolated; null if not measured"),
     _make_nullable("power_watt", "W", "sum over rails of voltage times current; null without power"),
