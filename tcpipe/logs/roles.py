@@ -28,6 +28,7 @@ from tcpipe.logs.topics import (
     format_topic_names,
     format_topics,
     list_undecodable,
+    select_successive,
 )
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity, is_corrected, make_rail_name
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
@@ -69,7 +70,7 @@ MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss", "pose")
 
 @dataclass(frozen=True, slots=True)
 class PlayedRole:
-    """A role, the topics that play it (several only for power: they are summed), their type, and why."""
+    """A role, the topics that are used as it (of power a sum, else one after the other), the type of the first, and why."""
 
     name: str
     topics: tuple[str, ...]
@@ -120,6 +121,7 @@ class _Decisions:
     ambiguous: list[str] = field(default_factory=list)
     choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
     undecided: set[str] = field(default_factory=set)
+    findings: list[Finding] = field(default_factory=list)
 
     def pass_over(self, role: str, topic: Topic, why: str, reason: str) -> None:
         """Leave a candidate out, for a reason that is one word or several in kebab case."""
@@ -143,9 +145,9 @@ def assign_roles(
 ) -> RoleAssignment:
     """Return which topic plays which role, and why; `RecipeError`: no profile is called ``robot``.
 
-    ``chosen`` is the recipe's ``read.topics``: of power all are summed, elsewhere the first that the log holds is taken, and an empty list
-    means that nothing plays the role. Outside ``namespace`` only topics that are chosen by name play roles. Those of the ``mapped`` roles
-    (``read.fields``) may be of any type.
+    ``chosen`` is the recipe's ``read.topics``: of power all are summed; of other roles the first is used, and those named after it while
+    it has no messages; an empty list means that no topic is used. Outside ``namespace`` only topics that are chosen by name are used.
+    Those of the ``mapped`` roles (``read.fields``) may be of any type.
     """
     every = {topic.name: topic for topic in sorted(topics, key=lambda topic: topic.name)}
     named = {name for names in chosen.values() for name in names}
@@ -203,6 +205,7 @@ def assign_roles(
             *find_missing_roles({*decided.roles, *decided.undecided}),
             *find_left_out(decided.passed_over),
             *proposed,
+            *decided.findings,
             *find_undecodable(listed.values(), {type_name for types in decided.types.values() for type_name in types}),
         ),
         decided.choices,
@@ -279,6 +282,10 @@ def _collect_own_velocities(decided: _Decisions, topics: Iterable[Topic], ignore
     return [((rank(topic.type_name),), "", topic) for topic in both if _is_usable(decided, topic, ignored)]
 
 
+_MAX_OVERLAP_FRACTION = 0.5
+"""Largest common time of topics that the recipe names for one role, as a fraction of the shorter one: the rest of it is used."""
+
+
 def _take_chosen(
     decided: _Decisions, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]], mapped: Collection[str]
 ) -> None:
@@ -287,7 +294,16 @@ def _take_chosen(
             decided.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
             continue
         present = [name for name in names if name in topics]
-        wanted = present if role == "power" else present[:1]
+        sent = [topics[name] for name in present if topics[name].message_count != 0]
+        joined = select_successive(sent, max_overlap_fraction=_MAX_OVERLAP_FRACTION)
+        wanted = present if role == "power" else [topic.name for topic in joined] or present[:1]
+        for topic in sent if wanted else ():
+            if topic.name not in wanted:
+                decided.left_out[topic.name] = f"read.topics.{role} names {wanted[0]} first"
+                remedies = suggest("use", {"read.topics": {role: [topic.name]}})
+                names_used = {"role": role, "used": " + ".join(wanted)}
+                subject = Subject("topic", topic.name)
+                decided.findings.append(make_finding("topic-overlaps", subject, names=names_used, remedies=remedies))
         missing = [name for name in names if name not in topics]
         if missing and (role == "power" or not present):
             decided.undecided.add(role)
@@ -491,13 +507,21 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
         return
     first = _select_best(role, candidates)
     topics = [topic for _, topic in first]
+    # A topic that is renamed during the log goes on as another one.
+    is_joined = role != "power" and len(topics) == len(select_successive(topics))
+    if is_joined:
+        same_type = [topic for _, _, topic in candidates if topic.type_name == topics[0].type_name]
+        short = find_short_topics(same_type, topics, of_power=True)
+        topics = select_successive([*topics, *(topic for topic in same_type if topic.name not in short)])
     names = tuple(topic.name for topic in topics)
     taken = set(names)
     others = [topic for _, _, topic in candidates if topic.name not in taken]
     thin = find_short_topics(others, topics, of_power=role == "power")
     # Bare numbers share a rail, other topics are one each.
     rails = tuple(dict.fromkeys(make_rail_name(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
-    if len(first) == 1:
+    if is_joined and len(topics) > 1:
+        why = "they follow each other"
+    elif len(first) == 1:
         better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
         better = f"{better} than {format_topic_names(others)}" if others else f"the only {topics[0].type_name}"
         why = first[0][0] or better
@@ -544,9 +568,10 @@ def _are_sides(names: Sequence[str]) -> bool:
 
 def _format_recipe_line(role: str, names: Sequence[str]) -> str:
     others = "".join(f' or ["{name}"]' for name in names[1:])
-    summed = f", or several to be summed: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
+    how = "several to be summed" if role == "power" else "if they follow each other"
+    several = f", or {how}: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
     line = RecipeFragment({"read.topics": {role: [names[0]]}}).toml().splitlines()[-1]
-    return f"{line}  #{others}{summed if role == 'power' else ''}"
+    return f"{line}  #{others}{several}"
 
 
 def _list_questions(decided: _Decisions) -> list[str]:

@@ -6,10 +6,11 @@ A sensor's extrinsics come from the recipe, from static transforms, or are assum
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import cast, get_args
 
+import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import MapError, RecipeError, RoleError
@@ -100,7 +101,34 @@ def read_sources(
         seen_frames = count_frames(columns, types[topic])
         source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
         sources.append(replace(source, readings=_apply_recipe(source, config)))
-    return sources, power, findings
+    return list(_join_topics(sources, config, findings)), power, findings
+
+
+def _join_topics(
+    sources: Sequence[TopicReadings], config: ReadConfig, findings: list[Finding]
+) -> Iterator[TopicReadings]:
+    """Yield of each role the first topic, and the rows of others outside the times of those before them.
+
+    A topic of another frame than the first is not used, with a finding: a role has one frame.
+    """
+    used: dict[Role, list[TopicReadings]] = {}
+    for source in sources:
+        before, log_time_ns = used.setdefault(source.role, []), source.readings.log_time_ns
+        has_one_place = source.role not in (*_WITHOUT_PLACE, *config.extrinsics)
+        if source.role == "power" or not before:
+            yield source
+        elif has_one_place and next(iter(source.frames), "") != next(iter(before[0].frames), ""):
+            names = {"role": source.role, "reason": "another-frame"}
+            findings.append(make_finding("topic-left-out", Subject("topic", source.topic), names=names))
+            continue
+        else:
+            times = [other.readings.log_time_ns for other in before if len(other.readings.row)]
+            overlaps = [(at_ns[0] <= log_time_ns) & (log_time_ns <= at_ns[-1]) for at_ns in times]
+            rows = np.flatnonzero(~np.any([np.zeros(len(log_time_ns), np.bool_), *overlaps], axis=0))
+            count = len(log_time_ns) - len(rows)
+            readings = source.readings.select(rows, dropped={"overlapping": count} if count else {})
+            yield replace(source, readings=readings)
+        before.append(source)
 
 
 def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:

@@ -249,6 +249,50 @@ def test_the_recipe_places_over_tf() -> None:
     np.testing.assert_allclose(found.sensors["gnss"].quat_xyzw, [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
 
 
+def renamed(at: int, *, until: int, child: str = "base_link") -> MemoryLog:
+    """Return the log of a husky whose odometry has another name from row ``at`` on; the first ends at row ``until``."""
+    topics = husky()
+    (kind, whole), (_, other) = topics.pop("/husky_velocity_controller/odom"), odometry(child=child)
+    topics |= {"/odom": (kind, whole.slice(0, until)), "/platform/odom": (kind, other.slice(at))}
+    log = MemoryLog(topics)
+    for name in ("/odom", "/platform/odom"):
+        stamp_ns = topics[name][1]["log_time_ns"].to_numpy()
+        log.topics[name] = replace(log.topics[name], start_ns=int(stamp_ns[0]), end_ns=int(stamp_ns[-1]))
+    return log
+
+
+def test_an_odometry_that_is_renamed_during_the_log_is_one_stream() -> None:
+    found, whole = read(renamed(200, until=200)), read(husky())
+    assert found.tables["wheel_odometry"].equals(whole.tables["wheel_odometry"])
+    assert set(found.sensors["wheel_odometry"].topic.split(" + ")) == {"/odom", "/platform/odom"}
+    assert found.sensors["wheel_odometry"].xyz_m == whole.sensors["wheel_odometry"].xyz_m
+
+
+@pytest.mark.parametrize("names", [["/odom", "/platform/odom"], ["/platform/odom", "/odom"]])
+def test_of_two_topics_named_for_one_role_the_first_is_used_where_both_have_messages(names: list[str]) -> None:
+    log = renamed(200, until=250)
+    found = read(log, topics={"wheel_odometry": names})
+    assert found.tables["wheel_odometry"].num_rows == 500
+    (unused,) = select_findings(found.report.findings, "messages-unused")
+    assert (unused.names["topic"], unused.names["reasons"], unused.numbers["overlapping_count"]) == (
+        names[1],
+        "overlapping",
+        50,
+    )
+
+
+def test_two_frames_are_not_joined_unless_the_recipe_states_one_place() -> None:
+    log = renamed(200, until=200, child="camera")
+    found = read(log, topics={"wheel_odometry": ["/odom", "/platform/odom"]})
+    assert found.tables["wheel_odometry"].num_rows == 200
+    (unused,) = select_findings(found.report.findings, "topic-left-out")
+    assert (unused.subject.name, unused.names["reason"]) == ("/platform/odom", "another-frame")
+    placed = read(
+        log, topics={"wheel_odometry": ["/odom", "/platform/odom"]}, extrinsics={"wheel_odometry": Extrinsics()}
+    )
+    assert placed.tables["wheel_odometry"].num_rows == 500
+
+
 def test_missing_gnss_and_power_are_warnings() -> None:
     found = read({"/odom": odometry()})
     assert set(found.tables) == {"wheel_odometry"}
