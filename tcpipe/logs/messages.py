@@ -58,15 +58,14 @@ class Readings:
     own_time_ns: Ints | None = None
     """Time that the measurement itself carries (NMEA), as `read_header_ns`."""
 
-    def select(self, rows: Ints | slice, *, dropped: Mapping[str, int] = MappingProxyType({})) -> Readings:
-        """Return some of the rows; ``dropped`` counts the others by reason."""
+    def select(self, rows: Ints | Mask | slice) -> Readings:
+        """Return some of the rows."""
         return replace(
             self,
             row=self.row[rows],
             log_time_ns=self.log_time_ns[rows],
             header_ns=None if self.header_ns is None else self.header_ns[rows],
             columns={name: values[rows] for name, values in self.columns.items()},
-            dropped={**self.dropped, **dropped},
             own_time_ns=None if self.own_time_ns is None else self.own_time_ns[rows],
         )
 

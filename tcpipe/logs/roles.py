@@ -121,7 +121,6 @@ class _Decisions:
     ambiguous: list[str] = field(default_factory=list)
     choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
     undecided: set[str] = field(default_factory=set)
-    findings: list[Finding] = field(default_factory=list)
 
     def pass_over(self, role: str, topic: Topic, why: str, reason: str) -> None:
         """Leave a candidate out, for a reason that is one word or several in kebab case."""
@@ -205,7 +204,6 @@ def assign_roles(
             *find_missing_roles({*decided.roles, *decided.undecided}),
             *find_left_out(decided.passed_over),
             *proposed,
-            *decided.findings,
             *find_undecodable(listed.values(), {type_name for types in decided.types.values() for type_name in types}),
         ),
         decided.choices,
@@ -282,10 +280,6 @@ def _collect_own_velocities(decided: _Decisions, topics: Iterable[Topic], ignore
     return [((rank(topic.type_name),), "", topic) for topic in both if _is_usable(decided, topic, ignored)]
 
 
-_MAX_OVERLAP_FRACTION = 0.5
-"""Largest common time of topics that the recipe names for one role, as a fraction of the shorter one: the rest of it is used."""
-
-
 def _take_chosen(
     decided: _Decisions, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]], mapped: Collection[str]
 ) -> None:
@@ -294,16 +288,8 @@ def _take_chosen(
             decided.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
             continue
         present = [name for name in names if name in topics]
-        sent = [topics[name] for name in present if topics[name].message_count != 0]
-        joined = select_successive(sent, max_overlap_fraction=_MAX_OVERLAP_FRACTION)
-        wanted = present if role == "power" else [topic.name for topic in joined] or present[:1]
-        for topic in sent if wanted else ():
-            if topic.name not in wanted:
-                decided.left_out[topic.name] = f"read.topics.{role} names {wanted[0]} first"
-                remedies = suggest("use", {"read.topics": {role: [topic.name]}})
-                names_used = {"role": role, "used": " + ".join(wanted)}
-                subject = Subject("topic", topic.name)
-                decided.findings.append(make_finding("topic-overlaps", subject, names=names_used, remedies=remedies))
+        usable = [name for name in present if _fits(decided, topics[name], role, mapped)]
+        wanted = present if role == "power" else usable or present[:1]
         missing = [name for name in names if name not in topics]
         if missing and (role == "power" or not present):
             decided.undecided.add(role)
@@ -321,6 +307,12 @@ def _take_chosen(
                 decided.problems.append(f"recipe read.topics.{role}: {name} cannot be read: {topics[name].problem}")
         if wanted:
             decided.roles[role] = PlayedRole(role, tuple(wanted), topics[wanted[0]].type_name, "set in the recipe")
+
+
+def _fits(decided: _Decisions, topic: Topic, role: str, mapped: Collection[str]) -> bool:
+    """Whether a topic has messages that can be read and are of a type for the role."""
+    has_type = topic.type_name in decided.types[role] or role in mapped
+    return has_type and topic.problem is None and topic.message_count != 0
 
 
 def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> bool:

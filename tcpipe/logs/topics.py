@@ -204,25 +204,17 @@ def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_po
     )
 
 
-def select_successive(topics: Sequence[Topic], *, max_overlap_fraction: float = 0.0) -> list[Topic]:
-    """Return the first topic, and each other that overlaps none of those before it for longer than a fraction of the shorter one.
-
-    The index of a bag gives times of chunks: topics that follow each other seem to overlap there.
-    """
+def select_successive(topics: Sequence[Topic]) -> list[Topic]:
+    """Return the first topic, and each other that ends before those in front of it begin, or begins after they end."""
     used = list(topics[:1])
     for topic in topics[1:]:
-        if all(_compute_overlap(topic, other) <= max_overlap_fraction for other in used):
+        if all(_ends_before(topic, other) or _ends_before(other, topic) for other in used):
             used.append(topic)
     return used
 
 
-def _compute_overlap(one: Topic, other: Topic) -> float:
-    """Return the common time of two topics as a fraction of the shorter one, 1 if it is unknown."""
-    if one.start_ns is None or one.end_ns is None or other.start_ns is None or other.end_ns is None:
-        return 1.0
-    common_ns = min(one.end_ns, other.end_ns) - max(one.start_ns, other.start_ns)
-    shorter_ns = min(one.end_ns - one.start_ns, other.end_ns - other.start_ns)
-    return common_ns / max(shorter_ns, 1) if common_ns > 0 else float(common_ns == 0)
+def _ends_before(one: Topic, other: Topic) -> bool:
+    return one.end_ns is not None and other.start_ns is not None and one.end_ns < other.start_ns
 
 
 def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:

@@ -6,7 +6,7 @@ A sensor's extrinsics come from the recipe, from static transforms, or are assum
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import cast, get_args
 
@@ -56,6 +56,11 @@ class TopicReadings:
         """Its identity: one topic may hold positions and velocities."""
         return f"{self.topic} ({self.role})" if self.role == "gnss_velocity" else self.topic
 
+    @property
+    def frame(self) -> str:
+        """The frame that its first messages name, "" without one."""
+        return next(iter(self.frames), "")
+
 
 def read_sources(
     messages: dict[str, Arrays],
@@ -101,34 +106,36 @@ def read_sources(
         seen_frames = count_frames(columns, types[topic])
         source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
         sources.append(replace(source, readings=_apply_recipe(source, config)))
-    return list(_join_topics(sources, config, findings)), power, findings
+    return _join_topics(sources, config, findings), power, findings
 
 
-def _join_topics(
-    sources: Sequence[TopicReadings], config: ReadConfig, findings: list[Finding]
-) -> Iterator[TopicReadings]:
-    """Yield of each role the first topic, and the rows of others outside the times of those before them.
+def _join_topics(sources: Sequence[TopicReadings], config: ReadConfig, findings: list[Finding]) -> list[TopicReadings]:
+    """Return of each role the first topic, and what others in its frame measured while those in front of them had no messages.
 
-    A topic of another frame than the first is not used, with a finding: a role has one frame.
+    A role has one frame and one place. Findings are added on topics that are not used, or in part.
     """
-    used: dict[Role, list[TopicReadings]] = {}
+    joined: dict[Role, list[TopicReadings]] = {}
     for source in sources:
-        before, log_time_ns = used.setdefault(source.role, []), source.readings.log_time_ns
-        has_one_place = source.role not in (*_WITHOUT_PLACE, *config.extrinsics)
-        if source.role == "power" or not before:
-            yield source
-        elif has_one_place and next(iter(source.frames), "") != next(iter(before[0].frames), ""):
-            names = {"role": source.role, "reason": "another-frame"}
-            findings.append(make_finding("topic-left-out", Subject("topic", source.topic), names=names))
-            continue
+        before, role, subject = joined.setdefault(source.role, []), source.role, Subject("topic", source.topic)
+        if role == "power" or not before:
+            before.append(source)
+        elif role not in (*_WITHOUT_PLACE, *config.extrinsics) and source.frame != before[0].frame:
+            names = {"role": role, "reason": "another-frame"}
+            findings.append(make_finding("topic-left-out", subject, names=names))
         else:
-            times = [other.readings.log_time_ns for other in before if len(other.readings.row)]
-            overlaps = [(at_ns[0] <= log_time_ns) & (log_time_ns <= at_ns[-1]) for at_ns in times]
-            rows = np.flatnonzero(~np.any([np.zeros(len(log_time_ns), np.bool_), *overlaps], axis=0))
-            count = len(log_time_ns) - len(rows)
-            readings = source.readings.select(rows, dropped={"overlapping": count} if count else {})
-            yield replace(source, readings=readings)
-        before.append(source)
+            at_ns = source.readings.log_time_ns
+            overlaps = np.zeros(len(at_ns), np.bool_)
+            for first_ns, last_ns in (
+                other.readings.log_time_ns[[0, -1]] for other in before if len(other.readings.row)
+            ):
+                overlaps |= (at_ns >= first_ns) & (at_ns <= last_ns)
+            if count := int(overlaps.sum()):
+                names = {"role": role, "used": before[0].topic}
+                remedies = suggest("use", {"read.topics": {role: [source.topic]}})
+                numbers = {"overlapping_count": count, "messages_count": source.messages}
+                findings.append(make_finding("topic-overlaps", subject, names=names, remedies=remedies, **numbers))
+            before.append(replace(source, readings=source.readings.select(~overlaps)))
+    return [source for topics in joined.values() for source in topics]
 
 
 def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
@@ -139,7 +146,7 @@ def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
     if role == "imu":
         return convert_imu_to_si(readings, config.imu_units)
     if role == "gnss_velocity" and role not in config.topics:
-        return select_ground_velocity(readings, next(iter(source.frames), ""), source.topic)
+        return select_ground_velocity(readings, source.frame, source.topic)
     return scale_odometry(readings, config.odometry_scale[role]) if role in config.odometry_scale else readings
 
 
@@ -203,7 +210,7 @@ def place_sensors(
 ) -> tuple[dict[str, Sensor], list[Finding]]:
     """Return each role's sensor, and findings: frames that nothing places, topics with several frames."""
     of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
-    frame_of = {role: next(iter(found[0].frames), "") for role, found in of_role.items() if found}
+    frame_of = {role: found[0].frame for role, found in of_role.items() if found}
     sensors: dict[str, Sensor] = {}
     findings: list[Finding] = []
     for role, (pose, placed_by) in place_frames(log, tables, assignment, frame_of, config).items():

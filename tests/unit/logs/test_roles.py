@@ -222,18 +222,6 @@ def test_a_topic_that_is_renamed_during_the_log_is_used_under_both_names(role, k
         assert played(chosen)[role] == names
 
 
-def test_of_topics_named_for_one_role_those_that_overlap_in_time_are_said() -> None:
-    log = [during("/front/fix", FIX, 0, 60), during("/rear/fix", FIX, 0.1, 60), during("/late/fix", FIX, 60.1, 90)]
-    found = assign_roles([*log, during("/odom", ODOMETRY, 0, 90)], {"gnss": [topic.name for topic in log]})
-    assert played(found)["gnss"] == ("/front/fix", "/late/fix")
-    (finding,) = select_findings(found.findings, "topic-overlaps")
-    assert (finding.subject.name, finding.names["used"]) == ("/rear/fix", "/front/fix + /late/fix")
-    (remedy,) = finding.remedies
-    chosen = assign_roles([*log, during("/odom", ODOMETRY, 0, 90)], remedy.recipe["read.topics"])
-    assert played(chosen)["gnss"] == ("/rear/fix",)
-    assert not select_findings(chosen.findings, "topic-overlaps")
-
-
 def test_a_named_topic_without_messages_leaves_the_role_to_the_next() -> None:
     log = [topic("/front/fix", FIX, 0), topic("/rear/fix", FIX), topic("/odom", ODOMETRY)]
     assert played(assign_roles(log, {"gnss": ["/front/fix", "/rear/fix"]}))["gnss"] == ("/rear/fix",)

@@ -273,12 +273,12 @@ def test_of_two_topics_named_for_one_role_the_first_is_used_where_both_have_mess
     log = renamed(200, until=250)
     found = read(log, topics={"wheel_odometry": names})
     assert found.tables["wheel_odometry"].num_rows == 500
-    (unused,) = select_findings(found.report.findings, "messages-unused")
-    assert (unused.names["topic"], unused.names["reasons"], unused.numbers["overlapping_count"]) == (
-        names[1],
-        "overlapping",
-        50,
-    )
+    (unused,) = select_findings(found.report.findings, "topic-overlaps")
+    assert (unused.subject.name, unused.names["used"], unused.numbers["overlapping_count"]) == (names[1], names[0], 50)
+    (remedy,) = unused.remedies
+    other = read(log, topics=remedy.recipe["read.topics"])
+    assert other.sensors["wheel_odometry"].topic == names[1]
+    assert not select_findings(other.report.findings, "topic-overlaps")
 
 
 def test_two_frames_are_not_joined_unless_the_recipe_states_one_place() -> None:
