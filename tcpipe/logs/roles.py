@@ -288,8 +288,9 @@ def _take_chosen(
             decided.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
             continue
         present = [name for name in names if name in topics]
-        usable = [name for name in present if _fits(decided, topics[name], role, mapped)]
-        wanted = present if role == "power" else usable or present[:1]
+        readable = [name for name in present if topics[name].problem is None and topics[name].message_count != 0]
+        fits = [name for name in readable if topics[name].type_name in decided.types[role] or role in mapped]
+        wanted = present if role == "power" else fits or present[:1]
         missing = [name for name in names if name not in topics]
         if missing and (role == "power" or not present):
             decided.undecided.add(role)
@@ -307,12 +308,6 @@ def _take_chosen(
                 decided.problems.append(f"recipe read.topics.{role}: {name} cannot be read: {topics[name].problem}")
         if wanted:
             decided.roles[role] = PlayedRole(role, tuple(wanted), topics[wanted[0]].type_name, "set in the recipe")
-
-
-def _fits(decided: _Decisions, topic: Topic, role: str, mapped: Collection[str]) -> bool:
-    """Whether a topic has messages that can be read and are of a type for the role."""
-    has_type = topic.type_name in decided.types[role] or role in mapped
-    return has_type and topic.problem is None and topic.message_count != 0
 
 
 def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> bool:

@@ -206,10 +206,10 @@ def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_po
 
 def select_successive(topics: Sequence[Topic]) -> list[Topic]:
     """Return the first topic, and each other that ends before those in front of it begin, or begins after they end."""
-    used = list(topics[:1])
-    for topic in topics[1:]:
-        if all(_ends_before(topic, other) or _ends_before(other, topic) for other in used):
-            used.append(topic)
+    used: list[Topic] = []
+    for one in topics:
+        if all(_ends_before(one, other) or _ends_before(other, one) for other in used):
+            used.append(one)
     return used
 
 

@@ -110,11 +110,6 @@ def find_command_changes(rows: MotionRows, *, step_mps: float, window_s: float, 
     return make_mask(np.array(spans, dtype=np.int64).reshape(-1, 2), len(command))
 
 
-def find_unknown_commands(rows: MotionRows, *, before_s: float) -> Mask:
-    """Return rows without a known command, and those up to ``before_s`` [s] before them."""
-    return dilate_mask(np.isnan(rows.commanded_mps), rows.piece, before=rows.count(before_s), after=0)
-
-
 def _estimate_jitter(command: Floats, part: NDArray[np.int64], window: int) -> Floats:
     """Return what row-to-row scatter leaves in the difference of the means after and before each row, [m/s], shape (N,)."""
     square = np.concatenate((np.zeros(min(len(command), 1)), 0.5 * np.diff(command) ** 2))

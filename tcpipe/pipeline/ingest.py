@@ -12,7 +12,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pyarrow as pa
 
 from tcpipe import __version__
@@ -52,6 +51,7 @@ from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.recipe import TimeWindow
 from tcpipe.store import Store, open_store
+from tcpipe.tables.arrays import encode_rows
 from tcpipe.tables.findings import select_problems
 from tcpipe.tables.options import as_function
 
@@ -424,7 +424,7 @@ def _describe_elsewhere(state: State, run_id: str, source: LogSource) -> str:
 def _compute_shared_fraction(store: Store, older: str, newer: str) -> float:
     """Return the share of a run's measurements that another has too."""
     shared = every = 0
-    mine_of, theirs_of = _find_stream_files(store, older), _find_stream_files(store, newer)
+    mine_of, theirs_of = store.find_stream_files(older), store.find_stream_files(newer)
     for role, path in mine_of.items():
         try:
             mine, theirs = read_table(path), read_table(theirs_of[role]) if role in theirs_of else None
@@ -435,21 +435,9 @@ def _compute_shared_fraction(store: Store, older: str, newer: str) -> float:
     return shared / every if every else 0.0
 
 
-def _find_stream_files(store: Store, run_id: str) -> Mapping[str, Path]:
-    with suppress(StoreError):
-        known = store.run_json(run_id)
-        return store.stream_files(run_id, known) if known else {}
-    return {}
-
-
 def _count_shared_rows(mine: pa.Table, theirs: pa.Table) -> int:
     """Count the rows of one table that are in the other: recorded at one instant with the same values."""
     floating = [field.name for field in mine.schema if pa.types.is_floating(field.type)]
     names = ["log_time_ns", *(name for name in floating if name in theirs.column_names)]
-    others = set(_read_rows(theirs, names))
-    return sum(row in others for row in _read_rows(mine, names))
-
-
-def _read_rows(table: pa.Table, names: Sequence[str]) -> list[bytes]:
-    columns = [np.asarray(table.column(name)).view(np.int64) for name in names]
-    return [row.tobytes() for row in np.column_stack(columns)]
+    others = set(encode_rows(theirs, names))
+    return sum(row in others for row in encode_rows(mine, names))

@@ -11,7 +11,7 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.motion import masks
 from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
-from tcpipe.motion.row_sections import Floats, Mask, MotionRows, number_pieces
+from tcpipe.motion.row_sections import Floats, Mask, MotionRows, dilate_mask, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m, find_common_scale_std
 from tcpipe.recipe import MaskConfig, TimeWindow
 from tcpipe.recipe.suggestions import suggest
@@ -137,7 +137,8 @@ def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Ma
         rows, step_mps=config.command_step_mps, window_s=config.command_window_s, settle_s=config.command_settle_s
     )
     beside = masks.find_ramps(rows, slope, halted, above_mps2=config.ramp_acceleration_mps2, min_s=config.min_event_s)
-    unknown = masks.find_unknown_commands(rows, before_s=config.command_settle_s)
+    unknown = np.isnan(rows.commanded_mps)
+    unknown = dilate_mask(unknown, rows.piece, before=rows.count(config.command_settle_s), after=0)
     return changed | (lasting & unknown) | beside
 
 

@@ -56,11 +56,6 @@ class TopicReadings:
         """Its identity: one topic may hold positions and velocities."""
         return f"{self.topic} ({self.role})" if self.role == "gnss_velocity" else self.topic
 
-    @property
-    def frame(self) -> str:
-        """The frame that its first messages name, "" without one."""
-        return next(iter(self.frames), "")
-
 
 def read_sources(
     messages: dict[str, Arrays],
@@ -119,7 +114,7 @@ def _join_topics(sources: Sequence[TopicReadings], config: ReadConfig, findings:
         before, role, subject = joined.setdefault(source.role, []), source.role, Subject("topic", source.topic)
         if role == "power" or not before:
             before.append(source)
-        elif role not in (*_WITHOUT_PLACE, *config.extrinsics) and source.frame != before[0].frame:
+        elif role not in (*_WITHOUT_PLACE, *config.extrinsics) and [*source.frames][:1] != [*before[0].frames][:1]:
             names = {"role": role, "reason": "another-frame"}
             findings.append(make_finding("topic-left-out", subject, names=names))
         else:
@@ -146,7 +141,7 @@ def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
     if role == "imu":
         return convert_imu_to_si(readings, config.imu_units)
     if role == "gnss_velocity" and role not in config.topics:
-        return select_ground_velocity(readings, source.frame, source.topic)
+        return select_ground_velocity(readings, next(iter(source.frames), ""), source.topic)
     return scale_odometry(readings, config.odometry_scale[role]) if role in config.odometry_scale else readings
 
 
@@ -210,7 +205,7 @@ def place_sensors(
 ) -> tuple[dict[str, Sensor], list[Finding]]:
     """Return each role's sensor, and findings: frames that nothing places, topics with several frames."""
     of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
-    frame_of = {role: found[0].frame for role, found in of_role.items() if found}
+    frame_of = {role: next(iter(found[0].frames), "") for role, found in of_role.items() if found}
     sensors: dict[str, Sensor] = {}
     findings: list[Finding] = []
     for role, (pose, placed_by) in place_frames(log, tables, assignment, frame_of, config).items():
