@@ -95,7 +95,7 @@ def compute_median_period_ns(stamp_ns: Ints) -> int:
 
 
 def compute_window_means(stamp_ns: Ints, values: Floats, at_ns: Ints, window_ns: int) -> Floats:
-    """Return the means of the samples (N, k) within half a window of each stamp, shape (M, k); NaN where there are none."""
+    """Return the means of the samples (N, k) within half a window of each stamp, shape (M, k); NaN without samples."""
     first = np.searchsorted(stamp_ns, at_ns - window_ns // 2, "left")
     last = np.searchsorted(stamp_ns, at_ns + window_ns // 2, "right")
     count = np.where(last > first, (last - first).astype(np.float64), np.nan)

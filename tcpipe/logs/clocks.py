@@ -55,10 +55,8 @@ CLOCK = "rosgraph_msgs/msg/Clock"
 _FEWEST_IN_BIN = 4
 _FEWEST_REGULAR = 2
 _ABOUT_TWICE = 0.5
-_MOST_BINS = 2_000_000
-"""Of half a second: eleven days."""
+_MOST_BINS = 2_000_000  # of half a second: eleven days
 _MOSTLY = 0.5
-_BACK_NS = 1_000_000_000
 _MAX_BACKWARD_FRACTION = 0.01
 """Largest share of headers of a simulation that may be more than 1 s before an earlier one."""
 LOG_CLOCK = Subject("log", "clock")
@@ -68,7 +66,7 @@ LOG_CLOCK = Subject("log", "clock")
 class TopicTimes:
     """A topic's times in log-time order: log time and header stamp [ns], shape (N,), the header's 0 where unset.
 
-    ``content``, columns of shape (N,), tells an exact duplicate from a repeated stamp; ``prefer`` and ``offset_ns`` are the recipe's.
+    ``content``, columns of shape (N,), distinguishes duplicates from repeated stamps; ``prefer`` and ``offset_ns`` are the recipe's.
     """
 
     log_time_ns: Ints
@@ -100,7 +98,7 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedClock:
-    """What the simulation's clock told at which log time: both [ns], shape (N,), both rising; and which topics count it."""
+    """Log times and simulation times of messages [ns], shape (N,), both rising, and the topics that count the simulation time."""
 
     log_time_ns: Ints
     clock_ns: Ints
@@ -138,7 +136,7 @@ class AlignedClocks:
 
 
 def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> AlignedClocks:
-    """Return the timeline of each topic that plays a role, and what the clocks did; ``clock_published``: /clock has messages."""
+    """Return the timeline of each topic that is used, and the clock steps; ``clock_published``: /clock has messages."""
     stamped = {
         name: (topic.log_time_ns, topic.header_ns)
         for name, topic in topics.items()
@@ -200,7 +198,7 @@ def _bring_to_log_clock(times: TopicTimes) -> Ints:
 def _settle_after_setting_back(
     topics: Mapping[str, TopicTimes], spans: Sequence[tuple[int, int, float]]
 ) -> AlignedClocks:
-    """Return the timelines without what lies in times that the clock passed twice: what of it is earlier nobody can tell."""
+    """Return the timelines without messages of times that the clock passed twice, since their order is unknown."""
     kept = {
         name: np.flatnonzero(~np.any([(a <= topic.log_time_ns) & (topic.log_time_ns < b) for a, b, _ in spans], axis=0))
         for name, topic in topics.items()
@@ -461,7 +459,7 @@ def _find_leaps(times: TopicTimes, known: Mask) -> Mask:
 
 
 def _find_reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
-    """Return the offset [ns] that most topics with header time share in an epoch; 0 where there is none.
+    """Return the offset [ns] that most topics with header time share in an epoch; 0 without one.
 
     Among equally large groups the one nearest to the log's clock is taken.
     """
@@ -550,5 +548,5 @@ def _is_timed(header_ns: Ints) -> bool:
 
 def _is_counting_clock(header_ns: Ints, *, published: bool) -> bool:
     """Whether headers count simulated time that runs forward."""
-    back = np.maximum.accumulate(header_ns) - header_ns > _BACK_NS
+    back = np.maximum.accumulate(header_ns) - header_ns > SECOND_NS
     return bool(np.mean(back) <= _MAX_BACKWARD_FRACTION and (published or np.median(header_ns) < SIMULATED_NS))

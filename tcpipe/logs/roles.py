@@ -1,8 +1,8 @@
-"""Which topic plays which role, decided from the topic list alone, and why; what cannot be decided is asked for with the recipe line.
+"""Assignment of topics to roles from the topic list alone, with the reason; tcpipe asks for a decision with the line of the recipe.
 
-Rules, in this order: the recipe; topics that are other estimators' outputs play no role (fusing them again would count a sensor twice);
-the message type; how the topic is called, unless a topic covers but a small share of what a rival covers. Where two topics are left that
-no rule tells apart, nobody guesses. Roles without a topic, topics that are left out and those that cannot be decoded are findings.
+Rules, in this order: the recipe; outputs of other estimators are not used (fusing them again would count a sensor twice); the message
+type; the name of the topic, unless the topic covers only a small part of what another covers; topics that follow each other are joined.
+If several topics remain, tcpipe asks. Roles without a topic and topics that are not used or cannot be decoded are findings.
 """
 
 from __future__ import annotations
@@ -108,15 +108,15 @@ class _Decisions:
     """The decisions while they are made."""
 
     types: Mapping[str, tuple[str, ...]]
-    """Message types that can play each role, best first."""
+    """Message types that fit each role, best first."""
     propulsion: Sequence[str]
-    """Those that tell propulsion apart, best first."""
+    """Message types that measure propulsion separately, best first."""
     refusals: Mapping[str, str]
-    """Those whose currents tell no power, and why."""
+    """Message types whose currents are not drawn from the battery, with the reason."""
     roles: dict[str, PlayedRole] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     passed_over: dict[tuple[str, str], str] = field(default_factory=dict)
-    """By role and topic, the reason why one that holds data was not taken, though nobody asked for that."""
+    """By role and topic, the reason why tcpipe does not use a topic that has data."""
     problems: list[str] = field(default_factory=list)
     ambiguous: list[str] = field(default_factory=list)
     choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -217,7 +217,7 @@ def _is_in(namespace: str | None, topic: Topic) -> bool:
 
 
 def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Collection[str]) -> None:
-    """Keep what the pose stands in for, and what it was made from, out of what is fused."""
+    """Exclude GNSS, which the pose replaces, and the roles that the pose was computed from."""
     pose = decided.roles["pose"].topics[0]
     for role in ("gnss", *pose_sources):
         if role in decided.roles:
@@ -229,7 +229,7 @@ def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Co
 
 
 def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> None:
-    """Let a pose made elsewhere play, where its name clearly says so, there is one such, and nothing else tells a position."""
+    """Use the pose of another program if its name identifies it, it is the only one, and no other topic measures positions."""
     best = [] if taken else _select_best("pose", candidates) if candidates else []
     for _, why, topic in candidates:
         if [topic] == [other for _, other in best]:
@@ -246,7 +246,7 @@ _NO_FIXES = "it needs the fixes of its receiver, and no topic is used as gnss"
 
 
 def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
-    """Let the velocity play that comes from the receiver of the fixes; one that nobody can tell to be of it stays out, and is said."""
+    """Use the velocity of the receiver of the fixes; a velocity of an unknown receiver is not used, with a finding."""
     fixes = decided.roles["gnss"].topics[0] if "gnss" in decided.roles else ""
     receiver = fixes.rpartition("/")[0]
     near = [(rank, why, topic) for rank, why, topic in candidates if topic.name.rpartition("/")[0] == receiver]
@@ -269,7 +269,7 @@ def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
 
 
 def _collect_own_velocities(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
-    """Return the topics of NMEA sentences, which may tell places and velocities at once, and the fixes that do."""
+    """Return the topics of NMEA sentences and of fixes that contain positions and velocities."""
     fixes = decided.roles["gnss"].topics if "gnss" in decided.roles else ()
     both = [
         topic
@@ -336,7 +336,7 @@ _FUSED = re.compile(
 )
 _FUSED_FIXES = re.compile(r"filtered|fused|fusion|ekf|ukf|truth")
 _SLAM = re.compile(r"icp$|slam|loam|lego_?loam|(fast)?_?lio|liosam|cartographer|hector$|kiss$")
-"""Poses from a laser, matched scan by scan: what is told by nothing else in the log."""
+"""Poses from a laser, matched scan by scan, which no other topic of the log contains."""
 _OF_GNSS = re.compile(r"gps|gnss|navsat|fix$|utm|ublox|novatel|septentrio|rtk")
 _VISUAL = re.compile(
     r"zed|visual|vo$|vio$|svo|rtabmap|orb$|orbslam|stereo|camera|cam$|realsense|t265|rgbd|vins|mono|okvis|vslam"
@@ -452,7 +452,7 @@ _DRIVES = re.compile(r"drive|motor|wheel|traction")
 
 
 def _sort_power(decided: _Decisions, topic: Topic) -> Sorted:
-    """Rank: messages that tell propulsion apart, then what hangs on the drives, then whole batteries."""
+    """Rank messages that measure propulsion separately first, then currents of the drives, then whole batteries."""
     if topic.type_name in decided.refusals:
         return None, (), f"its type {decided.refusals[topic.type_name]}"
     if topic.type_name in decided.propulsion:

@@ -57,15 +57,14 @@ from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
 
-_TOGETHER_S = 1.0
-"""What ends within so long is one commit."""
+_TOGETHER_S = 1.0  # results of this time share a commit
 
 _NO_LOGS = "no logs given; expected .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
 
 
 @dataclass(frozen=True, slots=True)
 class IngestSummary:
-    """What became of every log, in the order given; ``exit_code`` is the contract's."""
+    """Results of the logs in the order given; ``exit_code`` is the contract's."""
 
     store: Path | str
     results: tuple[IngestResult, ...] = field(default_factory=tuple)
@@ -150,8 +149,7 @@ ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
-_MOST_RUNS = 5
-"""So many runs are named."""
+_MOST_RUNS = 5  # named in one message
 
 
 def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> None:
@@ -168,7 +166,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
 def find_broken(store: Store, state: State, sources: Iterable[LogSource]) -> set[tuple[str, str]]:
     """Return the ingestions of what these logs hold or held of which a file is gone.
 
-    In a bucket nobody looks, as that takes a request for every thousand files.
+    Stores in buckets are not searched, which would need a request for every thousand files.
     """
     if store.place.path is None:
         return set()

@@ -50,7 +50,7 @@ class Fused:
 
 
 def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
-    """Fuse each section for itself, in order of epoch and stamp."""
+    """Fuse each section separately, in order of epoch and stamp."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
     for section in cut_sections(inputs.measurements, inputs.cuts_ns):

@@ -161,7 +161,7 @@ class SpeedLimit:
 
 
 def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
-    """Return the limit of a run, of a robot whose profile says ``max_velocity_mps`` [m/s]; the recipe's goes first."""
+    """Return the limit of a run, of a robot whose profile states ``max_velocity_mps`` [m/s]; the recipe has priority."""
     top, held = masks.find_top_command(
         rows,
         moving_above_mps=config.turning_velocity_mps,
@@ -184,7 +184,7 @@ def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: 
 
 
 def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: MaskConfig) -> Iterator[Finding]:
-    """Yield the findings on commands: that there are none, they fall silent, no limit is known, or most was driven below it."""
+    """Yield the findings on commands: none or silent, unknown limit, most of the drive below the limit."""
     commanded, moving = np.isfinite(rows.commanded_mps), np.abs(rows.velocity_mps) > config.turning_velocity_mps
     if not commanded.any():
         yield make_finding("no-command", _COMMAND)

@@ -7,7 +7,7 @@ A sensor's extrinsics come from the recipe, from static transforms, or are assum
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import cast, get_args
 
 import numpy as np
@@ -30,8 +30,8 @@ from tcpipe.logs.messages import (
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic, make_topic_not_decoded
 from tcpipe.power.readings import PowerReadings
-from tcpipe.recipe import Extrinsics, ReadConfig, Role
-from tcpipe.recipe.suggestions import suggest
+from tcpipe.recipe import ReadConfig, Role
+from tcpipe.recipe.suggestions import make_place_to_measure, suggest
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import Arrays, LogReader, read_transforms
 from tcpipe.stages.read_power import read_power_of_topics, select_power_rows
@@ -216,7 +216,7 @@ def place_sensors(
             findings.append(make_finding("several-frames", subject, names=names, frames_count=len(several)))
         if placed_by == "assumed":
             names = {"frame": frame or "the sensor", "topic": of_role[role][0].topic}
-            remedies = suggest("place", {"read.extrinsics": {role: asdict(Extrinsics())}})
+            remedies = suggest("place", {"read.extrinsics": {role: make_place_to_measure(role)}})
             findings.append(make_finding("sensor-not-placed", subject, names=names, remedies=remedies))
         sensors[role] = Sensor(
             topic=" + ".join(source.topic for source in of_role[role]),

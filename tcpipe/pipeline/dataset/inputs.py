@@ -179,7 +179,7 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 
 
 def read_earlier_splits(dataset: str | Path) -> pa.Table:
-    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` if it is none."""
+    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` for another path."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     if read_card(directory).redaction is not None:
         raise DatasetError(
@@ -276,15 +276,11 @@ def _format_value(value: object) -> str:
 _SAME_TIME_NS = 1_000_000_000
 _SAME_PLACE_M = 2.0
 _SAME_DRIVE = 0.5
-"""Where so large a share of two runs is together, to the second and in place, their clocks may differ by a constant."""
-
+"""If this fraction of two runs overlaps in time and place, a constant offset between their clocks is removed."""
 _METRES_PER_DEG = 111_320.0
+_NEVER_NS = 2**61  # later than any time [ns since 1970]; twice of it still fits an int64
 
-_NEVER_NS = 2**61
-"""Beyond any time [ns since 1970], and twice of it is an integer still."""
-
-_WAYS = 64
-"""So many ways are held at once."""
+_WAYS = 64  # most runs whose positions are in memory
 
 Mask = NDArray[np.bool_]
 

@@ -13,10 +13,11 @@ from made_tracks import with_columns
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import RecipeError, RoleError
-from tcpipe.formats.recipe_toml import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_recipe, parse_toml
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import Extrinsics, ReadConfig
+from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_power import select_power_rows
 from tcpipe.tables.findings import select_findings
@@ -239,7 +240,15 @@ def test_a_latched_tf_places_what_tf_static_does_not() -> None:
     assert found.sensors["imu"].placed_by == "assumed"
     (unplaced,) = select_findings(found.report.findings, "sensor-not-placed")
     assert (unplaced.subject.name, unplaced.names["frame"]) == ("imu", "imu_link")
-    assert "xyz_m" in unplaced.remedies[0].recipe["read.extrinsics"]["imu"]
+    line = RecipeFragment(unplaced.remedies[0].recipe, is_checked=True).toml()
+    assert "xyz_m = [?, ?, ?]" in line
+    with pytest.raises(ValueError, match=r"line 2.*; measure it and write the value in place of \?"):
+        parse_toml(line)
+    assert parse_recipe(parse_toml(line.replace("?", "0.1")), where="measured").read.extrinsics["imu"].xyz_m == (
+        0.1,
+        0.1,
+        0.1,
+    )
 
 
 def test_the_recipe_places_over_tf() -> None:

@@ -137,6 +137,15 @@ def reseal(directory: Path, **values: object) -> None:
     (directory / "dataset.json").write_text(json.dumps({key: of for key, of in card.items() if of is not None}))
 
 
+def test_a_dataset_of_an_earlier_version_is_compared_by_what_its_card_tells(here):
+    reseal(here / "dataset", tcpipe_version="0.7.0", inputs="0" * 64)
+    assert refused(here, map_name="yard") == (OTHER["map_name"][1],)
+    assert refused(here, tags={}) == (OTHER["tags"][1],)
+    assert refused(here, tags={"weather": "wet"}) == ("--tag: weather=dry in the dataset, weather=wet now",)
+    assert build_dataset(here / "dataset", **usual(here)).status == "done"
+    assert read_card(here / "dataset").run_tags == {"weather": "dry"}
+
+
 def test_a_dataset_of_another_data_model_is_left_alone(here):
     reseal(here / "dataset", data_model_version="2.1")
     with pytest.raises(DatasetError, match="is not changed, because its inputs are unknown") as caught:
