@@ -353,6 +353,13 @@ class Store:
         except (TableError, StoreError):
             return None
 
+    def find_stream_files(self, run_id: str) -> dict[str, Path]:
+        """Return the files of L1 by role as `stream_files`; none if they are not there or not as they were written."""
+        with suppress(StoreError):
+            known = self.run_json(run_id)
+            return self.stream_files(run_id, known) if known else {}
+        return {}
+
     def stream_files(self, run_id: str, known: RunJson) -> dict[str, Path]:
         """Return the files of L1 on this machine by role, proved; `StoreError` if one is not as it was written."""
         place = self.runs_place.below(run_id)

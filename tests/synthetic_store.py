@@ -29,10 +29,13 @@ from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,
     MASKED_TRACK,
     REJECTIONS,
+    STREAMS,
     TRACK,
     Datum,
     LabelledSegments,
     MaskedTrack,
+    Sensor,
+    Streams,
     Track,
     TrackInfo,
 )
@@ -138,6 +141,7 @@ def add_run(
     tags=None,
     includes=(),
     facts=None,
+    streams=None,
 ):
     """Put a run with these segments, and this masked track, into the store, as ingestion would."""
     recipe = recipe or Recipe()
@@ -148,9 +152,10 @@ def add_run(
     identity = make_recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
     distance_by_reason_m = distance_by_reason_m or {"kept": metres, "stationary": 0.0, "accelerating": 2.5}
-    store.write_run_json(
-        run_id, RunJson(LogOrigin((f"/logs/{run_id}.mcap",), sha256 or run_id, 1), robot=None, sensors=sensors or {})
-    )
+    files = store.write_streams(run_id, streams, key="k") if streams else {}
+    sensors = sensors or (streams.sensors if streams else {})
+    origin = LogOrigin((f"/logs/{run_id}.mcap",), sha256 or run_id, 1)
+    store.write_run_json(run_id, RunJson(origin, robot=None, sensors=sensors, streams=files, streams_key="k"))
     manifest = Manifest(
         run_id=run_id,
         recipe_id=identity,
@@ -173,6 +178,25 @@ def add_run(
         labelled=LabelledSegments(table, info, distance_by_reason_m),
     )
     commit_run(store, run_id)
+
+
+def make_fixes(stamp_ns, *, drive=0, late_ns=0, topic="/fix"):
+    """Return streams of fixes at 5 Hz between two stamps: ``drive`` gives the values at each time, ``late_ns`` is a recorder's clock."""
+    time_ns = np.arange(stamp_ns[0] - late_ns, stamp_ns[1] - late_ns, 200_000_000) // 200_000_000 * 200_000_000
+    noise = np.array([np.random.default_rng([drive, at]).normal(size=3) for at in time_ns.tolist()])
+    known = {
+        "stamp_ns": time_ns + late_ns,
+        "log_time_ns": time_ns + late_ns,
+        "clock_epoch": np.zeros(len(time_ns), np.int16),
+    }
+    known |= dict(zip(("lon_deg", "lat_deg", "alt_m"), ([15.43, 47.07, 400.0] + 1e-7 * noise).T, strict=True))
+    rest = {
+        column.name: np.zeros(len(time_ns)) if pa.types.is_floating(column.dtype) else np.zeros(len(time_ns), np.int8)
+        for column in STREAMS["gnss"].columns
+        if column.name not in known
+    }
+    sensor = Sensor(topic, "sensor_msgs/msg/NavSatFix", "gps", "the only one", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    return Streams({"gnss": STREAMS["gnss"].table(**known, **rest)}, {"gnss": sensor}, "husky")
 
 
 def make_noise_facts():

@@ -16,7 +16,7 @@ from typing import Any
 from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import IngestSections, Recipe, TableMapping, TimeWindow
-from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
+from tcpipe.recipe.checking import TO_MEASURE, as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots import GENERIC, PowerSource, Profiles, Robot
 
 logger = logging.getLogger(__name__)
@@ -219,3 +219,6 @@ def parse_toml(text: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise ValueError("its values are nested too deep") from None
+    except tomllib.TOMLDecodeError as error:
+        hint = f"; measure it and write the value in place of {TO_MEASURE}" if f"[{TO_MEASURE}" in text else ""
+        raise ValueError(f"{error}{hint}") from None

@@ -11,6 +11,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
+_MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long
 
 
 def compute_seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
@@ -79,9 +80,13 @@ def find_longest_step_ns(stamp_ns: Ints, least_ns: int) -> int:
 
 
 def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
-    """Return the last value at or before each stamp, shape (M,); NaN before the first."""
+    """Return the last value at or before each stamp, shape (M,); NaN where it is older than 1 s and three periods, or none is known."""
+    if not values.size:
+        return np.full(at_ns.size, np.nan)
     index = np.searchsorted(stamp_ns, at_ns, "right") - 1
-    return np.where(index >= 0, values[np.maximum(index, 0)] if values.size else np.nan, np.nan)
+    last = np.maximum(index, 0)
+    is_known = (index >= 0) & (at_ns - stamp_ns[last] <= find_longest_step_ns(stamp_ns, _MIN_HOLD_NS))
+    return np.where(is_known, values[last], np.nan)
 
 
 def compute_median_period_ns(stamp_ns: Ints) -> int:
@@ -90,7 +95,7 @@ def compute_median_period_ns(stamp_ns: Ints) -> int:
 
 
 def compute_window_means(stamp_ns: Ints, values: Floats, at_ns: Ints, window_ns: int) -> Floats:
-    """Return the means of the samples (N, k) within half a window of each stamp, shape (M, k); NaN where there are none."""
+    """Return the means of the samples (N, k) within half a window of each stamp, shape (M, k); NaN without samples."""
     first = np.searchsorted(stamp_ns, at_ns - window_ns // 2, "left")
     last = np.searchsorted(stamp_ns, at_ns + window_ns // 2, "right")
     count = np.where(last > first, (last - first).astype(np.float64), np.nan)

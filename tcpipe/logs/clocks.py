@@ -36,7 +36,8 @@ APART_NS = SECOND_NS
 """Offsets closer than this are delays; topics further apart run on different clocks."""
 
 _LASTING_NS = 10 * SECOND_NS
-_MOST_BACK = 0.2
+_MAX_OTHER_LEVEL_FRACTION = 0.2
+"""Largest share of the messages of 10 s before or after a step that may be at the other level, since they are late."""
 _TOGETHER_NS = 5 * SECOND_NS
 _BIN_NS = SECOND_NS // 20
 _FEWEST = 3
@@ -54,11 +55,10 @@ CLOCK = "rosgraph_msgs/msg/Clock"
 _FEWEST_IN_BIN = 4
 _FEWEST_REGULAR = 2
 _ABOUT_TWICE = 0.5
-_MOST_BINS = 2_000_000
-"""Of half a second: eleven days."""
+_MOST_BINS = 2_000_000  # of half a second: eleven days
 _MOSTLY = 0.5
-_BACK_NS = 1_000_000_000
-_MOST_BACK = 0.01
+_MAX_BACKWARD_FRACTION = 0.01
+"""Largest share of headers of a simulation that may be more than 1 s before an earlier one."""
 LOG_CLOCK = Subject("log", "clock")
 
 
@@ -66,7 +66,7 @@ LOG_CLOCK = Subject("log", "clock")
 class TopicTimes:
     """A topic's times in log-time order: log time and header stamp [ns], shape (N,), the header's 0 where unset.
 
-    ``content``, columns of shape (N,), tells an exact duplicate from a repeated stamp; ``prefer`` and ``offset_ns`` are the recipe's.
+    ``content``, columns of shape (N,), distinguishes duplicates from repeated stamps; ``prefer`` and ``offset_ns`` are the recipe's.
     """
 
     log_time_ns: Ints
@@ -98,7 +98,7 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedClock:
-    """What the simulation's clock told at which log time: both [ns], shape (N,), both rising; and which topics count it."""
+    """Log times and simulation times of messages [ns], shape (N,), both rising, and the topics that count the simulation time."""
 
     log_time_ns: Ints
     clock_ns: Ints
@@ -136,7 +136,7 @@ class AlignedClocks:
 
 
 def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> AlignedClocks:
-    """Return the timeline of each topic that plays a role, and what the clocks did; ``clock_published``: /clock has messages."""
+    """Return the timeline of each topic that is used, and the clock steps; ``clock_published``: /clock has messages."""
     stamped = {
         name: (topic.log_time_ns, topic.header_ns)
         for name, topic in topics.items()
@@ -198,7 +198,7 @@ def _bring_to_log_clock(times: TopicTimes) -> Ints:
 def _settle_after_setting_back(
     topics: Mapping[str, TopicTimes], spans: Sequence[tuple[int, int, float]]
 ) -> AlignedClocks:
-    """Return the timelines without what lies in times that the clock passed twice: what of it is earlier nobody can tell."""
+    """Return the timelines without messages of times that the clock passed twice, since their order is unknown."""
     kept = {
         name: np.flatnonzero(~np.any([(a <= topic.log_time_ns) & (topic.log_time_ns < b) for a, b, _ in spans], axis=0))
         for name, topic in topics.items()
@@ -294,22 +294,37 @@ def _find_steps(times: TopicTimes) -> list[tuple[int, int]]:
     for j in (np.flatnonzero(np.abs(np.diff(level)) > STEP_NS // 2) + 1).tolist():
         if j < begin + _FEWEST or len(level) - j < _FEWEST:
             continue
-        before = level[max(begin, min(int(np.searchsorted(at, at[j] - _LASTING_NS)), j - _FEWEST)) : j]
-        after = level[j : max(int(np.searchsorted(at, at[j] + _LASTING_NS)), j + _FEWEST)]
+        start = max(begin, min(int(np.searchsorted(at, at[j] - _LASTING_NS)), j - _FEWEST))
+        before, after = level[start:j], level[j : max(int(np.searchsorted(at, at[j] + _LASTING_NS)), j + _FEWEST)]
         low, high = np.median(before), np.median(after)
-        step = int(high - low)
+        step, middle = int(high - low), (low + high) / 2
         # The very row must take the step (not one near it), and both levels must last: a delay comes back.
         takes_it = abs(int(level[j] - level[j - 1]) - step) < abs(step) // 2
-        middle = (low + high) / 2
         lasts = all(
-            np.mean((side > middle) != (own > middle)) <= _MOST_BACK for side, own in ((before, low), (after, high))
+            np.mean((side > middle) != (own > middle)) <= _MAX_OTHER_LEVEL_FRACTION
+            for side, own in ((before, low), (after, high))
         )
-        if abs(step) > STEP_NS and takes_it and lasts:
+        if (
+            abs(step) > STEP_NS
+            and takes_it
+            and lasts
+            and j - start == _find_rise(np.append(before, after), middle, step)
+        ):
             between = slice(last[j - 1], last[j] + 1)
             first = int(last[j - 1]) + 1 + int(np.argmax(np.abs(np.diff(behind[between]))))
             found.append((int(rows[first]), step))
             begin = j
     return found
+
+
+def _find_rise(level: Ints, middle: float, step: int) -> int:
+    """Return the first row after a step: with it the fewest rows are at the level of the other side of the step.
+
+    Of equally good rows it is the first of a rise and the last of a fall, since a late message is at a lower level.
+    """
+    balance = np.cumsum(np.where((level > middle) == (step > 0), -1, 1))
+    best = np.flatnonzero(balance == balance.max())
+    return 1 + int(best[0] if step > 0 else best[-1])
 
 
 def _find_common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, list[tuple[int, int]]]) -> list[ClockStep]:
@@ -444,7 +459,7 @@ def _find_leaps(times: TopicTimes, known: Mask) -> Mask:
 
 
 def _find_reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
-    """Return the offset [ns] that most topics with header time share in an epoch; 0 where there is none.
+    """Return the offset [ns] that most topics with header time share in an epoch; 0 without one.
 
     Among equally large groups the one nearest to the log's clock is taken.
     """
@@ -533,5 +548,5 @@ def _is_timed(header_ns: Ints) -> bool:
 
 def _is_counting_clock(header_ns: Ints, *, published: bool) -> bool:
     """Whether headers count simulated time that runs forward."""
-    back = np.maximum.accumulate(header_ns) - header_ns > _BACK_NS
-    return bool(np.mean(back) <= _MOST_BACK and (published or np.median(header_ns) < SIMULATED_NS))
+    back = np.maximum.accumulate(header_ns) - header_ns > SECOND_NS
+    return bool(np.mean(back) <= _MAX_BACKWARD_FRACTION and (published or np.median(header_ns) < SIMULATED_NS))

@@ -58,6 +58,17 @@ class Readings:
     own_time_ns: Ints | None = None
     """Time that the measurement itself carries (NMEA), as `read_header_ns`."""
 
+    def select(self, rows: Ints | Mask | slice) -> Readings:
+        """Return some of the rows."""
+        return replace(
+            self,
+            row=self.row[rows],
+            log_time_ns=self.log_time_ns[rows],
+            header_ns=None if self.header_ns is None else self.header_ns[rows],
+            columns={name: values[rows] for name, values in self.columns.items()},
+            own_time_ns=None if self.own_time_ns is None else self.own_time_ns[rows],
+        )
+
 
 def read_messages(
     columns: Columns, role: str, type_name: str, *, fix_std_m: Mapping[str, float] = MappingProxyType({})
@@ -527,12 +538,4 @@ def select_ground_velocity(readings: Readings, frame: str, topic: str) -> Readin
         return readings
     remedies = suggest("use", {"read.topics": {"gnss_velocity": [topic]}})
     found = make_finding("velocity-not-over-ground", GNSS_VELOCITY, names={"frame": frame}, remedies=remedies)
-    none = slice(0, 0)
-    return replace(
-        readings,
-        row=readings.row[none],
-        log_time_ns=readings.log_time_ns[none],
-        header_ns=None if readings.header_ns is None else readings.header_ns[none],
-        columns={name: values[none] for name, values in readings.columns.items()},
-        findings=(*readings.findings, found),
-    )
+    return replace(readings.select(slice(0, 0)), findings=(*readings.findings, found))

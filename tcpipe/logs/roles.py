@@ -1,8 +1,8 @@
-"""Which topic plays which role, decided from the topic list alone, and why; what cannot be decided is asked for with the recipe line.
+"""Assignment of topics to roles from the topic list alone, with the reason; tcpipe asks for a decision with the line of the recipe.
 
-Rules, in this order: the recipe; topics that are other estimators' outputs play no role (fusing them again would count a sensor twice);
-the message type; how the topic is called, unless a topic covers but a small share of what a rival covers. Where two topics are left that
-no rule tells apart, nobody guesses. Roles without a topic, topics that are left out and those that cannot be decoded are findings.
+Rules, in this order: the recipe; outputs of other estimators are not used (fusing them again would count a sensor twice); the message
+type; the name of the topic, unless the topic covers only a small part of what another covers; topics that follow each other are joined.
+If several topics remain, tcpipe asks. Roles without a topic and topics that are not used or cannot be decoded are findings.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from tcpipe.logs.topics import (
     format_topic_names,
     format_topics,
     list_undecodable,
+    select_successive,
 )
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity, is_corrected, make_rail_name
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
@@ -69,7 +70,7 @@ MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss", "pose")
 
 @dataclass(frozen=True, slots=True)
 class PlayedRole:
-    """A role, the topics that play it (several only for power: they are summed), their type, and why."""
+    """A role, the topics that are used as it (of power a sum, else one after the other), the type of the first, and why."""
 
     name: str
     topics: tuple[str, ...]
@@ -107,15 +108,15 @@ class _Decisions:
     """The decisions while they are made."""
 
     types: Mapping[str, tuple[str, ...]]
-    """Message types that can play each role, best first."""
+    """Message types that fit each role, best first."""
     propulsion: Sequence[str]
-    """Those that tell propulsion apart, best first."""
+    """Message types that measure propulsion separately, best first."""
     refusals: Mapping[str, str]
-    """Those whose currents tell no power, and why."""
+    """Message types whose currents are not drawn from the battery, with the reason."""
     roles: dict[str, PlayedRole] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     passed_over: dict[tuple[str, str], str] = field(default_factory=dict)
-    """By role and topic, the reason why one that holds data was not taken, though nobody asked for that."""
+    """By role and topic, the reason why tcpipe does not use a topic that has data."""
     problems: list[str] = field(default_factory=list)
     ambiguous: list[str] = field(default_factory=list)
     choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -143,9 +144,9 @@ def assign_roles(
 ) -> RoleAssignment:
     """Return which topic plays which role, and why; `RecipeError`: no profile is called ``robot``.
 
-    ``chosen`` is the recipe's ``read.topics``: of power all are summed, elsewhere the first that the log holds is taken, and an empty list
-    means that nothing plays the role. Outside ``namespace`` only topics that are chosen by name play roles. Those of the ``mapped`` roles
-    (``read.fields``) may be of any type.
+    ``chosen`` is the recipe's ``read.topics``: of power all are summed; of other roles the first is used, and those named after it while
+    it has no messages; an empty list means that no topic is used. Outside ``namespace`` only topics that are chosen by name are used.
+    Those of the ``mapped`` roles (``read.fields``) may be of any type.
     """
     every = {topic.name: topic for topic in sorted(topics, key=lambda topic: topic.name)}
     named = {name for names in chosen.values() for name in names}
@@ -216,7 +217,7 @@ def _is_in(namespace: str | None, topic: Topic) -> bool:
 
 
 def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Collection[str]) -> None:
-    """Keep what the pose stands in for, and what it was made from, out of what is fused."""
+    """Exclude GNSS, which the pose replaces, and the roles that the pose was computed from."""
     pose = decided.roles["pose"].topics[0]
     for role in ("gnss", *pose_sources):
         if role in decided.roles:
@@ -228,7 +229,7 @@ def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Co
 
 
 def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> None:
-    """Let a pose made elsewhere play, where its name clearly says so, there is one such, and nothing else tells a position."""
+    """Use the pose of another program if its name identifies it, it is the only one, and no other topic measures positions."""
     best = [] if taken else _select_best("pose", candidates) if candidates else []
     for _, why, topic in candidates:
         if [topic] == [other for _, other in best]:
@@ -245,7 +246,7 @@ _NO_FIXES = "it needs the fixes of its receiver, and no topic is used as gnss"
 
 
 def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
-    """Let the velocity play that comes from the receiver of the fixes; one that nobody can tell to be of it stays out, and is said."""
+    """Use the velocity of the receiver of the fixes; a velocity of an unknown receiver is not used, with a finding."""
     fixes = decided.roles["gnss"].topics[0] if "gnss" in decided.roles else ""
     receiver = fixes.rpartition("/")[0]
     near = [(rank, why, topic) for rank, why, topic in candidates if topic.name.rpartition("/")[0] == receiver]
@@ -268,7 +269,7 @@ def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
 
 
 def _collect_own_velocities(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
-    """Return the topics of NMEA sentences, which may tell places and velocities at once, and the fixes that do."""
+    """Return the topics of NMEA sentences and of fixes that contain positions and velocities."""
     fixes = decided.roles["gnss"].topics if "gnss" in decided.roles else ()
     both = [
         topic
@@ -287,7 +288,9 @@ def _take_chosen(
             decided.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
             continue
         present = [name for name in names if name in topics]
-        wanted = present if role == "power" else present[:1]
+        readable = [name for name in present if topics[name].problem is None and topics[name].message_count != 0]
+        fits = [name for name in readable if topics[name].type_name in decided.types[role] or role in mapped]
+        wanted = present if role == "power" else fits or present[:1]
         missing = [name for name in names if name not in topics]
         if missing and (role == "power" or not present):
             decided.undecided.add(role)
@@ -333,7 +336,7 @@ _FUSED = re.compile(
 )
 _FUSED_FIXES = re.compile(r"filtered|fused|fusion|ekf|ukf|truth")
 _SLAM = re.compile(r"icp$|slam|loam|lego_?loam|(fast)?_?lio|liosam|cartographer|hector$|kiss$")
-"""Poses from a laser, matched scan by scan: what is told by nothing else in the log."""
+"""Poses from a laser, matched scan by scan, which no other topic of the log contains."""
 _OF_GNSS = re.compile(r"gps|gnss|navsat|fix$|utm|ublox|novatel|septentrio|rtk")
 _VISUAL = re.compile(
     r"zed|visual|vo$|vio$|svo|rtabmap|orb$|orbslam|stereo|camera|cam$|realsense|t265|rgbd|vins|mono|okvis|vslam"
@@ -449,7 +452,7 @@ _DRIVES = re.compile(r"drive|motor|wheel|traction")
 
 
 def _sort_power(decided: _Decisions, topic: Topic) -> Sorted:
-    """Rank: messages that tell propulsion apart, then what hangs on the drives, then whole batteries."""
+    """Rank messages that measure propulsion separately first, then currents of the drives, then whole batteries."""
     if topic.type_name in decided.refusals:
         return None, (), f"its type {decided.refusals[topic.type_name]}"
     if topic.type_name in decided.propulsion:
@@ -491,13 +494,21 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
         return
     first = _select_best(role, candidates)
     topics = [topic for _, topic in first]
+    # A topic that is renamed during the log goes on as another one.
+    is_joined = role != "power" and len(topics) == len(select_successive(topics))
+    if is_joined:
+        same_type = [topic for _, _, topic in candidates if topic.type_name == topics[0].type_name]
+        short = find_short_topics(same_type, topics, of_power=True)
+        topics = select_successive([*topics, *(topic for topic in same_type if topic.name not in short)])
     names = tuple(topic.name for topic in topics)
     taken = set(names)
     others = [topic for _, _, topic in candidates if topic.name not in taken]
     thin = find_short_topics(others, topics, of_power=role == "power")
     # Bare numbers share a rail, other topics are one each.
     rails = tuple(dict.fromkeys(make_rail_name(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
-    if len(first) == 1:
+    if is_joined and len(topics) > 1:
+        why = "they follow each other"
+    elif len(first) == 1:
         better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
         better = f"{better} than {format_topic_names(others)}" if others else f"the only {topics[0].type_name}"
         why = first[0][0] or better
@@ -544,9 +555,10 @@ def _are_sides(names: Sequence[str]) -> bool:
 
 def _format_recipe_line(role: str, names: Sequence[str]) -> str:
     others = "".join(f' or ["{name}"]' for name in names[1:])
-    summed = f", or several to be summed: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
+    how = "several to be summed" if role == "power" else "if they follow each other"
+    several = f", or {how}: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
     line = RecipeFragment({"read.topics": {role: [names[0]]}}).toml().splitlines()[-1]
-    return f"{line}  #{others}{summed if role == 'power' else ''}"
+    return f"{line}  #{others}{several}"
 
 
 def _list_questions(decided: _Decisions) -> list[str]:

@@ -1,6 +1,6 @@
-"""What a log says of itself: its topics, in data and in words, how much of a drive they cover; findings on them, and on its damage.
+"""Topics of a log, as data and in words, and their coverage of a drive; findings on topics and on damage of the log.
 
-Which robot a log is of: told by the user, by message types that only one robot publishes, or by its name in a topic; or several.
+The robot of a log is stated by the user, or found by message types that only one robot publishes or by its name in a topic.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ AutopilotKind = Literal["ulog", "dataflash"]
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic of a log, or of a file of it, as the index tells; None where the index does not say.
+    """One topic of a log, or of a file of it, by the index; None for values that the index lacks.
 
     ``type_name`` is ``package/msg/Name`` for ROS 1 and ROS 2 alike; ``encoding`` is ``cdr``, ``ros1``, or what else the log names;
     ``definition`` is the definition text in the log ("" where it has none), of the language ``schema_encoding``; ``problem`` says why the
@@ -39,7 +39,7 @@ class Topic:
     definition: str
     problem: str | None = None
     silent_ns: int = 0
-    """How long between the first and the last message there was none, as far as the index tells [ns]."""
+    """Time without messages between the first and the last one, by the index [ns]."""
     schema_encoding: str = ""
 
     @property
@@ -119,7 +119,7 @@ def _merge_damage(subject: Subject, places: Sequence[Damage]) -> Finding:
 
 
 def split_notes(findings: Iterable[Finding]) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
-    """Return the findings that tell of a loss, and the notes."""
+    """Return the findings on losses, and the notes."""
     found = list(findings)
     return tuple(finding for finding in found if finding.severity != "note"), tuple(
         finding for finding in found if finding.severity == "note"
@@ -138,7 +138,7 @@ def normalize_type_name(name: str) -> str:
 
 
 LISTED = 8
-"""Of a long list so many are named."""
+"""Most entries of a list in a message."""
 
 
 def format_topics(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
@@ -180,7 +180,7 @@ def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
 _LITTLE_SPAN = 0.5
 """A sensor that was no messages for more than half of the drive does not win by its name."""
 _LITTLE_SPAN_OF_POWER = 0.1
-"""What tells propulsion apart and what tells a whole battery are not of one quantity: there coverage weighs less."""
+"""For power the coverage counts less, since topics measure propulsion or the whole battery: different quantities."""
 _SILENCE_NS, _SILENT_PERIODS = 5_000_000_000, 10
 _LITTLE_COUNT = 0.01
 """Sensors that could play one role differ in rate, but not a hundredfold: 1 Hz of GNSS against 20 Hz, 10 Hz of odometry against 200 Hz."""
@@ -189,7 +189,7 @@ _LITTLE_COUNT = 0.01
 def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_power: bool = False) -> frozenset[str]:
     """Return which topics, by name, cover less than such a share of what a rival covers, or hold less than a hundredth of its messages.
 
-    What the index does not tell speaks against nobody.
+    A topic is not short if the index lacks its times or counts.
     """
     listed = list(rivals)
     little_span = _LITTLE_SPAN_OF_POWER if of_power else _LITTLE_SPAN
@@ -204,10 +204,23 @@ def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_po
     )
 
 
+def select_successive(topics: Sequence[Topic]) -> list[Topic]:
+    """Return the first topic, and each other that ends before those in front of it begin, or begins after they end."""
+    used: list[Topic] = []
+    for one in topics:
+        if all(_ends_before(one, other) or _ends_before(other, one) for other in used):
+            used.append(one)
+    return used
+
+
+def _ends_before(one: Topic, other: Topic) -> bool:
+    return one.end_ns is not None and other.start_ns is not None and one.end_ns < other.start_ns
+
+
 def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
     """Return how long a topic was silent [ns], by the spans (first, last time) of those pieces of a log that hold messages of it.
 
-    Silences below 5 s, or below ten of its mean periods, are none.
+    Only gaps above 5 s and ten mean periods count.
     """
     if len(spans_ns) < 2 or not count:
         return 0
@@ -219,7 +232,7 @@ def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -
 
 
 def format_coverage(topic: Topic) -> str:
-    """Return ``658 messages over 65.7 s``, as far as the index tells."""
+    """Return ``658 messages over 65.7 s``, with the values that the index has."""
     span_s = topic.span_s
     count = "some messages" if topic.message_count is None else f"{topic.message_count} messages"
     silent = f", no messages for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""

@@ -12,7 +12,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pyarrow as pa
 
 from tcpipe import __version__
@@ -52,20 +51,20 @@ from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.recipe import TimeWindow
 from tcpipe.store import Store, open_store
+from tcpipe.tables.arrays import encode_rows
 from tcpipe.tables.findings import select_problems
 from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
 
-_TOGETHER_S = 1.0
-"""What ends within so long is one commit."""
+_TOGETHER_S = 1.0  # results of this time share a commit
 
 _NO_LOGS = "no logs given; expected .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
 
 
 @dataclass(frozen=True, slots=True)
 class IngestSummary:
-    """What became of every log, in the order given; ``exit_code`` is the contract's."""
+    """Results of the logs in the order given; ``exit_code`` is the contract's."""
 
     store: Path | str
     results: tuple[IngestResult, ...] = field(default_factory=tuple)
@@ -150,8 +149,7 @@ ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
-_MOST_RUNS = 5
-"""So many runs are named."""
+_MOST_RUNS = 5  # named in one message
 
 
 def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> None:
@@ -168,7 +166,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
 def find_broken(store: Store, state: State, sources: Iterable[LogSource]) -> set[tuple[str, str]]:
     """Return the ingestions of what these logs hold or held of which a file is gone.
 
-    In a bucket nobody looks, as that takes a request for every thousand files.
+    Stores in buckets are not searched, which would need a request for every thousand files.
     """
     if store.place.path is None:
         return set()
@@ -424,7 +422,7 @@ def _describe_elsewhere(state: State, run_id: str, source: LogSource) -> str:
 def _compute_shared_fraction(store: Store, older: str, newer: str) -> float:
     """Return the share of a run's measurements that another has too."""
     shared = every = 0
-    mine_of, theirs_of = _find_stream_files(store, older), _find_stream_files(store, newer)
+    mine_of, theirs_of = store.find_stream_files(older), store.find_stream_files(newer)
     for role, path in mine_of.items():
         try:
             mine, theirs = read_table(path), read_table(theirs_of[role]) if role in theirs_of else None
@@ -435,21 +433,9 @@ def _compute_shared_fraction(store: Store, older: str, newer: str) -> float:
     return shared / every if every else 0.0
 
 
-def _find_stream_files(store: Store, run_id: str) -> Mapping[str, Path]:
-    with suppress(StoreError):
-        known = store.run_json(run_id)
-        return store.stream_files(run_id, known) if known else {}
-    return {}
-
-
 def _count_shared_rows(mine: pa.Table, theirs: pa.Table) -> int:
     """Count the rows of one table that are in the other: recorded at one instant with the same values."""
     floating = [field.name for field in mine.schema if pa.types.is_floating(field.type)]
     names = ["log_time_ns", *(name for name in floating if name in theirs.column_names)]
-    others = set(_read_rows(theirs, names))
-    return sum(row in others for row in _read_rows(mine, names))
-
-
-def _read_rows(table: pa.Table, names: Sequence[str]) -> list[bytes]:
-    columns = [np.asarray(table.column(name)).view(np.int64) for name in names]
-    return [row.tobytes() for row in np.column_stack(columns)]
+    others = set(encode_rows(theirs, names))
+    return sum(row in others for row in encode_rows(mine, names))

@@ -57,7 +57,7 @@ class RoleTopic:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedYield:
-    """What the excerpt gives; rates are an hour's, of recording and of driving (without stationary time)."""
+    """Yield of the excerpt; rates are per hour of recording and of driving (without stationary time)."""
 
     span_s: float
     driven_m: float
@@ -99,7 +99,7 @@ _LETTERS = {"power": "w", "velocity": "v", "duration": "T", "energy": "E"}
 
 @dataclass(frozen=True, slots=True)
 class Preflight:
-    """What to know before a day is recorded like this."""
+    """Result of a preflight: expected yield, topics, problems and findings."""
 
     log: str
     robot: str | None
@@ -109,12 +109,12 @@ class Preflight:
     problems: tuple[str, ...]
     """Why ingest would fail."""
     findings: tuple[Finding, ...]
-    """Of ingesting it, and what is too slow, missing or off in such recordings, the worst first."""
+    """Findings of ingest, and on topics that are too slow, missing or offset, the worst first."""
     verdict: Verdict
     losses: tuple[StoreLoss, ...]
     """Where most metres go that are no segments."""
     recipe: str
-    """What ``tcpipe init --from`` would write, less what the recipe settles [TOML]."""
+    """The recipe of ``tcpipe init --from`` without the keys that the given recipe has [TOML]."""
     exit_code: int
     """0 ready; 3 there are warnings, errors or no segments; 1 ingest would fail."""
 
@@ -229,11 +229,13 @@ def _compute_hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | N
 
 def _iterate_topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
     for role, role_facts in facts.roles.items():
+        shares = {
+            name: topic.rows / (topic.rate_hz * span_s) if topic.rate_hz and span_s else 1.0
+            for name, topic in role_facts.topics.items()
+        }
         for name, topic in role_facts.topics.items():
-            whole = (topic.rate_hz or 0.0) * span_s
-            yield RoleTopic(
-                role, name, topic.rate_hz, WANTED_HZ.get(role), min(topic.rows / whole, 1.0) if whole else 1.0
-            )
+            share = shares[name] if role == "power" else sum(shares.values())  # others follow each other
+            yield RoleTopic(role, name, topic.rate_hz, WANTED_HZ.get(role), min(share, 1.0))
 
 
 def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:

@@ -135,10 +135,15 @@ def _format_schema(schema: Mapping[str, Any]) -> str:
     return f"{_TYPES.get(schema.get('type', ''), 'another value')} {_format_range(schema)}".strip()
 
 
+TO_MEASURE = "?"
+"""In a suggested recipe: a number that the user must measure. It is not TOML, so that nobody uses it unread."""
+
+
 def as_toml(value: Any) -> str:
-    """Return a value as TOML writes it."""
+    """Return a value as TOML writes it; `TO_MEASURE` as it is."""
     if isinstance(value, bool | str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        return TO_MEASURE if value == TO_MEASURE else text
     if isinstance(value, list | tuple):
         return "[" + ", ".join(as_toml(item) for item in value) + "]"
     if isinstance(value, Mapping):

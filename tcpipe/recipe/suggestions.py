@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from tcpipe.errors import RecipeError, clean_line
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.checking import as_toml, from_values, read_annotations
+from tcpipe.recipe.checking import TO_MEASURE, as_toml, from_values, read_annotations
 from tcpipe.tables.findings import Remedy
 
 TomlValue: TypeAlias = "bool | float | str | Sequence[TomlValue] | Mapping[str, TomlValue]"
@@ -33,7 +33,7 @@ class RecipeFragment:
         """Check it as a recipe that holds nothing else."""
         if not self.is_checked:
             try:
-                from_values(Recipe, tomllib.loads(self.toml()), where="suggested recipe")
+                from_values(Recipe, tomllib.loads(self.toml().replace(TO_MEASURE, "0.0")), where="suggested recipe")
             except tomllib.TOMLDecodeError as error:
                 raise RecipeError(f"suggested recipe: {error}") from None
 
@@ -118,12 +118,16 @@ def propose_decisions(
 ) -> Iterator[ProposedLine]:
     """Yield what only a person knows: where sensors are mounted, by role and frame, and whether a robot with fixes alone reversed."""
     for role, frame in frames:
-        turn = {} if role == "gnss" else {"rpy_rad": [0.0, 0.0, 0.0]}
         note = f"measure it from base_link: nothing places {frame or 'it'}"
-        yield ProposedLine("read.extrinsics", role, {"xyz_m": [0.0, 0.0, 0.0], **turn}, note, is_certain=False)
+        yield ProposedLine("read.extrinsics", role, make_place_to_measure(role), note, is_certain=False)
     if not keeps_reversing and "gnss" in roles and not {"wheel_odometry", "visual_odometry"} & {*roles}:
         note = "if it never reversed: fixes alone do not tell forward from backward"
         yield ProposedLine("mask", "keep_reversing", True, note, is_certain=False)
+
+
+def make_place_to_measure(role: str) -> Keys:
+    """Return the extrinsics of a sensor as keys whose values the user must measure; an antenna has no rotation."""
+    return dict.fromkeys(("xyz_m",) if role == "gnss" else ("xyz_m", "rpy_rad"), (TO_MEASURE,) * 3)
 
 
 def propose_quality(table: str, key: str, source: str) -> ProposedLine:

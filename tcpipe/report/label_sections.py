@@ -33,7 +33,7 @@ QUALITY_WORDS = {
     Quality.WEAK_GNSS: "position is uncertain",
     Quality.CURVED: "the path bends",
     Quality.POWER_MEAN_MISMATCH: "mean power and energy over time differ by more than 5 %",
-    Quality.NO_COMMAND: "no command topic: full speed is unverified",
+    Quality.NO_COMMAND: "no command: full speed is unverified",
     Quality.VOLTAGE_OUT_OF_RANGE: "voltage leaves the robot's range",
     Quality.CLOCK_DOUBTFUL: "a clock is uncertain",
     Quality.BELOW_FULL_SPEED: "commanded below full speed",

@@ -50,7 +50,7 @@ class Fused:
 
 
 def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
-    """Fuse each section for itself, in order of epoch and stamp."""
+    """Fuse each section separately, in order of epoch and stamp."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
     for section in cut_sections(inputs.measurements, inputs.cuts_ns):
@@ -145,7 +145,7 @@ def make_wheel_column(
 
 
 def make_command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:
-    """Return the last command at each stamp; NaN before the first and without commands."""
+    """Return the last command at each stamp; NaN before the first, while the topic is silent, and without commands."""
     table = streams.tables.get("command")
     names = {"commanded_velocity_mps": "forward_velocity_mps", "commanded_yaw_rate_radps": "yaw_rate_radps"}
     if table is None:

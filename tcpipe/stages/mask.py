@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.motion import masks
 from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
-from tcpipe.motion.row_sections import Floats, Mask, MotionRows, number_pieces
+from tcpipe.motion.row_sections import Floats, Mask, MotionRows, dilate_mask, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m, find_common_scale_std
 from tcpipe.recipe import MaskConfig, TimeWindow
 from tcpipe.recipe.suggestions import suggest
@@ -125,7 +125,10 @@ def _find_motion_reasons(rows: MotionRows, config: MaskConfig) -> dict[DropReaso
 
 
 def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Mask:
-    """Mark commanded changes where there are commands, lasting accelerations where there are none, and ramps beside halts."""
+    """Mark commanded changes, ramps beside halts, and lasting accelerations where no command is known or one is about to fall silent.
+
+    Before a silence the command may have changed unseen: the last one is still held.
+    """
     slope = masks.estimate_forward_acceleration_mps2(rows, window_s=config.acceleration_window_s)
     lasting = masks.find_accelerating(
         rows, slope, above_mps2=config.max_acceleration_mps2, min_s=config.min_event_s, dilate_s=config.dilate_s
@@ -134,7 +137,9 @@ def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Ma
         rows, step_mps=config.command_step_mps, window_s=config.command_window_s, settle_s=config.command_settle_s
     )
     beside = masks.find_ramps(rows, slope, halted, above_mps2=config.ramp_acceleration_mps2, min_s=config.min_event_s)
-    return changed | (lasting & np.isnan(rows.commanded_mps)) | beside
+    unknown = np.isnan(rows.commanded_mps)
+    unknown = dilate_mask(unknown, rows.piece, before=rows.count(config.command_settle_s), after=0)
+    return changed | (lasting & unknown) | beside
 
 
 _MOST = 0.5
@@ -156,7 +161,7 @@ class SpeedLimit:
 
 
 def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
-    """Return the limit of a run, of a robot whose profile says ``max_velocity_mps`` [m/s]; the recipe's goes first."""
+    """Return the limit of a run, of a robot whose profile states ``max_velocity_mps`` [m/s]; the recipe has priority."""
     top, held = masks.find_top_command(
         rows,
         moving_above_mps=config.turning_velocity_mps,
@@ -178,21 +183,25 @@ def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: 
     return SpeedLimit(top, top, held, (found,))
 
 
-def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: MaskConfig) -> tuple[Finding, ...]:
-    """Return the findings on commands: that there are none, that no limit is known, that most was driven below it."""
+def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: MaskConfig) -> Iterator[Finding]:
+    """Yield the findings on commands: none or silent, unknown limit, most of the drive below the limit."""
     commanded, moving = np.isfinite(rows.commanded_mps), np.abs(rows.velocity_mps) > config.turning_velocity_mps
     if not commanded.any():
-        return (make_finding("no-command", _COMMAND),)
+        yield make_finding("no-command", _COMMAND)
+        return
+    silent_s, moving_s = (float(mask.sum()) * rows.period_s for mask in (moving & ~commanded, moving))
+    if silent_s > read_threshold("command-silent", "min_silent_fraction") * moving_s:
+        yield make_finding("command-silent", _COMMAND, silent_s=silent_s, moving_s=moving_s)
+    slow = (dropped_by & DropReason.BELOW_FULL_SPEED) != 0
     if limit.limit_mps is None and config.require_full_speed:
         remedies = (*_state_limit(np.nanmax(rows.commanded_mps)), *_KEEP)
-        return (make_finding("max-velocity-unknown", _COMMAND, remedies=remedies),)
-    slow = (dropped_by & DropReason.BELOW_FULL_SPEED) != 0
-    if (
+        yield make_finding("max-velocity-unknown", _COMMAND, remedies=remedies)
+    elif (
         limit.limit_mps
         and slow[moving].sum() > read_threshold("driven-below-limit", "min_slow_fraction") * moving.sum()
     ):
         remedies = (*_state_limit(limit.top_mps), *_KEEP)
-        finding = make_finding(
+        yield make_finding(
             "driven-below-limit",
             _COMMAND,
             slow_fraction=float(slow[moving].mean()),
@@ -200,8 +209,8 @@ def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: M
             top_mps=limit.top_mps,
             remedies=remedies,
         )
-        return (finding,)
-    return limit.findings
+    else:
+        yield from limit.findings
 
 
 def _state_limit(speed_mps: float) -> tuple[Remedy, ...]:

@@ -7,9 +7,10 @@ A sensor's extrinsics come from the recipe, from static transforms, or are assum
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import cast, get_args
 
+import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import MapError, RecipeError, RoleError
@@ -29,8 +30,8 @@ from tcpipe.logs.messages import (
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic, make_topic_not_decoded
 from tcpipe.power.readings import PowerReadings
-from tcpipe.recipe import Extrinsics, ReadConfig, Role
-from tcpipe.recipe.suggestions import suggest
+from tcpipe.recipe import ReadConfig, Role
+from tcpipe.recipe.suggestions import make_place_to_measure, suggest
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import Arrays, LogReader, read_transforms
 from tcpipe.stages.read_power import list_second_meters, read_power_of_topics, select_power_rows
@@ -106,7 +107,36 @@ def read_sources(
         seen_frames = count_frames(columns, types[topic])
         source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
         sources.append(replace(source, readings=_apply_recipe(source, config)))
-    return sources, power, findings
+    return _join_topics(sources, config, findings), power, findings
+
+
+def _join_topics(sources: Sequence[TopicReadings], config: ReadConfig, findings: list[Finding]) -> list[TopicReadings]:
+    """Return of each role the first topic, and what others in its frame measured while those in front of them had no messages.
+
+    A role has one frame and one place. Findings are added on topics that are not used, or in part.
+    """
+    joined: dict[Role, list[TopicReadings]] = {}
+    for source in sources:
+        before, role, subject = joined.setdefault(source.role, []), source.role, Subject("topic", source.topic)
+        if role == "power" or not before:
+            before.append(source)
+        elif role not in (*_WITHOUT_PLACE, *config.extrinsics) and [*source.frames][:1] != [*before[0].frames][:1]:
+            names = {"role": role, "reason": "another-frame"}
+            findings.append(make_finding("topic-left-out", subject, names=names))
+        else:
+            at_ns = source.readings.log_time_ns
+            overlaps = np.zeros(len(at_ns), np.bool_)
+            for first_ns, last_ns in (
+                other.readings.log_time_ns[[0, -1]] for other in before if len(other.readings.row)
+            ):
+                overlaps |= (at_ns >= first_ns) & (at_ns <= last_ns)
+            if count := int(overlaps.sum()):
+                names = {"role": role, "used": before[0].topic}
+                remedies = suggest("use", {"read.topics": {role: [source.topic]}})
+                numbers = {"overlapping_count": count, "messages_count": source.messages}
+                findings.append(make_finding("topic-overlaps", subject, names=names, remedies=remedies, **numbers))
+            before.append(replace(source, readings=source.readings.select(~overlaps)))
+    return [source for topics in joined.values() for source in topics]
 
 
 def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
@@ -192,7 +222,7 @@ def place_sensors(
             findings.append(make_finding("several-frames", subject, names=names, frames_count=len(several)))
         if placed_by == "assumed":
             names = {"frame": frame or "the sensor", "topic": of_role[role][0].topic}
-            remedies = suggest("place", {"read.extrinsics": {role: asdict(Extrinsics())}})
+            remedies = suggest("place", {"read.extrinsics": {role: make_place_to_measure(role)}})
             findings.append(make_finding("sensor-not-placed", subject, names=names, remedies=remedies))
         sensors[role] = Sensor(
             topic=" + ".join(source.topic for source in of_role[role]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,12 @@ def select_rows(table: pa.Table, name: str, value: str | int) -> pa.Table:
     column = table.column(name)
     chosen = (to_texts(column) if isinstance(value, str) else to_numbers(column)) == value
     return table if chosen.all() else table.filter(number_column(chosen))
+
+
+def encode_rows(table: pa.Table, names: Sequence[str]) -> list[bytes]:
+    """Return the values of 64-bit columns row by row, to be compared bit by bit."""
+    columns = [to_numbers(table.column(name)).view(np.int64) for name in names]
+    return [row.tobytes() for row in np.column_stack(columns)]
 
 
 _POINT, _LINE_STRING = 1, 2

@@ -52,7 +52,7 @@ class Quality(IntFlag):
     POWER_MEAN_MISMATCH = 1 << 5
     """The plain mean of the power samples differs from energy / duration by more than 5 %."""
     NO_COMMAND = 1 << 6
-    """No command topic: it is unknown whether the robot was driven at its maximum speed."""
+    """No command is known: it is unknown whether the robot was driven at its maximum speed."""
     VOLTAGE_OUT_OF_RANGE = 1 << 7
     """The voltage leaves the range of the robot profile."""
     CLOCK_DOUBTFUL = 1 << 8

@@ -215,10 +215,8 @@ _TRACK_COLUMNS = (
     _make_nullable(
         "wheel_velocity_mps", "m/s", "forward velocity by the wheels, interpolated; null without", "base_link"
     ),
-    _make_nullable(
-        "commanded_velocity_mps", "m/s", "commanded forward velocity, last value; null without", "base_link"
-    ),
-    _make_nullable("commanded_yaw_rate_radps", "rad/s", "commanded yaw rate, last value; null without", "base_link"),
+    _make_nullable("commanded_velocity_mps", "m/s", "last commanded forward velocity; null if it is old", "base_link"),
+    _make_nullable("commanded_yaw_rate_radps", "rad/s", "last commanded yaw rate; null if it is old", "base_link"),
     _make_nullable("voltage_volt", "V", "mean voltage over the rails, interpolated; null if not measured"),
     _make_nullable("current_amp", "A", "sum of the rails' currents, interpolated; null if not measured"),
     _make_nullable("power_watt", "W", "sum over rails of voltage times current; null without power"),

@@ -6,6 +6,8 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -105,6 +107,35 @@ def _used(nodes):
             inner = inner.value
         if isinstance(inner, ast.Name) and inner.id in known:
             yield ".".join([known[inner.id], *reversed(parts)]), id(node) in bare, node.lineno
+
+
+def list_bound_names(body: list[ast.stmt]) -> Iterator[str]:
+    """Yield each name that statements of a module bind; one branch of an if or a try stands for all of its branches."""
+    for each in body:
+        match each:
+            case ast.Assign(targets=targets):
+                nodes = [node for target in targets for node in ast.walk(target)]
+                yield from (node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+            case ast.AnnAssign(target=ast.Name(id=name)):
+                yield name
+            case ast.FunctionDef(name=name, decorator_list=[ast.Name(id="overload")]):
+                pass
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                yield name
+            case ast.Import(names=names) | ast.ImportFrom(names=names):
+                yield from (alias.asname or alias.name for alias in names)
+            case ast.If() | ast.Try():
+                branches = [each.body, each.orelse, *(handler.body for handler in getattr(each, "handlers", []))]
+                yield from {name for branch in branches for name in list_bound_names(branch)}
+            case ast.For() | ast.With():
+                yield from list_bound_names(each.body)
+
+
+def test_no_name_of_a_module_is_bound_twice():
+    counts = {path: Counter(list_bound_names(tree.body)) for path, tree in read_trees().items()}
+    assert {path: name for path, found in counts.items() for name, count in found.items() if count > 1} == {}
+    twice = "_MOST = 1\nif True:\n    A = 1\nelse:\n    A = 2\n_MOST: int = 2"
+    assert Counter(list_bound_names(ast.parse(twice).body)) == {"_MOST": 2, "A": 1}
 
 
 def test_no_modules_import_each_other_in_a_circle():

@@ -581,7 +581,8 @@ def compute_command_ratio(wheels: BodyVelocities, command: CommandedSpeed) -> fl
     if command.stamp_ns.size == 0:
         return None
     commanded_mps = hold_last(command.stamp_ns, command.forward_velocity_mps, wheels.stamp_ns)
-    changed = np.flatnonzero(np.abs(np.diff(commanded_mps, prepend=commanded_mps[0])) > _STEP_MPS)
+    # A difference to an unknown command is NaN, which is a change.
+    changed = np.flatnonzero(~(np.abs(np.diff(commanded_mps, prepend=commanded_mps[0])) <= _STEP_MPS))
     began = np.concatenate(([0], changed))[np.searchsorted(changed, np.arange(commanded_mps.size), "right")]
     is_held = wheels.stamp_ns - wheels.stamp_ns[began] > _HELD_NS
     rows = is_held & (np.abs(commanded_mps) > _DRIVES_MPS) & np.isfinite(commanded_mps)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +29,7 @@ from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_s
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
 from tcpipe.formats.json_files import convert_record, digest, to_plain
+from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
@@ -36,8 +39,9 @@ from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.recipe import Recipe
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store
+from tcpipe.tables.arrays import encode_rows, number_column
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import TABLES_VERSION
 
 if TYPE_CHECKING:
@@ -99,7 +103,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
         problems += error.problems
     if problems:
         raise DatasetError(*problems)
-    once = remove_duplicates(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
+    once = remove_duplicates(store, chosen.runs, chosen.logs)
     runs = once.runs
     documents = tuple(store.map_document(name) for name in names)
     maps = partial(_map_files, store, documents)
@@ -116,17 +120,9 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": options.region,
             "format": options.file_format,
-            **(
-                {"covariates": [(table.name, table.checksum) for table in options.covariates]}
-                if options.covariates
-                else {}
-            ),
-            **(
-                {"excluded": [(ids.name, ids.checksum, ids.reason) for ids in options.exclusions]}
-                if options.exclusions
-                else {}
-            ),
-            **({} if options.earlier is None else {"kept_split": _hash_table(options.earlier)}),
+            "covariates": [(table.name, table.checksum) for table in options.covariates],
+            "excluded": [(ids.name, ids.checksum, ids.reason) for ids in options.exclusions],
+            "kept_split": None if options.earlier is None else _hash_table(options.earlier),
         }
     )
     fingerprint = digest(("redacted", fingerprint)) if options.redact else fingerprint
@@ -183,7 +179,7 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 
 
 def read_earlier_splits(dataset: str | Path) -> pa.Table:
-    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` if it is none."""
+    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` for another path."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     if read_card(directory).redaction is not None:
         raise DatasetError(
@@ -280,15 +276,11 @@ def _format_value(value: object) -> str:
 _SAME_TIME_NS = 1_000_000_000
 _SAME_PLACE_M = 2.0
 _SAME_DRIVE = 0.5
-"""Where so large a share of two runs is together, to the second and in place, their clocks may differ by a constant."""
-
+"""If this fraction of two runs overlaps in time and place, a constant offset between their clocks is removed."""
 _METRES_PER_DEG = 111_320.0
+_NEVER_NS = 2**61  # later than any time [ns since 1970]; twice of it still fits an int64
 
-_NEVER_NS = 2**61
-"""Beyond any time [ns since 1970], and twice of it is an integer still."""
-
-_WAYS = 64
-"""So many ways are held at once."""
+_WAYS = 64  # most runs whose positions are in memory
 
 Mask = NDArray[np.bool_]
 
@@ -311,10 +303,10 @@ class _SegmentPositions:
     lonlat_deg: NDArray[np.float64]
 
 
-def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, str]) -> UniqueRuns:
-    """Return the runs, by id, without second recordings, and a finding for each of those; of two, the first by id stays.
+def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[str, LogOrigin]) -> UniqueRuns:
+    """Return the runs, by id, without second logs of a drive, and findings; of two, the first by id stays.
 
-    ``runs`` are all of one recipe; ``sha256_by_run`` is the hash of each run's log.
+    ``runs`` are all of one recipe; ``logs`` are by run.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
     start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T
@@ -328,7 +320,7 @@ def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, 
     findings: list[Finding] = []
     by_sha256: dict[str, str] = {}
     for index, run in enumerate(runs):
-        twin = by_sha256.setdefault(sha256_by_run[run.run_id], run.run_id)
+        twin = by_sha256.setdefault(logs[run.run_id].sha256, run.run_id)
         if twin != run.run_id:
             findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
@@ -337,8 +329,12 @@ def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, 
         for earlier in np.flatnonzero((apart_ns <= _SAME_TIME_NS) & (robot[:index] == run.facts.robot)).tolist():
             if earlier in kept:
                 shared = _find_shared(way(index), way(earlier))
-                twice |= shared
-                others += [kept[earlier].run_id] if shared.any() else []
+                is_one = _is_one_drive(store, (run, kept[earlier])) if shared.any() else False
+                if is_one:
+                    twice |= shared
+                    others.append(kept[earlier].run_id)
+                elif is_one is None:
+                    findings.append(_find_overlap(run, kept[earlier], int(shared.sum()), logs))
         if twice.any():
             findings.append(_find_twice(run, int(twice.sum()), others))
         if twice.all() and len(twice):
@@ -356,6 +352,56 @@ def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Fi
         duplicate_count=duplicates,
         segment_count=run.facts.segments,
     )
+
+
+def _find_overlap(run: RunDirectory, other: RunDirectory, shared: int, logs: Mapping[str, LogOrigin]) -> Finding:
+    """Return the question whether two runs are of one drive, with a command for each answer."""
+    own, others = (shlex.join(map(str, logs[each.run_id].paths)) for each in (run, other))
+    remedies = (
+        Remedy("two_robots", command=f"tcpipe ingest {own} --tag robot={run.run_id}"),
+        Remedy("one_drive", command=f"tcpipe ingest {others} {own} --tag robot={other.run_id}"),
+    )
+    numbers = {"overlapping_count": shared, "segment_count": run.facts.segments}
+    names = {"other": other.run_id}
+    return make_finding("drives-overlap", Subject("run", run.run_id), names=names, remedies=remedies, **numbers)
+
+
+_COMPARED_ROLES = ("gnss", "pose", "wheel_odometry", "visual_odometry", "imu")
+"""Sensors whose values seldom repeat, those with the fewest first."""
+_MIN_EQUAL_FRACTION, _MIN_VALUES = 0.5, 3
+
+
+def _is_one_drive(store: Store, pair: tuple[RunDirectory, RunDirectory]) -> bool | None:
+    """Return whether two runs at one time and place are of one drive, None if that is unknown.
+
+    One sensor with equal values proves one drive, other values of topics of one name prove two; else the tag ``robot`` decides.
+    """
+    files = [store.find_stream_files(run.run_id) for run in pair]
+    sensors = [run.facts.log.sensors if run.facts.log else {} for run in pair]
+    for role in (role for role in _COMPARED_ROLES if all(role in found for found in files)):
+        fraction = _compute_equal_fraction([read_table(found[role]) for found in files])
+        if fraction >= _MIN_EQUAL_FRACTION:
+            return True
+        one, two = (known[role].topic if role in known else "" for known in sensors)
+        if fraction < _MIN_EQUAL_FRACTION and one == two:
+            return False
+    tags = [run.facts.tags.get("robot") for run in pair]
+    return tags[0] == tags[1] if any(tags) else None
+
+
+def _compute_equal_fraction(streams: Sequence[pa.Table]) -> float:
+    """Return the fraction of values, of those that occur once in the common time of two streams, which both have; NaN for few."""
+    names = [field.name for field in streams[0].schema if pa.types.is_floating(field.type) and "_var" not in field.name]
+    stamps = [to_integers(table, "stamp_ns") for table in streams]
+    first_ns = max(stamp[0] for stamp in stamps) - _SAME_TIME_NS
+    last_ns = min(stamp[-1] for stamp in stamps) + _SAME_TIME_NS
+    common = [
+        Counter(encode_rows(table.filter(number_column((first_ns <= stamp) & (stamp <= last_ns))), names))
+        for table, stamp in zip(streams, stamps, strict=True)
+    ]
+    once = [{row for row, count in counts.items() if count == 1} for counts in common]
+    fewest = min(map(len, once))
+    return len(once[0] & once[1]) / fewest if fewest >= _MIN_VALUES else math.nan
 
 
 def _find_span_ns(facts: RunFacts) -> tuple[int, int]:

@@ -121,7 +121,7 @@ def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
 
 
 def _select_tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
-    """Return the runs with all of the tags; `DatasetError` lists all tags if there is none."""
+    """Return the runs with all of the tags; `DatasetError` lists all tags if no run has them."""
     chosen = [run for run in runs if tags.items() <= run.facts.tags.items()]
     if not chosen:
         wanted = " ".join(f"{key}={value}" for key, value in tags.items())

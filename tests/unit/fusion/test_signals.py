@@ -33,6 +33,18 @@ def test_last_value_is_held_and_unknown_before_the_first():
     assert np.isnan(hold_last(np.empty(0, np.int64), np.empty(0), np.array([5], np.int64))).all()
 
 
+@pytest.mark.parametrize(("period_s", "longest_s"), [(0.05, 1.0), (0.5, 1.5), (5.0, 15.0)])
+def test_a_value_is_unknown_after_a_second_or_three_periods(period_s, longest_s):
+    stamp_ns = 10**18 + np.arange(20) * round(period_s * 1e9)
+    held = hold_last(stamp_ns, np.ones(20), stamp_ns[-1] + np.array([0, longest_s - 0.01, longest_s + 0.01]) * 1e9)
+    assert np.isfinite(held).tolist() == [True, True, False]
+
+
+def test_a_single_value_is_held_for_a_second():
+    held = hold_last(np.array([0], np.int64), np.ones(1), np.array([0, 10**9, 10**9 + 1], np.int64))
+    assert np.isfinite(held).tolist() == [True, True, False]
+
+
 def test_seconds_keep_nanoseconds_of_large_stamps():
     zero = 1_700_000_000_000_000_000
     assert compute_seconds(np.array([zero + 1], np.int64), zero)[0] == 1e-9

@@ -197,6 +197,36 @@ def covering(name: str, type_name: str, count: int, span_s: float) -> Topic:
     return Topic(name, type_name, count, 0, round(span_s * 1e9), "cdr", "")
 
 
+def during(name: str, type_name: str, start_s: float, end_s: float) -> Topic:
+    return Topic(name, type_name, round(20 * (end_s - start_s)), round(start_s * 1e9), round(end_s * 1e9), "cdr", "")
+
+
+@pytest.mark.parametrize("half_s", [10.0, 30.0, 50.0])
+@pytest.mark.parametrize(
+    ("role", "kind", "names"),
+    [
+        ("gnss", FIX, ("/fix", "/gps/fix")),
+        ("imu", IMU, ("/imu/data", "/xsens/imu")),
+        ("wheel_odometry", ODOMETRY, ("/wheel/odom", "/odom")),
+        ("command", "geometry_msgs/msg/Twist", ("/cmd_vel", "/base/cmd_vel")),
+    ],
+)
+def test_a_topic_that_is_renamed_during_the_log_is_used_under_both_names(role, kind, names, half_s) -> None:
+    others = [during("/other/odom", ODOMETRY, 0, 60)] if role != "wheel_odometry" else []
+    for first, second in (names, names[::-1]):
+        found = assign_roles([during(first, kind, 0, half_s), during(second, kind, half_s + 0.1, 60), *others], {})
+        assert set(played(found)[role]) == {first, second}
+        chosen = assign_roles(
+            [during(first, kind, 0, half_s), during(second, kind, half_s + 0.1, 60), *others], {role: [*names]}
+        )
+        assert played(chosen)[role] == names
+
+
+def test_a_named_topic_without_messages_leaves_the_role_to_the_next() -> None:
+    log = [topic("/front/fix", FIX, 0), topic("/rear/fix", FIX), topic("/odom", ODOMETRY)]
+    assert played(assign_roles(log, {"gnss": ["/front/fix", "/rear/fix"]}))["gnss"] == ("/rear/fix",)
+
+
 @pytest.mark.parametrize(("little", "much"), [("/wheel/odom", "/odom"), ("/odom_a", "/odom_b"), ("/odom_b", "/odom_a")])
 @pytest.mark.parametrize(("count", "span_s"), [(3, 65.0), (320, 32.0), (1, 0.0)])
 def test_a_topic_that_covers_little_does_not_win_by_its_name(little: str, much: str, count: int, span_s: float) -> None:

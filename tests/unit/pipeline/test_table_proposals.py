@@ -21,12 +21,13 @@ def write(path, **columns):
 
 
 def proposed(folder):
-    """The recipe as it is written, and with every comment of a line removed."""
+    """The recipe as it is written, and with every comment of a line removed and places measured."""
     text = propose_recipe(folder).toml()
     bare = "\n".join(
         line.removeprefix("# ") if " = " in line or line.startswith("# [") else line for line in text.splitlines()
     )
-    return parse_toml(text), parse_recipe(parse_toml(bare), where="every comment removed"), text
+    measured = bare.replace("?", "0.1")
+    return parse_toml(text), parse_recipe(parse_toml(measured), where="every comment removed"), text
 
 
 SECONDS = np.arange(ROWS) / 10

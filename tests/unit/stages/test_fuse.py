@@ -134,7 +134,9 @@ def test_power_command_and_wheels_stand_at_the_tracks_stamps(track, truth):
     command = to_floats(track.table, "commanded_velocity_mps")
     assert np.isnan(command[t < 5.0]).all()
     assert (command[(t >= 5.0) & (t < 10.0)] == 1.0).all()
-    assert (to_floats(track.table, "commanded_yaw_rate_radps")[t >= 10.0] == 0.2).all()
+    yaw_rate = to_floats(track.table, "commanded_yaw_rate_radps")
+    assert (yaw_rate[(t >= 10.0) & (t < 24.9)] == 0.2).all()
+    assert np.isnan(yaw_rate[t > 25.1]).all()  # older than three periods of 5 s
     wheel = to_floats(track.table, "wheel_velocity_mps") - np.interp(t, truth.t, truth.forward)
     assert np.median(np.abs(wheel)) < 0.06
 

@@ -53,6 +53,21 @@ def test_start_and_stop_with_commands():
     assert rows_of(masked, DropReason.STATIONARY)[(T < 5) | (T > 50.1)].all()
 
 
+def test_driving_after_the_commands_fell_silent_is_masked_as_without_commands():
+    speed = np.clip(
+        0.95 - (T - 30.2), 0.45, 0.95
+    )  # another source slows the robot down, while the last command is held
+    masked = gate(straight_track(speed, commanded_mps=np.where(T < 31, 1.0, np.nan)))
+    accelerating = rows_of(masked, DropReason.ACCELERATING)
+    assert accelerating[(T > 30.2) & (T < 30.7)].all()
+    assert not accelerating[(T < 29.5) | (T > 31.5)].any()
+    assert not rows_of(masked, DropReason.BELOW_FULL_SPEED).any()
+    (finding,) = masked.info.report.findings
+    assert (finding.code, finding.severity) == ("command-silent", "note")
+    assert finding.numbers["silent_s"] == pytest.approx(29.0, abs=0.1)
+    assert finding.numbers["moving_s"] == pytest.approx(60.0, abs=0.1)
+
+
 def test_start_and_stop_without_commands():
     masked = gate(straight_track(start_and_stop()))
     kept = masked.table["dropped_by"].to_numpy() == 0

@@ -13,10 +13,11 @@ from made_tracks import with_columns
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import RecipeError, RoleError
-from tcpipe.formats.recipe_toml import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_recipe, parse_toml
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import Extrinsics, ReadConfig
+from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_power import select_power_rows
 from tcpipe.tables.findings import select_findings
@@ -239,7 +240,15 @@ def test_a_latched_tf_places_what_tf_static_does_not() -> None:
     assert found.sensors["imu"].placed_by == "assumed"
     (unplaced,) = select_findings(found.report.findings, "sensor-not-placed")
     assert (unplaced.subject.name, unplaced.names["frame"]) == ("imu", "imu_link")
-    assert "xyz_m" in unplaced.remedies[0].recipe["read.extrinsics"]["imu"]
+    line = RecipeFragment(unplaced.remedies[0].recipe, is_checked=True).toml()
+    assert "xyz_m = [?, ?, ?]" in line
+    with pytest.raises(ValueError, match=r"line 2.*; measure it and write the value in place of \?"):
+        parse_toml(line)
+    assert parse_recipe(parse_toml(line.replace("?", "0.1")), where="measured").read.extrinsics["imu"].xyz_m == (
+        0.1,
+        0.1,
+        0.1,
+    )
 
 
 def test_the_recipe_places_over_tf() -> None:
@@ -247,6 +256,50 @@ def test_the_recipe_places_over_tf() -> None:
     assert found.sensors["gnss"].xyz_m == (1.0, 2.0, 3.0)
     assert found.sensors["gnss"].placed_by == "recipe"
     np.testing.assert_allclose(found.sensors["gnss"].quat_xyzw, [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
+
+
+def renamed(at: int, *, until: int, child: str = "base_link") -> MemoryLog:
+    """Return the log of a husky whose odometry has another name from row ``at`` on; the first ends at row ``until``."""
+    topics = husky()
+    (kind, whole), (_, other) = topics.pop("/husky_velocity_controller/odom"), odometry(child=child)
+    topics |= {"/odom": (kind, whole.slice(0, until)), "/platform/odom": (kind, other.slice(at))}
+    log = MemoryLog(topics)
+    for name in ("/odom", "/platform/odom"):
+        stamp_ns = topics[name][1]["log_time_ns"].to_numpy()
+        log.topics[name] = replace(log.topics[name], start_ns=int(stamp_ns[0]), end_ns=int(stamp_ns[-1]))
+    return log
+
+
+def test_an_odometry_that_is_renamed_during_the_log_is_one_stream() -> None:
+    found, whole = read(renamed(200, until=200)), read(husky())
+    assert found.tables["wheel_odometry"].equals(whole.tables["wheel_odometry"])
+    assert set(found.sensors["wheel_odometry"].topic.split(" + ")) == {"/odom", "/platform/odom"}
+    assert found.sensors["wheel_odometry"].xyz_m == whole.sensors["wheel_odometry"].xyz_m
+
+
+@pytest.mark.parametrize("names", [["/odom", "/platform/odom"], ["/platform/odom", "/odom"]])
+def test_of_two_topics_named_for_one_role_the_first_is_used_where_both_have_messages(names: list[str]) -> None:
+    log = renamed(200, until=250)
+    found = read(log, topics={"wheel_odometry": names})
+    assert found.tables["wheel_odometry"].num_rows == 500
+    (unused,) = select_findings(found.report.findings, "topic-overlaps")
+    assert (unused.subject.name, unused.names["used"], unused.numbers["overlapping_count"]) == (names[1], names[0], 50)
+    (remedy,) = unused.remedies
+    other = read(log, topics=remedy.recipe["read.topics"])
+    assert other.sensors["wheel_odometry"].topic == names[1]
+    assert not select_findings(other.report.findings, "topic-overlaps")
+
+
+def test_two_frames_are_not_joined_unless_the_recipe_states_one_place() -> None:
+    log = renamed(200, until=200, child="camera")
+    found = read(log, topics={"wheel_odometry": ["/odom", "/platform/odom"]})
+    assert found.tables["wheel_odometry"].num_rows == 200
+    (unused,) = select_findings(found.report.findings, "topic-left-out")
+    assert (unused.subject.name, unused.names["reason"]) == ("/platform/odom", "another-frame")
+    placed = read(
+        log, topics={"wheel_odometry": ["/odom", "/platform/odom"]}, extrinsics={"wheel_odometry": Extrinsics()}
+    )
+    assert placed.tables["wheel_odometry"].num_rows == 500
 
 
 def test_missing_gnss_and_power_are_warnings() -> None:

@@ -211,3 +211,10 @@ def test_a_command_that_is_not_what_drives_tells_nothing():
     moving = driven(1.2, commanded=np.ones(COMMAND_NS.size))
     assert compute_command_ratio(moving, CommandedSpeed(COMMAND_NS, np.zeros(COMMAND_NS.size))) is None
     assert compute_command_ratio(moving, CommandedSpeed(COMMAND_NS[:0], np.zeros(0))) is None
+
+
+def test_speeds_while_the_commands_are_silent_prove_no_ratio():
+    is_sent = COMMAND_NS % (20 * 10**9) < 6 * 10**9
+    another_source = np.where(np.roll(is_sent, 20), 1.0, 1.3)  # it drives until two seconds after the commands return
+    command = CommandedSpeed(COMMAND_NS[is_sent], np.ones(is_sent.sum()))
+    assert compute_command_ratio(driven(1.0, commanded=another_source), command) is None

@@ -1,11 +1,23 @@
 import json
 import resource
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from synthetic_store import add_run, add_world, box, lanes, lonlat, open_world, region_file, segments
+from synthetic_store import (
+    add_run,
+    add_world,
+    box,
+    commit_run,
+    lanes,
+    lonlat,
+    make_fixes,
+    open_world,
+    region_file,
+    segments,
+)
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError, UsageError
@@ -31,9 +43,24 @@ def store(map_store, tmp_path):
     return Store(shutil.copytree(map_store.root, tmp_path / "store"))
 
 
-def add(store, run_id="a", y_m=(0.0,), *, x=(-10.0, 10.0), start_ns=0, recipe=None, sha256=None, **keywords):
+def add(
+    store,
+    run_id="a",
+    y_m=(0.0,),
+    *,
+    x=(-10.0, 10.0),
+    start_ns=0,
+    recipe=None,
+    sha256=None,
+    fixes=None,
+    tags=None,
+    **keywords,
+):
+    """Add a run; ``fixes`` are options of `make_fixes`."""
     table = segments(run_id, *lanes(np.array(y_m), *x), start_ns=start_ns, **keywords)
-    add_run(store, run_id, table, recipe=recipe, sha256=sha256)
+    spans = (table["start_ns"][0].as_py(), table["end_ns"][-1].as_py())
+    streams = None if fixes is None else make_fixes(spans, **fixes)
+    add_run(store, run_id, table, recipe=recipe, sha256=sha256, streams=streams, tags=tags)
 
 
 def build(store, tmp_path, *, page=False, **keywords):
@@ -110,8 +137,8 @@ def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
 
 @pytest.mark.parametrize(("sha256", "second_ns"), [("5ad0", 0), (None, 10**18 + 300_000_000)])
 def test_a_log_under_two_names_and_a_drive_in_two_logs_count_once(store, tmp_path, sha256, second_ns):
-    add(store, sha256=sha256, start_ns=0 if sha256 else 10**18)
-    add(store, "b", sha256=sha256, start_ns=second_ns)
+    add(store, sha256=sha256, start_ns=0 if sha256 else 10**18, fixes={})
+    add(store, "b", sha256=sha256, start_ns=second_ns, fixes={"late_ns": 0 if sha256 else 300_000_000})
     result = build(store, tmp_path)
     assert result.card.samples == 20
     assert twice(result) == [("b", "a", 20, 20)]
@@ -122,8 +149,8 @@ def test_a_log_under_two_names_and_a_drive_in_two_logs_count_once(store, tmp_pat
 def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_path, names, skew_ns):
     """One drive of 40 m; its second recording has the last 20 m of the first one and 10 m more."""
     whole, late = names
-    add(store, whole, x=(-19.0, 11.0), start_ns=10**18)
-    add(store, late, x=(-9.0, 18.0), start_ns=10**18 + 10 * 1_200_000_000 + skew_ns)
+    add(store, whole, x=(-19.0, 11.0), start_ns=10**18, fixes={})
+    add(store, late, x=(-9.0, 18.0), start_ns=10**18 + 10 * 1_200_000_000 + skew_ns, fixes={"late_ns": skew_ns})
     result = build(store, tmp_path)
     starts_m = np.sort(pq.read_table(tmp_path / "out" / "samples.parquet")["start_lon_deg"].to_numpy())
     assert result.card.samples == 37
@@ -148,6 +175,40 @@ def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store,
     add(store, "b", (5.0,), start_ns=10**18)  # elsewhere
     add(store, "c", start_ns=2 * 10**18)  # the same place, later
     assert build(store, tmp_path).card.samples == 60
+
+
+OTHER_TOPIC = {"drive": 1, "topic": "/gps/fix"}
+
+
+def test_two_robots_that_drive_together_keep_all_their_segments(store, tmp_path):
+    add(store, start_ns=10**18, fixes={})
+    add(store, "b", (1.5,), start_ns=10**18 + 200_000_000, fixes={"drive": 1})
+    result = build(store, tmp_path)
+    assert result.card.samples == 40
+    assert twice(result) == []
+    assert select_findings(result.findings, "drives-overlap") == []
+
+
+@pytest.mark.parametrize("fixes", [OTHER_TOPIC, None])
+@pytest.mark.parametrize(("answer", "samples"), [("two_robots", 40), ("one_drive", 20)])
+def test_runs_without_a_sensor_in_common_are_asked_for_and_a_tag_is_the_answer(store, tmp_path, fixes, answer, samples):
+    add(store, start_ns=10**18, fixes={})
+    add(store, "b", (1.5,), start_ns=10**18, fixes=fixes)
+    result = build(store, tmp_path)
+    assert result.card.samples == 40
+    (found,) = select_findings(result.findings, "drives-overlap")
+    assert (found.severity, found.subject.name, found.names["other"]) == ("warning", "b", "a")
+    assert (found.numbers["overlapping_count"], found.numbers["segment_count"]) == (20, 20)
+    command = {remedy.name: remedy.command for remedy in found.remedies}[answer]
+    logs, tag = command.removeprefix("tcpipe ingest ").split(" --tag ")
+    key, value = tag.split("=")
+    for log in logs.split():  # what ingesting a known log again does
+        store.tag_run(Path(log).stem, {key: value})
+        commit_run(store, Path(log).stem)
+    result = build(store, tmp_path, force=True)
+    assert result.card.samples == samples
+    assert select_findings(result.findings, "drives-overlap") == []
+    assert twice(result) == ([("b", "a", 20, 20)] if samples == 20 else [])
 
 
 def test_no_segments(store, tmp_path):
