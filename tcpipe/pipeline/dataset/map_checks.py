@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,6 +33,7 @@ from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, 
 from tcpipe.terrain.projection import Projection, compute_geoid_height
 from tcpipe.terrain.registration import (
     REACH_M,
+    HeightScale,
     Registration,
     SharedShift,
     register_tracks,
@@ -69,13 +71,14 @@ def register_runs(
     """Return the map's registration against each run that crosses enough of it, and findings on misfits.
 
     Rows of a track count that are certain enough to be sampled. With ``sample.align`` a registration says whether its shift is applied, and
-    findings why not. `MapError` if the map's heights are in feet.
+    findings why not. `MapError` if the map's heights are in another unit than metres, or scaled.
     """
     projection = find_map_projection(source, recipe.read.gnss_crs)
     tracks = [_register(run, source, projection, recipe.sample) for run in runs]
-    for track in tracks:
-        if track.found is not None and track.found.scale.is_feet():
-            raise MapError(_describe_feet(track.found, track.run_id, source.name))
+    scales = {track.run_id: track.found.scale for track in tracks if track.found is not None}
+    wrong = [run_id for run_id, scale in scales.items() if scale.is_wrong()]
+    if wrong and not any(scale.is_known and not scale.is_off() for scale in scales.values()):
+        raise MapError(_describe_scale(scales[wrong[0]], wrong[0], source))
     shared = _share_shift(tracks, source, is_wanted=recipe.sample.align)
     registrations, findings = list[MapRegistration](), list[Finding]()
     for track in tracks:
@@ -169,10 +172,18 @@ def _register(run: RunDirectory, source: MapFile, projection: Projection, config
     return _Track(run.run_id, thin, found, expected_m, track_std_m)
 
 
-def _describe_feet(found: Registration, run_id: str, name: str) -> str:
+def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
+    """Return the error for a map whose heights are no metres, with the command that corrects its raster."""
+    unit, file = scale.find_unit(), source.facts.sources["height"]
+    file = "FILE" if "…" in file else shlex.quote(file)
+    mended = f"rio edit-info {file} --bidx 1 --units {unit}"
+    if not unit:
+        factor = f"\"(* {scale.value:.3g} (read 1 1 'float64'))\""
+        mended = f"rio calc {factor} {file} scaled.tif --dtype float32 --co nodata=nan"
+    kind = {"": "scaled", "m": "metres, converted by mistake", "ft": "in feet"}.get(unit, f"in {unit}")
     return (
-        f"map {name}: where run {run_id} rises by 1 m, its heights rise by {1 / found.scale.value:.2f}: they are in feet and were read "
-        f"as metres; say so in the file (gdal_edit -units ft FILE) and add the map again (tcpipe add-map {name} --height FILE ... --force)"
+        f"map {source.name}: its heights rise by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}) where run {run_id} rises by "
+        f"1 m: they are {kind}; correct the raster ({mended}) and add the map again (tcpipe add-map {source.name} --height FILE ... --force)"
     )
 
 
@@ -201,7 +212,7 @@ def _find_shift(found: Registration, run_id: str, name: str, *, is_applied: bool
 def _find_other_heights(found: Registration, expected_m: float, run_id: str, name: str) -> tuple[Finding, ...]:
     """Return the finding, if any, that heights of map and track differ too much."""
     subject, names = Subject("run", run_id), {"map": name}
-    if found.scale.is_off():
+    if found.scale.is_off() or found.scale.is_wrong():
         return (make_finding("map-height-scale", subject, names=names, map_rise_m=1 / found.scale.value),)
     if not _is_other_ground(found.left_m, expected_m):
         return ()
