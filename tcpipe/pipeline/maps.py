@@ -238,7 +238,7 @@ def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str
 
 
 def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
-    """Return the classes that the store's other maps share; None while none of them has any."""
+    """Return the classes that the store's other maps share; None if no other map has classes that a user or a raster named."""
     for other in opened.maps():
         if other == name:
             continue
@@ -247,8 +247,9 @@ def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
         except (MapError, StoreError):
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue
-        if "terrain" in found.layers or found.facts.classes_from == "file":
-            own = found.facts.classes_from == "names"  # those values are of that raster alone
+        classes_from = found.facts.classes_from
+        if classes_from == "file" or ("terrain" in found.layers and classes_from != "default"):
+            own = classes_from == "names"  # those values are of that raster alone
             values = {entry.id: entry.id for entry in found.classes.classes} if own else found.id_by_value
             return ClassScheme(found.classes, values)
     return None

@@ -113,7 +113,9 @@ class HeightScale:
     def find_unit(self) -> str:
         """Return the unit of the map's heights, ``m`` if they were metres before they were converted; "" if it is no known unit."""
         error = max(3.0 * self.std / self.value, _MAX_UNIT_ERROR)
-        units = {metres: unit for unit, metres in _UNITS_M.items()} | {1.0 / metres: "m" for metres in _UNITS_M.values()}
+        units = {metres: unit for unit, metres in _UNITS_M.items()} | {
+            1.0 / metres: "m" for metres in _UNITS_M.values()
+        }
         return next((unit for metres, unit in units.items() if abs(self.value / metres - 1.0) < error), "")
 
     def is_off(self) -> bool:
@@ -293,7 +295,11 @@ def _find_least(spread: FloatArray) -> tuple[int, int]:
 def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArray) -> HeightScale:
     """Return the scale of heights, fitted with a tilt of the map unless it is that of a known unit: no map is tilted so much."""
     whole, tilt = _regress_heights(ground_m, height_m), xy_m - xy_m.mean(axis=0)
-    return whole if whole.is_wrong() and whole.find_unit() else _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
+    return (
+        whole
+        if whole.is_wrong() and whole.find_unit()
+        else _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
+    )
 
 
 def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:

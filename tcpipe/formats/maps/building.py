@@ -18,12 +18,12 @@ from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
-from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
+from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, make_table_command, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs, RasterOrigin
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import (
     MAX_ID,
     PAPER_SCHEME,
@@ -61,6 +61,9 @@ LayerSource = RasterLayer | PolygonLayer
 """What becomes a layer of a map."""
 
 OrthoBands = Literal["grey", "rgb"]
+
+_NAMED = 3
+"""Values that a finding names."""
 
 _RGB: tuple[Use, ...] = ("red", "green", "blue")
 
@@ -273,6 +276,19 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
     return tuple(findings)
 
 
+def _find_assumed(terrain: LayerSource | None) -> tuple[Finding, ...]:
+    """Return the finding, if any, that values of the terrain are read as the paper's classes, although nothing names them."""
+    values = [] if terrain is None else terrain.list_values()
+    names = {entry.id: entry.name for entry in PAPER_SCHEME.table.classes}
+    known = [f"{value} as {names[value]}" for value in values if value in names]
+    if not known:
+        return ()
+    meaning = ", ".join(known[:_NAMED]) + (" …" if len(known) > _NAMED else "")
+    remedy = Remedy("table", command=make_table_command(values))
+    subject = Subject("layer", "terrain")
+    return (make_finding("classes-assumed", subject, names={"meaning": meaning}, remedies=[remedy]),)
+
+
 def _make_facts(
     grid: MapGrid,
     layers: Mapping[str, LayerSource],
@@ -293,7 +309,10 @@ def _make_facts(
         height_max_m=layers["height"].tally.high,
         class_share=shares.pop("terrain", {}),
         class_shares=shares,
-        findings=_find_all(layers, covered),
+        findings=(
+            *(_find_assumed(layers.get("terrain")) if classes_from == "default" else ()),
+            *_find_all(layers, covered),
+        ),
         classes_from=classes_from,
         inputs=inputs,
         origins=origins,
@@ -367,7 +386,7 @@ def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], 
     if not isinstance(row, dict):
         problems.append(f"{where}: expected a table with {', '.join(_COLUMNS)}")
         return None
-    problems += [f"{where}: {name} is missing" for name in _COLUMNS if row.get(name) in (None, "")]
+    problems += [f"{where}: {name} is missing" for name in _COLUMNS if row.get(name) in (None, "", "?")]
     problems += [
         f"{where}: {name!r} is not a column (expected {', '.join(_COLUMNS)})" for name in row if name not in _COLUMNS
     ]

@@ -283,7 +283,14 @@ class RasterLayer:
         unnamed, names = sorted(self.tally.unnamed), self.raster.names
         values = ", ".join(f"{v} ({names[v]})" if v in names else str(v) for v in unnamed[:_LISTED])
         values += " …" if len(unnamed) > _LISTED else ""
-        return f"{self.label}: none of its values {values} is in the class table (which names {named}); give one with {option}"
+        return (
+            f"{self.label}: none of its values {values} is in the class table (which names {named}); give one with {option}; "
+            f"this writes one to fill in: {make_table_command(unnamed)}"
+        )
+
+    def list_values(self) -> list[int]:
+        """Return the values that were found, if the class table maps each value to itself."""
+        return sorted({*(np.flatnonzero(self.tally.by_class[1:]) + 1).tolist(), *self.tally.unnamed})
 
     def list_findings(self) -> tuple[Finding, ...]:
         """Return the raster's findings, a datum shift that is known only roughly, and values that are no class."""
@@ -334,6 +341,12 @@ class RasterLayer:
             mean(source, lattice, parts, part)
         else:
             resample_bilinear(source, lattice, part)
+
+
+def make_table_command(values: Sequence[int]) -> str:
+    """Return the shell command that writes a class table of values; each ``?`` has to be filled in before the table is read."""
+    rows = ["value,id,name,traversable", *(f"{value},{number},?,?" for number, value in enumerate(values, 1))]
+    return " ".join(['printf "%s\\n"', *(f'"{row}"' for row in rows), "> classes.csv"])
 
 
 def _compute_source_px_per_px(lattice: NDArray[np.float64]) -> float:

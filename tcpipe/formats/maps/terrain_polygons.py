@@ -60,6 +60,8 @@ class PolygonLayer:
     polygons: NDArray[np.object_]
     ids: NDArray[np.uint8]
     findings: tuple[Finding, ...]
+    numbers: frozenset[int]
+    """Numbers that stand for classes in the file, in place of names."""
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
 
@@ -80,6 +82,10 @@ class PolygonLayer:
         """Return what was observed when they were placed."""
         return self.findings
 
+    def list_values(self) -> list[int]:
+        """Return the numbers that stand for classes in the file."""
+        return sorted(self.numbers)
+
 
 def is_drawn(paths: Sequence[Path]) -> bool:
     """Return whether terrain files are polygons; `MapError` if some are and some are not."""
@@ -98,7 +104,8 @@ def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: M
     """
     features, problems = _read_all(paths)
     label, name = label_files(paths), label_files([Path(path.name) for path in paths])
-    ids = [_read_class_id(feature, scheme, problems) for feature in features]
+    numbers: set[int] = set()
+    ids = [_read_class_id(feature, scheme, problems, numbers) for feature in features]
     if not features:
         problems.append(f"{label}: no polygon in it; draw the terrain as polygons")
     if problems:
@@ -111,7 +118,8 @@ def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: M
     polygons, id_of_each = polygons[on_map], id_of_each[on_map]
     findings = (*projection.find_rough_shift(_TERRAIN), *_find_overlaps(polygons, id_of_each, scheme))
     terrain = make_paper_layers(["terrain"], scheme.table)["terrain"]
-    return PolygonLayer(terrain, label, name, grid, polygons, id_of_each, findings, shapely.STRtree(polygons))
+    tree = shapely.STRtree(polygons)
+    return PolygonLayer(terrain, label, name, grid, polygons, id_of_each, findings, frozenset(numbers), tree)
 
 
 def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
@@ -127,8 +135,8 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
     return features, problems
 
 
-def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
-    """Return a feature's class id; 0, and a line in ``problems``, where it has none."""
+def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str], numbers: set[int]) -> int:
+    """Return a feature's class id; 0, and a line in ``problems``, if it has none. A number in place of a name is added to ``numbers``."""
     given = next((value for name, value in feature.properties.items() if name.casefold() == PROPERTY), None)
     if given is None:
         there = shorten_value(", ".join(sorted(feature.properties)) or "none")[1:-1]
@@ -142,6 +150,7 @@ def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[
     if found is None and number is not None:
         known = {entry.id: entry.id for entry in scheme.table.classes} | dict(scheme.id_by_value)
         found = known.get(number)
+        numbers.add(number)
     if found is None:
         names = ", ".join(entry.name for entry in scheme.table.classes)
         problems.append(f"{feature.where}: {PROPERTY} {shorten_value(given)} is not in the class table ({names})")

@@ -183,7 +183,8 @@ def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
     kind = {"": "scaled", "m": "metres, converted by mistake", "ft": "in feet"}.get(unit, f"in {unit}")
     return (
         f"map {source.name}: its heights rise by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}) where run {run_id} rises by "
-        f"1 m: they are {kind}; correct the raster ({mended}) and add the map again (tcpipe add-map {source.name} --height FILE ... --force)"
+        f"1 m: they are {kind}; correct the raster ({mended}) and add the map again "
+        f"(tcpipe add-map {source.name} --height FILE ... --force)"
     )
 
 
@@ -264,7 +265,7 @@ def find_removed_by_ground(
     *,
     shifts: Sequence[Shifts],
 ) -> tuple[Removal, tuple[Finding, ...]]:
-    """Return metres of all runs by reason, for each class and slope, and findings where the used share is uneven.
+    """Return metres of all runs by reason, for each class and slope, and findings on uneven shares and on classes not traversable.
 
     ``used`` are the rows of ``segments`` that are train, test or unseen. Of overlapping ``sources`` the first counts; maps without a
     terrain layer give no classes. ``shifts`` are those of the runs, by map.
@@ -288,7 +289,29 @@ def find_removed_by_ground(
     classes = list_groups(by_class, names, _REASONS) if grounds else ()
     traversable = set(table.names()[table.traversable()].tolist())
     findings = _find_bias([group for group in classes if group.name in traversable], "class")
-    return Removal(classes, slopes), (*findings, *_find_bias(slopes, "slope"))
+    closed = [group for group in classes if group.name in set(table.names()) - traversable - {""}]
+    blocked = _find_blocked(closed, sum(group.driven_m for group in classes), grounds[0][0]) if closed else []
+    return Removal(classes, slopes), (*blocked, *findings, *_find_bias(slopes, "slope"))
+
+
+def _find_blocked(groups: Sequence[Group], driven_m: float, source: MapFile) -> list[Finding]:
+    """Return findings on classes that are not traversable, on which much of the distance was driven."""
+    names, least = source.classes.names(), read_threshold("driven-not-traversable", "min_driven_fraction")
+    return [
+        make_finding(
+            "driven-not-traversable",
+            Subject("class", group.name),
+            names={
+                "values": ", ".join(
+                    str(value) for value, number in source.id_by_value.items() if names[number] == group.name
+                )
+            },
+            driven_m=group.driven_m,
+            driven_fraction=group.driven_m / driven_m,
+        )
+        for group in groups
+        if group.driven_m > least * driven_m
+    ]
 
 
 def _list_spans(segments: pa.Table, used: NDArray[np.int64]) -> dict[str, _Spans]:

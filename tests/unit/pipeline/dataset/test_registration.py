@@ -1,13 +1,23 @@
 """A map that is off the tracks is said to be, run by run, when a dataset is built."""
 
 import numpy as np
-import pyarrow as pa
 import pytest
 import rasterio
 from made_tracks import with_columns
 from physics_model import PhysicsModel
 from raster_commands import run_rio
-from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, open_world, put_map, segments
+from synthetic_store import (
+    GEOID_M,
+    WORLD,
+    add_run,
+    add_world,
+    lanes,
+    open_world,
+    put_map,
+    segments,
+    track_at,
+    winding,
+)
 
 from tcpipe import open_dataset
 from tcpipe.errors import MapError
@@ -21,31 +31,6 @@ from tcpipe.planning.path_files import choose_map
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, select_findings
-from tcpipe.tables.levels import MASKED_TRACK
-
-GEOID_M = 46.3
-
-
-def track_at(xy_m, ground_xy_m, *, std_m=0.02, scale=1.0, seed=3):
-    """Return a track at ``xy_m`` whose heights are those of the world's ground at ``ground_xy_m`` [m from its middle]."""
-    count = len(xy_m)
-    position = lonlat(xy_m)
-    height = scale * WORLD.height(WORLD.x_m + ground_xy_m[:, 0], WORLD.y_m + ground_xy_m[:, 1]) + GEOID_M
-    noise = np.random.default_rng(seed).normal(0.0, 0.01, count)
-    given = {"lon_deg": position[:, 0], "lat_deg": position[:, 1], "alt_m": height + noise}
-    given |= {"x_std_m": np.full(count, std_m), "y_std_m": np.full(count, std_m)}
-    rest = {
-        column.name: np.zeros(count, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
-        for column in MASKED_TRACK.columns
-        if column.name not in given
-    }
-    return MASKED_TRACK.table(**given, **rest)
-
-
-def winding(count=3000):
-    """A drive of 170 m inside the site."""
-    s = np.linspace(0.0, 4.0 * np.pi, count)
-    return np.stack([14.0 * np.sin(s), 13.0 * np.cos(1.5 * s)], 1)
 
 
 def build_with(directory, track, recipe=None):
