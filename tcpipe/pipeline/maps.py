@@ -174,7 +174,7 @@ def _match_files(text: str) -> list[str]:
 def _describe_no_file(text: str) -> str:
     """Say why a text names no file."""
     if "://" in text or text.startswith("/vsi"):
-        return f"{text}: is an address, expected a file on this machine: gdal_translate {text} local.tif"
+        return f"{text}: is an address, expected a file on this machine: rio convert {text} local.tif"
     if Path(text).is_dir():
         return f"{text}: is a directory, expected its files: '{text.rstrip('/')}/*.tif'"
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"

@@ -45,7 +45,9 @@ def parse_crs(text: str, *, where: str) -> CRS:
         crs = crs.sub_crs_list[0] if crs.is_compound else CRS(crs.source_crs)
     crs = crs.to_2d()
     if crs.geodetic_crs is None or not (crs.is_projected or crs.is_geographic):
-        raise MapError(f"{where}: the CRS {crs.name!r} is local (expected a projected or geographic CRS)")
+        raise MapError(
+            f"{where}: the CRS {crs.name!r} is local, expected a projected or geographic one; if you know which, give --crs EPSG:n"
+        )
     radius_m = _read_ellipsoid(crs)[0]
     if abs(radius_m / _EARTH_RADIUS_M - 1.0) > 0.02:
         raise MapError(
@@ -61,14 +63,13 @@ def _bind_shift(crs: CRS, bound: CRS, where: str) -> CRS:
     """Return a CRS with the datum shift of a bound one, without it if the shift is zero; `MapError` for a shift in a grid file."""
     shift = bound.coordinate_operation
     assert shift is not None  # noqa: S101  (a bound CRS has one)
-    grids = [grid.short_name for grid in shift.grids]
-    if any(name != "@null" for name in grids):
+    if any(grid.short_name != "@null" for grid in shift.grids):
         raise MapError(
-            f"{where}: the datum shift of its CRS is in the grid file {grids[0]!r}, which tcpipe does not open; transform the raster: "
-            "rio warp in.tif out.tif --dst-crs EPSG:n"
+            f"{where}: the datum shift of its CRS is in the grid file {shift.grids[0].short_name!r}, which tcpipe does not open; "
+            "transform the raster: rio warp in.tif out.tif --dst-crs EPSG:n"
         )
     is_zero = bool(shift.towgs84) and not any(shift.towgs84)
-    if grids or (is_zero and np.allclose(_read_ellipsoid(crs), _read_ellipsoid(_WGS84), rtol=1e-8)):
+    if shift.grids or (is_zero and np.allclose(_read_ellipsoid(crs), _read_ellipsoid(_WGS84), rtol=1e-8)):
         return crs
     return BoundCRS(crs, CRS(bound.target_crs).to_2d(), shift)
 

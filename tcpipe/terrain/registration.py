@@ -73,8 +73,9 @@ _NORTH_M, _EAST_M = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, 
 _PARABOLOID = np.linalg.pinv(
     np.stack([np.ones_like(_EAST_M), _EAST_M, _NORTH_M, _EAST_M**2, _EAST_M * _NORTH_M, _NORTH_M**2], axis=1)
 )
-_UNITS_M = {"ft": 0.3048, "dm": 0.1, "cm": 0.01, "mm": 0.001}
-"""Units that heights are stored in instead of metres [m]."""
+_UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
+_UNITS |= {1.0 / metres: "m" for metres in _UNITS}
+"""Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
 
 _MAX_UNIT_ERROR = 0.07
 """Relative difference of a scale from a unit up to which it is that unit."""
@@ -111,12 +112,9 @@ class HeightScale:
         return self.value + margin < self.explained / most or self.value - margin > most
 
     def find_unit(self) -> str:
-        """Return the unit of the map's heights, ``m`` if they were metres before they were converted; "" if it is no known unit."""
+        """Return the unit of the map's heights; "" if it is no known unit."""
         error = max(3.0 * self.std / self.value, _MAX_UNIT_ERROR)
-        units = {metres: unit for unit, metres in _UNITS_M.items()} | {
-            1.0 / metres: "m" for metres in _UNITS_M.values()
-        }
-        return next((unit for metres, unit in units.items() if abs(self.value / metres - 1.0) < error), "")
+        return next((unit for scale, unit in _UNITS.items() if abs(self.value / scale - 1.0) < error), "")
 
     def is_off(self) -> bool:
         """Whether map and track surely do not rise alike."""
@@ -295,11 +293,9 @@ def _find_least(spread: FloatArray) -> tuple[int, int]:
 def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArray) -> HeightScale:
     """Return the scale of heights, fitted with a tilt of the map unless it is that of a known unit: no map is tilted so much."""
     whole, tilt = _regress_heights(ground_m, height_m), xy_m - xy_m.mean(axis=0)
-    return (
-        whole
-        if whole.is_wrong() and whole.find_unit()
-        else _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
-    )
+    if whole.is_wrong() and whole.find_unit():
+        return whole
+    return _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
 
 
 def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:

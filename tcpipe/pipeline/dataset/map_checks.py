@@ -54,7 +54,7 @@ _REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_le
 """Reason of each metre of a track; losses at sampling and to the split's buffer are one entry."""
 _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
 
-_DATUM = "map-height-datum"
+_DATUM, _BLOCKED = "map-height-datum", "driven-not-traversable"
 _MOST_RUNS = 30
 """Registered together at most: more of them thin the points of each."""
 
@@ -182,9 +182,8 @@ def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
         mended = f"rio calc {factor} {file} scaled.tif --dtype float32 --co nodata=nan"
     kind = {"": "scaled", "m": "metres, converted by mistake", "ft": "in feet"}.get(unit, f"in {unit}")
     return (
-        f"map {source.name}: its heights rise by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}) where run {run_id} rises by "
-        f"1 m: they are {kind}; correct the raster ({mended}) and add the map again "
-        f"(tcpipe add-map {source.name} --height FILE ... --force)"
+        f"map {source.name}: where run {run_id} rises by 1 m, it rises by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}): "
+        f"its heights are {kind}; correct the raster ({mended}) and add it again: tcpipe add-map {source.name} --height FILE ... --force"
     )
 
 
@@ -289,29 +288,24 @@ def find_removed_by_ground(
     classes = list_groups(by_class, names, _REASONS) if grounds else ()
     traversable = set(table.names()[table.traversable()].tolist())
     findings = _find_bias([group for group in classes if group.name in traversable], "class")
-    closed = [group for group in classes if group.name in set(table.names()) - traversable - {""}]
-    blocked = _find_blocked(closed, sum(group.driven_m for group in classes), grounds[0][0]) if closed else []
+    blocked = _find_blocked(classes, grounds[0][0]) if grounds else []
     return Removal(classes, slopes), (*blocked, *findings, *_find_bias(slopes, "slope"))
 
 
-def _find_blocked(groups: Sequence[Group], driven_m: float, source: MapFile) -> list[Finding]:
+def _find_blocked(groups: Sequence[Group], source: MapFile) -> list[Finding]:
     """Return findings on classes that are not traversable, on which much of the distance was driven."""
-    names, least = source.classes.names(), read_threshold("driven-not-traversable", "min_driven_fraction")
-    return [
-        make_finding(
-            "driven-not-traversable",
+    closed = {entry.name: entry.id for entry in source.classes.classes if not entry.traversable}
+    driven_m = sum(group.driven_m for group in groups)
+    least_m = driven_m * read_threshold(_BLOCKED, "min_driven_fraction")
+    findings = []
+    for group in (group for group in groups if group.name in closed and group.driven_m > least_m):
+        values = ", ".join(str(value) for value, number in source.id_by_value.items() if number == closed[group.name])
+        subject, driven = (
             Subject("class", group.name),
-            names={
-                "values": ", ".join(
-                    str(value) for value, number in source.id_by_value.items() if names[number] == group.name
-                )
-            },
-            driven_m=group.driven_m,
-            driven_fraction=group.driven_m / driven_m,
+            {"driven_m": group.driven_m, "driven_fraction": group.driven_m / driven_m},
         )
-        for group in groups
-        if group.driven_m > least * driven_m
-    ]
+        findings.append(make_finding(_BLOCKED, subject, names={"values": values}, **driven))
+    return findings
 
 
 def _list_spans(segments: pa.Table, used: NDArray[np.int64]) -> dict[str, _Spans]:

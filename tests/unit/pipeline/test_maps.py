@@ -290,8 +290,8 @@ def test_what_names_no_file_is_said(site, store, tmp_path):
     given = {"height": [tmp_path, "https://x.org/dem.tif", "/vsicurl/x.tif"], "ortho": str(tmp_path / "*.jpg")}
     assert refused(store, "m", UsageError, **given) == (
         f"{tmp_path}: is a directory, expected its files: '{tmp_path}/*.tif'",
-        "https://x.org/dem.tif: is an address, expected a file on this machine: gdal_translate https://x.org/dem.tif local.tif",
-        "/vsicurl/x.tif: is an address, expected a file on this machine: gdal_translate /vsicurl/x.tif local.tif",
+        "https://x.org/dem.tif: is an address, expected a file on this machine: rio convert https://x.org/dem.tif local.tif",
+        "/vsicurl/x.tif: is an address, expected a file on this machine: rio convert /vsicurl/x.tif local.tif",
         f"{tmp_path}/*.jpg: no file matches",
     )
 
