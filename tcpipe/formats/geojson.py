@@ -62,7 +62,7 @@ def read_regions(path: Path) -> Regions:
     if not problems and not polygons["train_test"]:
         problems.append(f"{path}: every feature is unseen or exclude: nothing could train; add a train_test polygon")
     if not problems:
-        problems += _find_wide(path, polygons) or _find_disagreements(path, polygons)
+        problems += _find_disagreements(path, polygons)
     if problems:
         raise RegionError(*shorten_problems(problems))
     return Regions(*(shapely.union_all(polygons[kind]) for kind in KINDS))
@@ -230,19 +230,16 @@ def _read_geometry(geometry: Json) -> NDArray[np.object_]:
     return np.array([shapely.force_2d(shape)])
 
 
-def _find_wide(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> list[str]:
-    """Return the problem, if any, that regions are larger than a site can be, as local metres are if they are read as degrees."""
+def _find_disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
+    """Yield the problems of regions together: an extent beyond any site, as of local metres read as degrees, and overlaps."""
     west, south, east, north = shapely.total_bounds([part for parts in polygons.values() for part in parts])
     width_km = (east - west) * np.cos(np.radians(np.clip(0.0, south, north))) * _KM_PER_DEG
     height_km = (north - south) * _KM_PER_DEG
-    size = (
-        f"{path}: its regions are {width_km:.0f} x {height_km:.0f} km, expected at most {_MAX_WIDTH_KM:.0f}; GeoJSON is in degrees: "
-        "if these are metres, export the regions as EPSG:4326 (rio bounds height.tif gives the map's outline so)"
-    )
-    return [size] if max(width_km, height_km) > _MAX_WIDTH_KM else []
-
-
-def _find_disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
+    if max(width_km, height_km) > _MAX_WIDTH_KM:
+        yield (
+            f"{path}: its regions are {width_km:.0f} x {height_km:.0f} km, expected at most {_MAX_WIDTH_KM:.0f}; GeoJSON is in degrees: "
+            "if these are metres, export the regions as EPSG:4326 (rio bounds height.tif gives the map's outline so)"
+        )
     train_test, unseen = shapely.union_all(polygons["train_test"]), shapely.union_all(polygons["unseen"])
     both = shapely.intersection(train_test, unseen)
     if shapely.is_empty(both):

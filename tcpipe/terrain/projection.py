@@ -63,13 +63,14 @@ def _bind_shift(crs: CRS, bound: CRS, where: str) -> CRS:
     """Return a CRS with the datum shift of a bound one, without it if the shift is zero; `MapError` for a shift in a grid file."""
     shift = bound.coordinate_operation
     assert shift is not None  # noqa: S101  (a bound CRS has one)
-    if any(grid.short_name != "@null" for grid in shift.grids):
+    grids = {grid.short_name for grid in shift.grids}
+    if grids - {"@null"}:
         raise MapError(
-            f"{where}: the datum shift of its CRS is in the grid file {shift.grids[0].short_name!r}, which tcpipe does not open; "
+            f"{where}: the datum shift of its CRS is in the grid file {', '.join(grids)!r}, which tcpipe does not open; "
             "transform the raster: rio warp in.tif out.tif --dst-crs EPSG:n"
         )
     is_zero = bool(shift.towgs84) and not any(shift.towgs84)
-    if shift.grids or (is_zero and np.allclose(_read_ellipsoid(crs), _read_ellipsoid(_WGS84), rtol=1e-8)):
+    if grids or (is_zero and np.allclose(_read_ellipsoid(crs), _read_ellipsoid(_WGS84), rtol=1e-8)):
         return crs
     return BoundCRS(crs, CRS(bound.target_crs).to_2d(), shift)
 

@@ -3,8 +3,7 @@
 A track's heights and the map's differ by a constant (ellipsoid against geoid, the robot's own height) that says nothing. What is left is
 the shape of the ground; the horizontal shift at which the two shapes agree best is searched over a small window, as in terrain-aided
 navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary no shift can be
-told, and none is. The track's heights are also regressed on the map's, which gives the unit of the map: one in feet rises by 3.28 where
-the track rises by one.
+told, and none is. The regression of the track's heights on the map's gives the unit of the map, such as feet.
 
 The shift is fitted together with a tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, and from
 the misfit itself: along slopes that are noisy a step is too short.
@@ -76,9 +75,7 @@ _PARABOLOID = np.linalg.pinv(
 _UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
 _UNITS |= {1.0 / metres: "m" for metres in _UNITS}
 """Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
-
 _MAX_UNIT_ERROR = 0.07
-"""Relative difference of a scale from a unit up to which it is that unit."""
 
 _KNOWN_SCALE = 0.03
 _EXPLAINED = 0.9

@@ -276,7 +276,7 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
 
 def _find_assumed(terrain: LayerSource | None) -> tuple[Finding, ...]:
     """Return the finding, if any, that values of the terrain are read as the paper's classes, although nothing names them."""
-    values = [] if terrain is None else terrain.list_values()
+    values = [] if terrain is None else terrain.values
     known = [f"{entry.id} as {entry.name}" for entry in PAPER_SCHEME.table.classes if entry.id in values]
     if not known:
         return ()

@@ -369,7 +369,7 @@ def _refuse_unplaced(dataset: Any, path: Path) -> None:
         raise MapError(f"{path}: the file contains no bands itself; name one of its subdatasets as a GeoTIFF")
     if dataset.crs is None and dataset.gcps[0]:
         raise MapError(
-            f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it first (gdalwarp -tps in.tif out.tif)"
+            f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it: rio warp in.tif out.tif --dst-crs EPSG:n"
         )
     if dataset.transform.is_identity:
         raise MapError(
@@ -420,7 +420,10 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
 def _describe_colours(dataset: Any, path: Path, bands: Sequence[int]) -> str:
     """Return the problem that classes are shown by colours, with the commands that make each a value, and a table of them."""
     shape = (3, min(dataset.height, _LOOKED_AT_PX), min(dataset.width, _LOOKED_AT_PX))
-    red, green, blue = dataset.read(bands, out_shape=shape).astype(np.int64)
+    try:
+        red, green, blue = dataset.read(bands, out_shape=shape).astype(np.int64)
+    except RasterioError as error:
+        raise MapError(f"{path}: cannot be read; the file is damaged: {describe_error(error)}") from error
     values, counts = np.unique((red << 16) + (green << 8) + blue, return_counts=True)
     names = {value: f"#{value:06x}" for value in sorted(values[np.argsort(-counts)][:_MAX_COLOURS].tolist())}
     r, g, b = (f"(read 1 {band} 'int32')" for band in bands)

@@ -235,11 +235,9 @@ class Tally:
 
     def _describe_range(self, label: str) -> str:
         """Return the problem that heights are no dry land, with the command that makes them no data."""
-        wrong, sign, limit = self.high, ">", _HIGHEST_M
-        if self.low < _DEEPEST_M:
-            wrong, sign, limit = self.low, "<", _DEEPEST_M
-        is_new = not math.isfinite(self.nodata)
-        tag, more = (-9999.0, " --dtype float32 --co nodata=-9999") if is_new else (self.nodata, "")
+        wrong, sign, limit = (self.low, "<", _DEEPEST_M) if self.low < _DEEPEST_M else (self.high, ">", _HIGHEST_M)
+        is_tagged = math.isfinite(self.nodata)
+        tag, more = (self.nodata, "") if is_tagged else (-9999.0, " --dtype float32 --co nodata=-9999")
         return (
             f"{label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; if {wrong:.6g} is no data: rio calc "
             f'--not-masked "(where ({sign} (read 1 1) {limit:g}) {tag:.9g} (read 1 1))" in.tif out.tif{more}; '
@@ -301,8 +299,9 @@ class RasterLayer:
             f"this writes one to fill in: {make_table_command(dict.fromkeys(unnamed, '?'))}"
         )
 
-    def list_values(self) -> list[int]:
-        """Return the values that were found, if the class table maps each value to itself."""
+    @property
+    def values(self) -> Sequence[int]:
+        """The values that were found, if the class table maps each value to itself."""
         return sorted({*(np.flatnonzero(self.tally.by_class[1:]) + 1).tolist(), *self.tally.unnamed})
 
     def list_findings(self) -> tuple[Finding, ...]:

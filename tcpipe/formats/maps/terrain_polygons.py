@@ -60,7 +60,7 @@ class PolygonLayer:
     polygons: NDArray[np.object_]
     ids: NDArray[np.uint8]
     findings: tuple[Finding, ...]
-    numbers: frozenset[int]
+    values: Sequence[int]
     """Numbers that stand for classes in the file, in place of names."""
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
@@ -81,10 +81,6 @@ class PolygonLayer:
     def list_findings(self) -> tuple[Finding, ...]:
         """Return what was observed when they were placed."""
         return self.findings
-
-    def list_values(self) -> list[int]:
-        """Return the numbers that stand for classes in the file."""
-        return sorted(self.numbers)
 
 
 def is_drawn(paths: Sequence[Path]) -> bool:
@@ -124,7 +120,7 @@ def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: M
         findings = (changed, *findings)
     terrain = make_paper_layers(["terrain"], scheme.table)["terrain"]
     tree = shapely.STRtree(polygons)
-    return PolygonLayer(terrain, label, name, grid, polygons, id_of_each, findings, frozenset(numbers), tree)
+    return PolygonLayer(terrain, label, name, grid, polygons, id_of_each, findings, sorted(numbers), tree)
 
 
 def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
@@ -142,7 +138,7 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
 
 def _find_class(feature: PolygonFeature) -> Any:
     """Return the property that names a feature's class; None if there is none or it is empty."""
-    found = {name.casefold(): value for name, value in reversed(feature.properties.items())}.get(PROPERTY)
+    found = next((value for name, value in feature.properties.items() if name.casefold() == PROPERTY), None)
     return None if found == "" else found
 
 

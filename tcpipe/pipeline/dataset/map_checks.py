@@ -178,8 +178,9 @@ def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
     file = "FILE" if "…" in file else shlex.quote(file)
     mended = f"rio edit-info {file} --bidx 1 --units {unit}"
     if not unit:
-        factor = f"\"(* {scale.value:.3g} (read 1 1 'float64'))\""
-        mended = f"rio calc {factor} {file} scaled.tif --dtype float32 --co nodata=nan"
+        mended = (
+            f"rio calc \"(* {scale.value:.3g} (read 1 1 'float64'))\" {file} scaled.tif --dtype float32 --co nodata=nan"
+        )
     kind = {"": "scaled", "m": "metres, converted by mistake", "ft": "in feet"}.get(unit, f"in {unit}")
     return (
         f"map {source.name}: where run {run_id} rises by 1 m, it rises by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}): "
@@ -295,16 +296,12 @@ def find_removed_by_ground(
 def _find_blocked(groups: Sequence[Group], source: MapFile) -> list[Finding]:
     """Return findings on classes that are not traversable, on which much of the distance was driven."""
     closed = {entry.name: entry.id for entry in source.classes.classes if not entry.traversable}
-    driven_m = sum(group.driven_m for group in groups)
-    least_m = driven_m * read_threshold(_BLOCKED, "min_driven_fraction")
+    driven_m, least = sum(group.driven_m for group in groups), read_threshold(_BLOCKED, "min_driven_fraction")
     findings = []
-    for group in (group for group in groups if group.name in closed and group.driven_m > least_m):
+    for group in (group for group in groups if group.name in closed and group.driven_m > least * driven_m):
         values = ", ".join(str(value) for value, number in source.id_by_value.items() if number == closed[group.name])
-        subject, driven = (
-            Subject("class", group.name),
-            {"driven_m": group.driven_m, "driven_fraction": group.driven_m / driven_m},
-        )
-        findings.append(make_finding(_BLOCKED, subject, names={"values": values}, **driven))
+        subject, names, share = Subject("class", group.name), {"values": values}, group.driven_m / driven_m
+        findings.append(make_finding(_BLOCKED, subject, names=names, driven_m=group.driven_m, driven_fraction=share))
     return findings
 
 

@@ -171,7 +171,8 @@ def test_the_command_prints_a_few_plain_lines(site, store):
     ]
     assert lines[2].startswith("height   100 % covered, from height.tif: 6")
     assert lines[4].startswith("terrain  100 % covered, from terrain.tif: ")
-    assert len(lines) == 5
+    assert lines[5].endswith("[classes-assumed]")
+    assert len(lines) == 6
 
 
 def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, store):
