@@ -39,6 +39,7 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
+from tcpipe.terrain.classes import PAPER_SCHEME
 
 STANDING_WATT = 90.0
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)
@@ -58,6 +59,32 @@ def lanes(y_m, x_from_m, x_to_m):
     x = np.arange(x_from_m, x_to_m - 0.5)
     start = np.array([(east, north) for north in np.atleast_1d(y_m) for east in x])
     return start, np.add(start, (1.0, 0.0))
+
+
+GEOID_M = 46.3
+"""Height of the geoid above the ellipsoid at the site."""
+
+
+def track_at(xy_m, ground_xy_m, *, std_m=0.02, scale=1.0, seed=3):
+    """Return a track at ``xy_m`` whose heights are those of the world's ground at ``ground_xy_m`` [m from its middle]."""
+    count = len(xy_m)
+    position = lonlat(xy_m)
+    height = scale * WORLD.height(WORLD.x_m + ground_xy_m[:, 0], WORLD.y_m + ground_xy_m[:, 1]) + GEOID_M
+    noise = np.random.default_rng(seed).normal(0.0, 0.01, count)
+    given = {"lon_deg": position[:, 0], "lat_deg": position[:, 1], "alt_m": height + noise}
+    given |= {"x_std_m": np.full(count, std_m), "y_std_m": np.full(count, std_m)}
+    rest = {
+        column.name: np.zeros(count, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
+        for column in MASKED_TRACK.columns
+        if column.name not in given
+    }
+    return MASKED_TRACK.table(**given, **rest)
+
+
+def winding(count=3000):
+    """A drive of 170 m inside the site."""
+    s = np.linspace(0.0, 4.0 * np.pi, count)
+    return np.stack([14.0 * np.sin(s), 13.0 * np.cos(1.5 * s)], 1)
 
 
 def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="husky"):
@@ -239,7 +266,8 @@ def _build_world(name, layers):
     here = _BUILT / "-".join((name, *layers))
     here.mkdir()
     rasters = WORLD.write(here, pixel_size_m=0.1)
-    build_map(here / "map.zarr", name=name, **{layer: rasters[layer] for layer in ("height", *layers)})
+    files = {layer: rasters[layer] for layer in ("height", *layers)}
+    build_map(here / "map.zarr", name=name, agreed=PAPER_SCHEME, **files)
     return here / "map.zarr"
 
 
@@ -259,7 +287,7 @@ def open_world(directory: Path, **how) -> Store:
 def put_map(store, name, **how):
     """Put a map into the store, over one that is there, without a quick look."""
     with store.new_map(name, after=store.map_number(name)) as path:
-        build_map(path, name=name, **how)
+        build_map(path, name=name, **{"agreed": PAPER_SCHEME, **how})
 
 
 def small_store(directory: Path) -> Store:

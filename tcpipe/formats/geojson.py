@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 import shapely
@@ -25,6 +25,7 @@ KINDS = ("train_test", "unseen", "exclude")
 _GEOMETRIES = ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon", "GeometryCollection")
 _WGS84_NAMES = ("CRS84", "4326")
 _MAX_OVERLAP_M2 = 0.01
+_MAX_WIDTH_KM, _KM_PER_DEG = 1_000.0, 111.32
 MAX_BYTES = 50_000_000
 """Of a GeoJSON file."""
 
@@ -74,6 +75,8 @@ class PolygonFeature:
     where: str
     properties: Mapping[str, Json]
     polygons: tuple[BaseGeometry, ...]
+    repaired: int = 0
+    """Polygons that crossed or touched themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,15 +104,27 @@ class FeatureCollection:
     type: str = "FeatureCollection"
 
 
-def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
+def read_polygons(path: Path, *, is_terrain: bool = False) -> tuple[list[PolygonFeature], list[str]]:
     """Read the polygon features of a file in their order, and one line for every unsound geometry.
+
+    Of terrain, features without a geometry have no polygons, and polygons that cross or touch themselves are repaired.
 
     `RegionError`: not GeoJSON, or in another CRS.
     """
     features: list[PolygonFeature] = []
     problems: list[str] = []
     for where, properties, geometry in _iterate_features(path):
-        features.append(PolygonFeature(where, properties, tuple(_iterate_polygons(where, geometry, problems))))
+        invalid: list[BaseGeometry] = []
+        is_empty = geometry is None or (isinstance(geometry, dict) and geometry.get("coordinates") == [])
+        found = (
+            ()
+            if is_terrain and is_empty
+            else _iterate_polygons(where, geometry, problems, invalid if is_terrain else None)
+        )
+        polygons = list(found)  # fills ``invalid``
+        mended = shapely.get_parts(shapely.get_parts(shapely.make_valid(np.array(invalid, dtype=object))))
+        polygons += [part for part in mended if part.geom_type == "Polygon"]
+        features.append(PolygonFeature(where, properties, tuple(polygons), len(invalid)))
     return features, problems
 
 
@@ -176,8 +191,10 @@ def _iterate_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Jso
         yield where, properties if isinstance(properties, dict) else {}, feature.get("geometry")
 
 
-def _iterate_polygons(where: str, geometry: Json, problems: list[str]) -> Iterator[BaseGeometry]:
-    """Yield the sound polygons of one geometry object; add a line to ``problems`` for every unsound one."""
+def _iterate_polygons(
+    where: str, geometry: Json, problems: list[str], invalid: list[Any] | None
+) -> Iterator[BaseGeometry]:
+    """Yield the sound polygons of one geometry object; add others to ``invalid``, or a line to ``problems``."""
     try:
         parts = _read_geometry(geometry)
     except ValueError as error:
@@ -190,6 +207,8 @@ def _iterate_polygons(where: str, geometry: Json, problems: list[str]) -> Iterat
             problems.append(f"{where}: geometry is {part.geom_type!r}, expected Polygon or MultiPolygon")
         elif problem := _find_lonlat_problem(shapely.get_coordinates(part)):
             problems.append(f"{where}: {problem}")
+        elif invalid is not None and not shapely.is_valid(part):
+            invalid.append(part)
         elif not shapely.is_valid(part):
             reason = explain_validity(part)
             problems.append(f"{where}: not a sound polygon: {reason} (lon lat); redraw it without crossing itself")
@@ -212,6 +231,15 @@ def _read_geometry(geometry: Json) -> NDArray[np.object_]:
 
 
 def _find_disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
+    """Yield the problems of regions together: an extent beyond any site, as of local metres read as degrees, and overlaps."""
+    west, south, east, north = shapely.total_bounds([part for parts in polygons.values() for part in parts])
+    width_km = (east - west) * np.cos(np.radians(np.clip(0.0, south, north))) * _KM_PER_DEG
+    height_km = (north - south) * _KM_PER_DEG
+    if max(width_km, height_km) > _MAX_WIDTH_KM:
+        yield (
+            f"{path}: its regions are {width_km:.0f} x {height_km:.0f} km, expected at most {_MAX_WIDTH_KM:.0f}; GeoJSON is in degrees: "
+            "if these are metres, export the regions as EPSG:4326 (rio bounds height.tif gives the map's outline so)"
+        )
     train_test, unseen = shapely.union_all(polygons["train_test"]), shapely.union_all(polygons["unseen"])
     both = shapely.intersection(train_test, unseen)
     if shapely.is_empty(both):

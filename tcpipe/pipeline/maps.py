@@ -174,7 +174,7 @@ def _match_files(text: str) -> list[str]:
 def _describe_no_file(text: str) -> str:
     """Say why a text names no file."""
     if "://" in text or text.startswith("/vsi"):
-        return f"{text}: is an address, expected a file on this machine: gdal_translate {text} local.tif"
+        return f"{text}: is an address, expected a file on this machine: rio convert {text} local.tif"
     if Path(text).is_dir():
         return f"{text}: is a directory, expected its files: '{text.rstrip('/')}/*.tif'"
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
@@ -238,7 +238,7 @@ def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str
 
 
 def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
-    """Return the classes that the store's other maps share; None while none of them has any."""
+    """Return the classes that the store's other maps share; None if no other map has classes that a user or a raster named."""
     for other in opened.maps():
         if other == name:
             continue
@@ -247,8 +247,9 @@ def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
         except (MapError, StoreError):
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue
-        if "terrain" in found.layers or found.facts.classes_from == "file":
-            own = found.facts.classes_from == "names"  # those values are of that raster alone
+        classes_from = found.facts.classes_from
+        if classes_from == "file" or ("terrain" in found.layers and classes_from != "default"):
+            own = classes_from == "names"  # those values are of that raster alone
             values = {entry.id: entry.id for entry in found.classes.classes} if own else found.id_by_value
             return ClassScheme(found.classes, values)
     return None

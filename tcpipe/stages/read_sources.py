@@ -291,6 +291,8 @@ def place_pose(
 ) -> tuple[dict[str, pa.Table], str, tuple[Finding, ...]]:
     """Return the streams with the pose in longitude and latitude, the CRS of these, and findings.
 
+    The CRS is that of ``read.pose_crs``, or ``read.gnss_crs`` if the former states its own datum shift.
+
     Raises `RecipeError`: `read.pose_crs` is no projected CRS.
     """
     if _POSE not in streams:
@@ -298,19 +300,22 @@ def place_pose(
     found = make_finding("pose-used-as-gnss", _POSE_ROLE, names={"topic": assignment.roles[_POSE].topics[0]})
     if config.pose_crs is None:
         return dict(streams), config.gnss_crs, (found, make_finding("pose-not-georeferenced", _POSE_ROLE))
-    from pyproj import Transformer  # noqa: PLC0415  only where a pose is placed
+    from pyproj import CRS, Transformer  # noqa: PLC0415  only where a pose is placed
 
     from tcpipe.terrain.projection import format_crs, parse_crs  # noqa: PLC0415
 
     try:
         crs = parse_crs(config.pose_crs, where="recipe read.pose_crs")
+        geographic = parse_crs(config.gnss_crs, where="recipe read.gnss_crs")
     except MapError as error:
         raise RecipeError(*error.problems) from None
     if not crs.is_projected or crs.geodetic_crs is None:
         raise RecipeError(f"recipe read.pose_crs: {crs.name} is not projected (metres); use degrees as gnss")
+    if not crs.is_bound:
+        geographic = CRS(crs.geodetic_crs).to_2d()
     pose = streams[_POSE]
-    lon, lat = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform(
+    lon, lat = Transformer.from_crs(crs, geographic, always_xy=True).transform(
         to_floats(pose, "x_m"), to_floats(pose, "y_m")
     )
     columns = {name: pose[name] for name in pose.column_names} | {"lon_deg": lon, "lat_deg": lat, "alt_m": pose["z_m"]}
-    return {**streams, _POSE: STREAMS[_POSE].table(**columns)}, format_crs(crs.geodetic_crs.to_2d()), (found,)
+    return {**streams, _POSE: STREAMS[_POSE].table(**columns)}, format_crs(geographic), (found,)

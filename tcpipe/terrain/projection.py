@@ -1,7 +1,7 @@
-"""Coordinate reference systems of maps: which are metric and upright, and how points get from one to another.
+"""Coordinate reference systems (CRS) of maps: tests for metric axes, and projection of points.
 
-A map's CRS must be one in which a patch may be cut as if the plane were the ground: x and y right-handed, and a unit of the plane
-within one per cent of a metre on the ellipsoid. UTM zones and national grids are; degrees, feet and Web Mercator are not.
+A map's CRS is right-handed, and its unit is within one per cent of a metre on the ellipsoid: a UTM zone or a national grid, but not
+degrees, feet or Web Mercator. A CRS without an authority's code keeps the datum shift that its file states (TOWGS84) as a bound CRS.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
+from pyproj.crs import BoundCRS
 from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest as TransformArea
@@ -29,30 +30,53 @@ MAX_SCALE_ERROR = 0.01
 """A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
 
 _EARTH_RADIUS_M = 6_371_000.0
+_WGS84 = CRS.from_epsg(4326)
 
 
 def parse_crs(text: str, *, where: str) -> CRS:
-    """Return the horizontal part of a CRS given as ``EPSG:n`` or WKT; `MapError` names ``where`` it was given."""
+    """Return the horizontal part of a CRS given as ``EPSG:n`` or WKT, with its datum shift; `MapError` names ``where`` it was given."""
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
         raise MapError(f"{where}: {text[:60]!r} is not a CRS (expected EPSG:n or WKT)") from error
+    bound: CRS | None = None
     while crs.is_compound or crs.is_bound:
+        bound = crs if crs.is_bound else bound
         crs = crs.sub_crs_list[0] if crs.is_compound else CRS(crs.source_crs)
     crs = crs.to_2d()
     if crs.geodetic_crs is None or not (crs.is_projected or crs.is_geographic):
-        raise MapError(f"{where}: the CRS {crs.name!r} is local (expected a projected or geographic CRS)")
+        raise MapError(
+            f"{where}: the CRS {crs.name!r} is local, expected a projected or geographic one; if you know which, give --crs EPSG:n"
+        )
     radius_m = _read_ellipsoid(crs)[0]
     if abs(radius_m / _EARTH_RADIUS_M - 1.0) > 0.02:
         raise MapError(
             f"{where}: the CRS {crs.name!r} is of another body (radius {radius_m / 1000:.0f} km), not the earth"
         )
     authority = crs.to_authority(min_confidence=100)
-    return CRS.from_authority(*authority) if authority else crs
+    if authority:  # as in GDAL, the authority's datum replaces the shift of the file
+        return CRS.from_authority(*authority)
+    return crs if bound is None else _bind_shift(crs, bound, where)
+
+
+def _bind_shift(crs: CRS, bound: CRS, where: str) -> CRS:
+    """Return a CRS with the datum shift of a bound one, without it if the shift is zero; `MapError` for a shift in a grid file."""
+    shift = bound.coordinate_operation
+    assert shift is not None  # noqa: S101  (a bound CRS has one)
+    grids = {grid.short_name for grid in shift.grids}
+    if grids - {"@null"}:
+        raise MapError(
+            f"{where}: the datum shift of its CRS is in the grid file {', '.join(grids)!r}, which tcpipe does not open; "
+            "transform the raster: rio warp in.tif out.tif --dst-crs EPSG:n"
+        )
+    is_zero = bool(shift.towgs84) and not any(shift.towgs84)
+    if grids or (is_zero and np.allclose(_read_ellipsoid(crs), _read_ellipsoid(_WGS84), rtol=1e-8)):
+        return crs
+    return BoundCRS(crs, CRS(bound.target_crs).to_2d(), shift)
 
 
 def format_crs(crs: CRS) -> str:
-    """Return ``AUTHORITY:code`` where the CRS is exactly that, else WKT 2."""
+    """Return ``AUTHORITY:code`` if the CRS is exactly that, else WKT 2."""
     authority = crs.to_authority(min_confidence=100)
     return ":".join(authority) if authority else crs.to_wkt()
 
@@ -97,14 +121,14 @@ def is_metric(crs: CRS, xy: FloatArray) -> bool:
 
 
 def find_utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
-    """Return the UTM zone of a point of another CRS, on its datum where that has one, else on WGS 84."""
+    """Return the UTM zone of a point of another CRS, on its datum if that has UTM zones and no shift of its own, else on WGS 84."""
     geodetic = CRS(crs.geodetic_crs)
     lon, lat = Transformer.from_crs(crs, geodetic, always_xy=True).transform(*xy)
     if not (math.isfinite(lon) and math.isfinite(lat)):
         raise MapError(f"the point {xy} is outside the area where the CRS {crs.name!r} is defined")
     spot = AreaOfInterest(lon, lat, lon, lat)
     found = query_utm_crs_info(datum_name=geodetic.name, area_of_interest=spot)
-    if found:
+    if found and not crs.is_bound:
         return CRS.from_authority(found[0].auth_name, found[0].code)
     zone = min(int((lon + 180.0) // 6.0) + 1, 60)
     return CRS.from_epsg((32600 if lat >= 0.0 else 32700) + zone)
@@ -147,7 +171,7 @@ class Projection:
         return np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], axis=-1)
 
     def find_rough_shift(self, subject: Subject) -> tuple[Finding, ...]:
-        """Return the finding, if any, that the two datums differ and the shift between them is known only roughly."""
+        """Return the finding, if any, that the two datums differ and their shift is rough, unknown or stated by a file."""
         source, target = (CRS(crs.geodetic_crs) for crs in (self.source, self.target))
         if source.datum == target.datum:
             return ()
@@ -156,6 +180,8 @@ class Projection:
         if not is_ballpark and 0.0 <= accuracy_m <= read_threshold("datum-shift-rough", "max_accuracy_m"):
             return ()
         names = {"source": source.name, "target": target.name}
+        if not is_ballpark and (self.source.is_bound or self.target.is_bound):
+            return (make_finding("datum-shift-stated", subject, names=names),)
         if accuracy_m <= 0.0:
             return (make_finding("datum-shift-unknown", subject, names=names),)
         return (make_finding("datum-shift-rough", subject, names=names, accuracy_m=accuracy_m),)

@@ -3,7 +3,7 @@
 A track's heights and the map's differ by a constant (ellipsoid against geoid, the robot's own height) that says nothing. What is left is
 the shape of the ground; the horizontal shift at which the two shapes agree best is searched over a small window, as in terrain-aided
 navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary no shift can be
-told, and none is. The track's heights are also regressed on the map's: a map in feet rises 3.28 where the track rises one.
+told, and none is. The regression of the track's heights on the map's gives the unit of the map, such as feet.
 
 The shift is fitted together with a tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, and from
 the misfit itself: along slopes that are noisy a step is too short.
@@ -72,11 +72,17 @@ _NORTH_M, _EAST_M = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, 
 _PARABOLOID = np.linalg.pinv(
     np.stack([np.ones_like(_EAST_M), _EAST_M, _NORTH_M, _EAST_M**2, _EAST_M * _NORTH_M, _NORTH_M**2], axis=1)
 )
-FOOT_M = 0.3048
-_ABOUT = 0.02
+_UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
+_UNITS |= {1.0 / metres: "m" for metres in _UNITS}
+"""Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
+_MAX_UNIT_ERROR = 0.07
+
 _KNOWN_SCALE = 0.03
 _EXPLAINED = 0.9
-"""A scale is believed where it is known to 3 % and explains nine tenths of the track's heights."""
+"""A scale is known if its standard deviation is 3 % and it explains nine tenths of the variance of the track's heights."""
+
+_MAX_WRONG_STD, _MIN_WRONG_EXPLAINED = 0.1, 0.7
+"""Relative standard deviation and explained share from which a scale far from one is certain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +98,20 @@ class HeightScale:
 
     @property
     def is_known(self) -> bool:
-        """Whether it says something of the map's unit."""
-        return self.std < _KNOWN_SCALE and self.explained > _EXPLAINED
+        """Whether it is certain enough to compare with one."""
+        return self.std < _KNOWN_SCALE * max(self.value, 1.0) and self.explained > _EXPLAINED
 
-    def is_feet(self) -> bool:
-        """Whether the map's heights are in feet."""
-        return self.is_known and abs(self.value - FOOT_M) < max(3.0 * self.std, _ABOUT)
+    def is_wrong(self) -> bool:
+        """Whether the map's heights are in another unit, or scaled: noise of the map lowers the value, but not below ``explained``."""
+        if self.std > _MAX_WRONG_STD * self.value or self.explained < _MIN_WRONG_EXPLAINED:
+            return False
+        most, margin = read_threshold("map-height-scale", "max_factor"), 3.0 * self.std
+        return self.value + margin < self.explained / most or self.value - margin > most
+
+    def find_unit(self) -> str:
+        """Return the unit of the map's heights; "" if it is no known unit."""
+        error = max(3.0 * self.std / self.value, _MAX_UNIT_ERROR)
+        return next((unit for scale, unit in _UNITS.items() if abs(self.value / scale - 1.0) < error), "")
 
     def is_off(self) -> bool:
         """Whether map and track surely do not rise alike."""
@@ -274,9 +288,11 @@ def _find_least(spread: FloatArray) -> tuple[int, int]:
 
 
 def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArray) -> HeightScale:
-    """Return the scale of heights beside a tilt of the map, or without one if it says feet: no map is tilted so much."""
+    """Return the scale of heights, fitted with a tilt of the map unless it is that of a known unit: no map is tilted so much."""
     whole, tilt = _regress_heights(ground_m, height_m), xy_m - xy_m.mean(axis=0)
-    return whole if whole.is_feet() else _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
+    if whole.is_wrong() and whole.find_unit():
+        return whole
+    return _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
 
 
 def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:

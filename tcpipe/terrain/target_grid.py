@@ -174,7 +174,7 @@ def _refuse_huge(height: Georeference, sides_m: tuple[float, float], pixel_size_
         raise MapError(
             f"{height.name}: the map would have {cols:.3g} x {rows:.3g} pixels of {pixel_size_m:.3g} m, at most "
             f"{MAX_PIXELS:.2g} in all and {MAX_SIDE_PX} a side; cut out the site "
-            "(gdal_translate -projwin ulx uly lrx lry in.tif out.tif) or give coarser rasters"
+            "(rio clip in.tif out.tif --bounds 'x_min y_min x_max y_max') or give coarser rasters"
         )
 
 

@@ -17,13 +17,13 @@ from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.integrity import write_checksums
-from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
-from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
+from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open, make_table_command
+from tcpipe.formats.maps.layer_building import Raster, RasterLayer, Tally, iterate_shards, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs, RasterOrigin
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import (
     MAX_ID,
     PAPER_SCHEME,
@@ -147,7 +147,8 @@ def _make_sources(
     layer, count = _make_layer(raster, schemes), len(raster.tiles[0].bands)
     projection = find_projection(raster.georeference, crs)
     if raster.role in PAPER_LAYERS or count == 1:
-        return (RasterLayer(layer, raster, grid, projection, schemes.get(raster.role)),)
+        tally = Tally(nodata=raster.tiles[0].nodata)
+        return (RasterLayer(layer, raster, grid, projection, schemes.get(raster.role), tally),)
     grid = choose_layer_grid(grid, raster.georeference, crs)
     dtype = np.dtype("float16" if all(tile.is_half for tile in raster.tiles) else "float32")
     values = count * grid.rows * grid.cols
@@ -273,6 +274,17 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
     return tuple(findings)
 
 
+def _find_assumed(terrain: LayerSource | None) -> tuple[Finding, ...]:
+    """Return the finding, if any, that values of the terrain are read as the paper's classes, although nothing names them."""
+    values = [] if terrain is None else terrain.values
+    known = [f"{entry.id} as {entry.name}" for entry in PAPER_SCHEME.table.classes if entry.id in values]
+    if not known:
+        return ()
+    names = {"meaning": ", ".join(known[:3]) + (" …" if known[3:] else "")}
+    remedy = Remedy("table", command=make_table_command(dict.fromkeys(values, "?")))
+    return (make_finding("classes-assumed", Subject("layer", "terrain"), names=names, remedies=[remedy]),)
+
+
 def _make_facts(
     grid: MapGrid,
     layers: Mapping[str, LayerSource],
@@ -285,6 +297,7 @@ def _make_facts(
     for role, layer in layers.items():
         pixels = layer.tally.pixels * (layer.grid.pixel_size_m / grid.pixel_size_m) ** 2
         covered[role] = min(pixels / (grid.rows * grid.cols), 1.0)
+    assumed = _find_assumed(layers.get("terrain")) if classes_from == "default" else ()
     shares = {name: found for name, layer in layers.items() if (found := _compute_class_shares(layer))}
     return MapFacts(
         sources={role: layer.name for role, layer in layers.items()},
@@ -293,7 +306,7 @@ def _make_facts(
         height_max_m=layers["height"].tally.high,
         class_share=shares.pop("terrain", {}),
         class_shares=shares,
-        findings=_find_all(layers, covered),
+        findings=(*assumed, *_find_all(layers, covered)),
         classes_from=classes_from,
         inputs=inputs,
         origins=origins,
@@ -367,7 +380,7 @@ def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], 
     if not isinstance(row, dict):
         problems.append(f"{where}: expected a table with {', '.join(_COLUMNS)}")
         return None
-    problems += [f"{where}: {name} is missing" for name in _COLUMNS if row.get(name) in (None, "")]
+    problems += [f"{where}: {name} is missing" for name in _COLUMNS if row.get(name) in (None, "", "?")]
     problems += [
         f"{where}: {name!r} is not a column (expected {', '.join(_COLUMNS)})" for name in row if name not in _COLUMNS
     ]

@@ -49,9 +49,11 @@ USES: dict[str, Use] = {"height": "metres", "ortho": "grey", "terrain": "classes
 _WEIGHTS = {"grey": LUMA_RGB, "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}
 """Of red, green and blue, by use."""
 
-_METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
-_METRES |= {"cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "mm": 0.001, "dm": 0.1, "km": 1000.0}
-_METRES |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0}
+_METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "km": 1000.0, "kilometre": 1000.0, "dm": 0.1, "decimetre": 0.1}
+_METRES |= {"cm": 0.01, "centimetre": 0.01, "mm": 0.001, "millimetre": 0.001}
+_METRES |= dict.fromkeys(("ft", "foot", "ftint", "intft", "internationalfoot"), 0.3048)
+_METRES |= dict.fromkeys(("usft", "ftus", "footus", "usfoot", "ussft", "surveyfoot", "ussurveyfoot"), 1200.0 / 3937.0)
+"""Metres by the name of a unit, of letters only."""
 
 GDAL_CONFIG = {
     "GDAL_CACHEMAX": 256,  # [MB] decoded blocks: a strip of a wide raster is wanted by many windows
@@ -97,6 +99,9 @@ _MAX_OPEN = 32
 _MAX_BLOCK_BYTES = 256_000_000
 """What is decoded at one time: a tile or a strip of a raster."""
 
+_LOOKED_AT_PX, _MAX_COLOURS = 2048, 32
+"""Longest side of a raster whose colours are counted [px], and most of them that are proposed as classes."""
+
 _MAX_STATISTICS_BYTES = 16_000_000
 
 _OPAQUE = 1
@@ -126,6 +131,8 @@ class Tile:
     driver: str
     dtype: str
     """Type of the values that are read: the file's for classes, else float64."""
+    nodata: float
+    """The tag; NaN also if there is none."""
     bands: tuple[int, ...]
     scale: tuple[float, float]
     """Scale and offset to metres, or to the numbers that are meant."""
@@ -174,6 +181,9 @@ def read_window(  # noqa: PLR0917
             f"{describe_error(error)}"
         ) from error
     valid = mask >= _OPAQUE
+    if tile.use == "classes" and raw.dtype.kind == "f":
+        valid &= np.isfinite(raw[0])
+        return _read_whole_numbers(tile, raw[0], valid), valid
     if tile.use == "classes":
         return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
     weights = _WEIGHTS.get(tile.use)
@@ -181,6 +191,18 @@ def read_window(  # noqa: PLR0917
         raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _read_grey(dataset, tile.bands, raw, weights)
     )
     return values, valid & np.isfinite(values)
+
+
+def _read_whole_numbers(tile: Tile, values: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return class values that are stored as floats; `MapError` for one that is no whole number."""
+    whole = np.where(valid, values, 0.0)
+    odd = whole[(whole != np.rint(whole)) | (np.abs(whole) > np.iinfo(tile.dtype).max)]
+    if odd.size:
+        raise MapError(
+            f"{tile.path}: {tile.role} has the value {odd[0]:g}, expected whole numbers; if classes were interpolated, transform the "
+            "raster of before that: rio warp in.tif out.tif --like height.tif --resampling nearest"
+        )
+    return whole.astype(tile.dtype)
 
 
 def _read_grey(
@@ -219,7 +241,8 @@ def read_tile(path: Path, role: str, use: Use) -> Tile:
                 findings=(*unusual, *ignored),
                 names=read_value_names(_describe_as_vrt(dataset), bands[0]) if use == "classes" else {},
                 driver=driver,
-                dtype=dataset.dtypes[bands[0] - 1] if use == "classes" else "float64",
+                dtype=dataset.dtypes[bands[0] - 1].replace("float", "int") if use == "classes" else "float64",
+                nodata=float(np.nan if (tag := dataset.nodatavals[bands[0] - 1]) is None else tag),
                 bands=bands,
                 scale=scale,
                 unit=unit,
@@ -280,7 +303,12 @@ def _list_plain_files(path: Path, raster: Path | None = None) -> tuple[str, tupl
 
 
 def check_layout(dataset: Any, where: str, remedy: str) -> None:
-    """Raise `MapError` for a raster that names another file for its overviews, or whose blocks do not fit into memory."""
+    """Raise `MapError` for complex numbers, overviews in another file, and blocks that do not fit into memory."""
+    if any(dtype.startswith("complex") for dtype in dataset.dtypes):
+        raise MapError(
+            f"{where}: has complex numbers, expected real ones; keep their real part: "
+            'rio calc --not-masked "(real (read 1 1))" in.tif out.tif --dtype float32'
+        )
     if any(dataset.tags(ns=domain) for domain in _REDIRECTIONS):
         raise MapError(f"{where}: names another file for its overviews, which tcpipe does not open; {remedy}")
     block = max(
@@ -291,7 +319,7 @@ def check_layout(dataset: Any, where: str, remedy: str) -> None:
     if block > _MAX_BLOCK_BYTES:
         raise MapError(
             f"{where}: kept in blocks of {block / 1e6:.0f} MB, at most {_MAX_BLOCK_BYTES // 10**6}; "
-            f"{remedy} -co TILED=YES -co BIGTIFF=IF_SAFER"
+            f"{remedy} --co tiled=true --co blockxsize=256 --co blockysize=256 --co bigtiff=if_safer"
         )
 
 
@@ -315,7 +343,7 @@ def _rewrite(path: Path) -> str:
     """Return the command that writes a raster as a GeoTIFF beside it."""
     target = path.with_suffix(".tif")
     return shlex.join(
-        ["gdal_translate", str(path), str(target if target != path else path.with_stem(f"{path.stem}-copy"))]
+        ["rio", "convert", str(path), str(target if target != path else path.with_stem(f"{path.stem}-copy"))]
     )
 
 
@@ -341,11 +369,11 @@ def _refuse_unplaced(dataset: Any, path: Path) -> None:
         raise MapError(f"{path}: the file contains no bands itself; name one of its subdatasets as a GeoTIFF")
     if dataset.crs is None and dataset.gcps[0]:
         raise MapError(
-            f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it first (gdalwarp -tps in.tif out.tif)"
+            f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it: rio warp in.tif out.tif --dst-crs EPSG:n"
         )
     if dataset.transform.is_identity:
         raise MapError(
-            f"{path}: has no georeference; give it one (gdal_edit -a_srs EPSG:n -a_ullr xmin ymax xmax ymin)"
+            f"{path}: has no georeference; give it one (rio edit-info FILE --crs EPSG:n --transform '[pixel, 0, x_min, 0, -pixel, y_max]')"
         )
     if dataset.transform.is_degenerate:
         raise MapError(f"{path}: its georeference has pixels without area")
@@ -374,7 +402,9 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
     most = MAX_BANDS if use == "numbers" else 1
     if not 1 <= len(plain) <= most or len(kinds) > 1:
         wanted = "one" if most == 1 else f"1 to {most} of one type"
-        raise MapError(f"{path}: {role} has {dataset.count} bands ({names[:80]}), expected {wanted}")
+        problem = f"{path}: {role} has {dataset.count} bands ({names[:80]}), expected {wanted}"
+        has_colours = use == "classes" and len(plain) == 3 and kinds == {np.dtype(np.uint8)}
+        raise MapError(_describe_colours(dataset, path, plain) if has_colours else problem)
     kind = kinds.pop()
     wanted = "metres" if use == "metres" else "numbers"
     if use != "classes" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
@@ -382,9 +412,33 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         raise MapError(f"{path}: {role} is a palette of colours, expected {wanted}{hint}")
     if use != "classes" and kind.kind not in "fiu":
         raise MapError(f"{path}: {role} is {kind}, expected floating point or integer {wanted}")
-    if use == "classes" and kind.kind not in "iu":
+    if use == "classes" and kind.kind not in "iuf":
         raise MapError(f"{path}: {role} is {kind}, expected integer class values")
     return tuple(plain), ()
+
+
+def _describe_colours(dataset: Any, path: Path, bands: Sequence[int]) -> str:
+    """Return the problem that classes are shown by colours, with the commands that make each a value, and a table of them."""
+    shape = (3, min(dataset.height, _LOOKED_AT_PX), min(dataset.width, _LOOKED_AT_PX))
+    try:
+        red, green, blue = dataset.read(bands, out_shape=shape).astype(np.int64)
+    except RasterioError as error:
+        raise MapError(f"{path}: cannot be read; the file is damaged: {describe_error(error)}") from error
+    values, counts = np.unique((red << 16) + (green << 8) + blue, return_counts=True)
+    names = {value: f"#{value:06x}" for value in sorted(values[np.argsort(-counts)][:_MAX_COLOURS].tolist())}
+    r, g, b = (f"(read 1 {band} 'int32')" for band in bands)
+    return (
+        f"{path}: has bands of red, green and blue, expected one of class values; make each colour a value: rio calc --not-masked "
+        f'"(+ (* 65536 {r}) (* 256 {g}) {b})" {shlex.quote(str(path))} classes.tif --dtype int32; write a table of the commonest of '
+        f"{len(values)} colours: {make_table_command(names)}; fill in each ? and use --terrain classes.tif --classes classes.csv"
+    )
+
+
+def make_table_command(names: Mapping[int, str]) -> str:
+    """Return the shell command that writes a class table of named values; each ``?`` has to be filled in before the table is read."""
+    rows = [f"{value},{number},{name},?" for number, (value, name) in enumerate(names.items(), 1)]
+    quoted = " ".join(f'"{row}"' for row in ("value,id,name,traversable", *rows))
+    return f'printf "%s\\n" {quoted} > classes.csv'
 
 
 def _fits_half(dataset: Any, bands: tuple[int, ...], scale: tuple[float, float]) -> bool:
@@ -410,9 +464,14 @@ def _read_scaling(
         subject, file = Subject("layer", role), {"file": path.name}
         return (1.0, 0.0), (make_finding("scale-not-applied", subject, names=file, scale=scale, offset=offset),)
     unit = (dataset.units[bands[0] - 1] or "").strip()
-    if unit.lower() not in _METRES:
-        raise MapError(f"{path}: height is in {unit!r}, expected metres (or cm, mm, ft)")
-    metres = _METRES[unit.lower()] if unit else _find_vertical_unit_m(dataset, path)
+    name = "".join(letter for letter in unit.lower() if letter.isalpha())
+    name = name.replace("meter", "metre").replace("metres", "metre").replace("feet", "foot")
+    if name not in _METRES or bool(unit) != bool(name):
+        raise MapError(
+            f"{path}: height is in {unit!r}, expected a unit that tcpipe knows; name it: "
+            f"rio edit-info {shlex.quote(str(path))} --bidx {bands[0]} --units m (or dm, cm, mm, km, ft, us-ft)"
+        )
+    metres = _METRES[name] if unit else _find_vertical_unit_m(dataset, path)
     return (scale * metres, offset * metres), ()
 
 
@@ -425,7 +484,7 @@ def _find_vertical_unit_m(dataset: Any, path: Path) -> float:
     if crs is not None and crs.is_projected and "foot" in (lain := crs.axis_info[0].unit_name).lower():
         raise MapError(
             f"{path}: its CRS is in {lain}, and the unit of its heights is unknown; state it in the file: "
-            "gdal_edit -units ft FILE (or us-ft, or m)"
+            f"rio edit-info {shlex.quote(str(path))} --bidx 1 --units ft (or us-ft, or m)"
         )
     return 1.0
 

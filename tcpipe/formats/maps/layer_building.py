@@ -19,7 +19,7 @@ from pyproj import CRS
 
 from tcpipe.errors import MapError
 from tcpipe.formats.geojson import shorten_problems
-from tcpipe.formats.maps.geotiff import OpenFile, Tile, Use, read_tile, read_window
+from tcpipe.formats.maps.geotiff import OpenFile, Tile, Use, make_table_command, read_tile, read_window
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.layers import Layer, Pixels
@@ -85,7 +85,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
     label = label_files(paths)
     if len(paths) > MAX_FILES:
         raise MapError(
-            f"{label}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: gdalwarp part*.tif joined.tif"
+            f"{label}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: rio merge part*.tif joined.tif"
         )
     tiles: list[Tile] = []
     problems: list[str] = []
@@ -96,9 +96,11 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
             problems += error.problems
     if problems:
         raise MapError(*shorten_problems(problems))
+    if crs is not None:  # stands in for a local CRS
+        tiles = [replace(tile, crs="") if tile.crs and CRS(tile.crs).is_engineering else tile for tile in tiles]
     known = {text: parse_crs(text, where=label) for text in dict.fromkeys(tile.crs for tile in tiles) if text}
-    _refuse_odd(tiles, "CRS", _find_crs_keys(tiles), "gdalwarp -t_srs EPSG:n in.tif out.tif")
-    _refuse_odd(tiles, "type and bands", [tile.kind for tile in tiles], "gdal_translate -ot T -b n in.tif out.tif")
+    _refuse_odd(tiles, "CRS", _find_crs_keys(tiles), "rio warp in.tif out.tif --dst-crs EPSG:n")
+    _refuse_odd(tiles, "type and bands", [tile.kind for tile in tiles], "rio convert in.tif out.tif --dtype T")
     found = known.get(tiles[0].crs, crs)
     if found is None:
         raise MapError(f"{label}: has no CRS; if you know it, give it with --crs EPSG:n")
@@ -157,7 +159,7 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files do not lie on the pixels of the rest "
             f"({got}, the rest {wanted}): {', '.join(shorten_problems([str(tile.path) for tile in odd]))}; "
-            "put all on one grid: gdalwarp -r bilinear *.tif joined.tif"
+            "put all on one grid: rio merge --resampling bilinear *.tif joined.tif"
         )
     a, b, x, d, e, y = tiles[base].affine
     col, row = at.min(axis=0).tolist()
@@ -213,6 +215,8 @@ class Tally:
     by_class: NDArray[np.int64] = field(default_factory=lambda: np.zeros(256, np.int64))
     unnamed: set[int] = field(default_factory=set)
     unnamed_pixels: int = 0
+    nodata: float = math.nan
+    """Tag of the raster; NaN also if it has none."""
 
     def count(self, layer: Layer, label: str, shard: Pixels) -> bool:
         """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
@@ -226,12 +230,19 @@ class Tally:
         if layer.stack != "greys" and present.size:
             self.low, self.high = min(self.low, float(present.min())), max(self.high, float(present.max()))
             if layer.kind == "relative" and (self.high > _HIGHEST_M or self.low < _DEEPEST_M):
-                wrong = self.low if self.low < _DEEPEST_M else self.high
-                raise MapError(
-                    f"{label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
-                    f"{wrong:.6g} is no data (gdal_edit -a_nodata {wrong:.9g}), or that they are centimetres (gdal_edit -scale 0.01)"
-                )
+                raise MapError(self._describe_range(label))
         return bool(present.size)
+
+    def _describe_range(self, label: str) -> str:
+        """Return the problem that heights are no dry land, with the command that makes them no data."""
+        wrong, sign, limit = (self.low, "<", _DEEPEST_M) if self.low < _DEEPEST_M else (self.high, ">", _HIGHEST_M)
+        is_tagged = math.isfinite(self.nodata)
+        tag, more = (self.nodata, "") if is_tagged else (-9999.0, " --dtype float32 --co nodata=-9999")
+        return (
+            f"{label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; if {wrong:.6g} is no data: rio calc "
+            f'--not-masked "(where ({sign} (read 1 1) {limit:g}) {tag:.9g} (read 1 1))" in.tif out.tif{more}; '
+            "if they are centimetres: rio edit-info FILE --bidx 1 --units cm"
+        )
 
     def note_unnamed(self, values: Pixels) -> None:
         """Remember raster values that the class table does not name."""
@@ -283,7 +294,15 @@ class RasterLayer:
         unnamed, names = sorted(self.tally.unnamed), self.raster.names
         values = ", ".join(f"{v} ({names[v]})" if v in names else str(v) for v in unnamed[:_LISTED])
         values += " …" if len(unnamed) > _LISTED else ""
-        return f"{self.label}: none of its values {values} is in the class table (which names {named}); give one with {option}"
+        return (
+            f"{self.label}: none of its values {values} is in the class table (which names {named}); give one with {option}; "
+            f"this writes one to fill in: {make_table_command(dict.fromkeys(unnamed, '?'))}"
+        )
+
+    @property
+    def values(self) -> Sequence[int]:
+        """The values that were found, if the class table maps each value to itself."""
+        return sorted({*(np.flatnonzero(self.tally.by_class[1:]) + 1).tolist(), *self.tally.unnamed})
 
     def list_findings(self) -> tuple[Finding, ...]:
         """Return the raster's findings, a datum shift that is known only roughly, and values that are no class."""

@@ -164,7 +164,7 @@ def open_window(client: HttpsClient, url: str, area: Geometry, *, crs: str | Non
         remote.fetch_blocks(0, 0)
         try:
             with rasterio.Env(**GDAL_CONFIG), rasterio.open(_NAME, driver="GTiff", opener=open_handle) as dataset:
-                check_layout(dataset, url, "download it and write it again: gdal_translate in.tif out.tif")
+                check_layout(dataset, url, "download it and write it again: rio convert in.tif out.tif")
                 window = _find_window(dataset, url, area, crs)
                 yield None if window is None else RemoteWindow(client, remote, dataset, window)
         except RasterioError as error:

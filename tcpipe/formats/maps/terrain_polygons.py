@@ -60,6 +60,8 @@ class PolygonLayer:
     polygons: NDArray[np.object_]
     ids: NDArray[np.uint8]
     findings: tuple[Finding, ...]
+    values: Sequence[int]
+    """Numbers that stand for classes in the file, in place of names."""
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
 
@@ -96,10 +98,12 @@ def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: M
     `MapError`: not GeoJSON, another CRS, invalid geometry, a class that the table does not have, or nothing on the map: all problems at
     once.
     """
-    features, problems = _read_all(paths)
+    every, problems = _read_all(paths)
+    features = [feature for feature in every if feature.polygons and _find_class(feature) is not None] or every
     label, name = label_files(paths), label_files([Path(path.name) for path in paths])
-    ids = [_read_class_id(feature, scheme, problems) for feature in features]
-    if not features:
+    numbers: set[int] = set()
+    ids = [_read_class_id(feature, scheme, problems, numbers) for feature in features]
+    if not problems and not any(feature.polygons for feature in features):
         problems.append(f"{label}: no polygon in it; draw the terrain as polygons")
     if problems:
         raise MapError(*shorten_problems(problems))
@@ -110,8 +114,13 @@ def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: M
     on_map = ~shapely.is_empty(polygons)
     polygons, id_of_each = polygons[on_map], id_of_each[on_map]
     findings = (*projection.find_rough_shift(_TERRAIN), *_find_overlaps(polygons, id_of_each, scheme))
+    repaired, skipped = sum(feature.repaired for feature in features), len(every) - len(features)
+    if repaired or skipped:
+        changed = make_finding("polygons-changed", _TERRAIN, repaired_count=repaired, skipped_count=skipped)
+        findings = (changed, *findings)
     terrain = make_paper_layers(["terrain"], scheme.table)["terrain"]
-    return PolygonLayer(terrain, label, name, grid, polygons, id_of_each, findings, shapely.STRtree(polygons))
+    tree = shapely.STRtree(polygons)
+    return PolygonLayer(terrain, label, name, grid, polygons, id_of_each, findings, sorted(numbers), tree)
 
 
 def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
@@ -119,7 +128,7 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
     problems: list[str] = []
     for path in paths:
         try:
-            found, unsound = read_polygons(path)
+            found, unsound = read_polygons(path, is_terrain=True)
         except RegionError as error:
             raise MapError(*error.problems) from None
         features += found
@@ -127,9 +136,15 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
     return features, problems
 
 
-def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
-    """Return a feature's class id; 0, and a line in ``problems``, where it has none."""
-    given = next((value for name, value in feature.properties.items() if name.casefold() == PROPERTY), None)
+def _find_class(feature: PolygonFeature) -> Any:
+    """Return the property that names a feature's class; None if there is none or it is empty."""
+    found = next((value for name, value in feature.properties.items() if name.casefold() == PROPERTY), None)
+    return None if found == "" else found
+
+
+def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str], numbers: set[int]) -> int:
+    """Return a feature's class id; 0, and a line in ``problems``, if it has none. A number in place of a name is added to ``numbers``."""
+    given = _find_class(feature)
     if given is None:
         there = shorten_value(", ".join(sorted(feature.properties)) or "none")[1:-1]
         problems.append(
@@ -142,6 +157,7 @@ def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[
     if found is None and number is not None:
         known = {entry.id: entry.id for entry in scheme.table.classes} | dict(scheme.id_by_value)
         found = known.get(number)
+        numbers.add(number)
     if found is None:
         names = ", ".join(entry.name for entry in scheme.table.classes)
         problems.append(f"{feature.where}: {PROPERTY} {shorten_value(given)} is not in the class table ({names})")

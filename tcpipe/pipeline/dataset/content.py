@@ -41,7 +41,7 @@ from tcpipe.formats.dataset_files import (
     make_parquet_writers,
     make_zarr_writers,
 )
-from tcpipe.formats.finding_lines import format_mixed_groups
+from tcpipe.formats.finding_lines import format_finding, format_mixed_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import (
     ROWS_PER_GROUP,
@@ -70,7 +70,7 @@ from tcpipe.stages.sample import Sampled, sum_losses
 from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
 from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
 from tcpipe.terrain.projection import compute_area, parse_crs
 
@@ -273,8 +273,10 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     )
     lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
+        _, found = find_removed_by_ground(inputs.runs, segments, sampled.kept, sources, recipe, shifts=shifts)
         raise DatasetError(
             _describe_nothing_sampled(segments, lost_m, sources),
+            *map(format_finding, select_findings(found, "driven-not-traversable")),
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
     tags = read_tags(pc.unique(segments.column("run_id")).to_pylist(), inputs.sources, recipe.split)

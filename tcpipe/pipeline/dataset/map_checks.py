@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,6 +33,7 @@ from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, 
 from tcpipe.terrain.projection import Projection, compute_geoid_height
 from tcpipe.terrain.registration import (
     REACH_M,
+    HeightScale,
     Registration,
     SharedShift,
     register_tracks,
@@ -52,7 +54,7 @@ _REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_le
 """Reason of each metre of a track; losses at sampling and to the split's buffer are one entry."""
 _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
 
-_DATUM = "map-height-datum"
+_DATUM, _BLOCKED = "map-height-datum", "driven-not-traversable"
 _MOST_RUNS = 30
 """Registered together at most: more of them thin the points of each."""
 
@@ -69,13 +71,14 @@ def register_runs(
     """Return the map's registration against each run that crosses enough of it, and findings on misfits.
 
     Rows of a track count that are certain enough to be sampled. With ``sample.align`` a registration says whether its shift is applied, and
-    findings why not. `MapError` if the map's heights are in feet.
+    findings why not. `MapError` if the map's heights are in another unit than metres, or scaled.
     """
     projection = find_map_projection(source, recipe.read.gnss_crs)
     tracks = [_register(run, source, projection, recipe.sample) for run in runs]
-    for track in tracks:
-        if track.found is not None and track.found.scale.is_feet():
-            raise MapError(_describe_feet(track.found, track.run_id, source.name))
+    scales = {track.run_id: track.found.scale for track in tracks if track.found is not None}
+    wrong = [run_id for run_id, scale in scales.items() if scale.is_wrong()]
+    if wrong and not any(scale.is_known and not scale.is_off() for scale in scales.values()):
+        raise MapError(_describe_scale(scales[wrong[0]], wrong[0], source))
     shared = _share_shift(tracks, source, is_wanted=recipe.sample.align)
     registrations, findings = list[MapRegistration](), list[Finding]()
     for track in tracks:
@@ -169,10 +172,19 @@ def _register(run: RunDirectory, source: MapFile, projection: Projection, config
     return _Track(run.run_id, thin, found, expected_m, track_std_m)
 
 
-def _describe_feet(found: Registration, run_id: str, name: str) -> str:
+def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
+    """Return the error for a map whose heights are no metres, with the command that corrects its raster."""
+    unit, file = scale.find_unit(), source.facts.sources["height"]
+    file = "FILE" if "…" in file else shlex.quote(file)
+    mended = f"rio edit-info {file} --bidx 1 --units {unit}"
+    if not unit:
+        mended = (
+            f"rio calc \"(* {scale.value:.3g} (read 1 1 'float64'))\" {file} scaled.tif --dtype float32 --co nodata=nan"
+        )
+    kind = {"": "scaled", "m": "metres, converted by mistake", "ft": "in feet"}.get(unit, f"in {unit}")
     return (
-        f"map {name}: where run {run_id} rises by 1 m, its heights rise by {1 / found.scale.value:.2f}: they are in feet and were read "
-        f"as metres; say so in the file (gdal_edit -units ft FILE) and add the map again (tcpipe add-map {name} --height FILE ... --force)"
+        f"map {source.name}: where run {run_id} rises by 1 m, it rises by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}): "
+        f"its heights are {kind}; correct the raster ({mended}) and add it again: tcpipe add-map {source.name} --height FILE ... --force"
     )
 
 
@@ -201,7 +213,7 @@ def _find_shift(found: Registration, run_id: str, name: str, *, is_applied: bool
 def _find_other_heights(found: Registration, expected_m: float, run_id: str, name: str) -> tuple[Finding, ...]:
     """Return the finding, if any, that heights of map and track differ too much."""
     subject, names = Subject("run", run_id), {"map": name}
-    if found.scale.is_off():
+    if found.scale.is_off() or found.scale.is_wrong():
         return (make_finding("map-height-scale", subject, names=names, map_rise_m=1 / found.scale.value),)
     if not _is_other_ground(found.left_m, expected_m):
         return ()
@@ -253,7 +265,7 @@ def find_removed_by_ground(
     *,
     shifts: Sequence[Shifts],
 ) -> tuple[Removal, tuple[Finding, ...]]:
-    """Return metres of all runs by reason, for each class and slope, and findings where the used share is uneven.
+    """Return metres of all runs by reason, for each class and slope, and findings on uneven shares and on classes not traversable.
 
     ``used`` are the rows of ``segments`` that are train, test or unseen. Of overlapping ``sources`` the first counts; maps without a
     terrain layer give no classes. ``shifts`` are those of the runs, by map.
@@ -277,7 +289,20 @@ def find_removed_by_ground(
     classes = list_groups(by_class, names, _REASONS) if grounds else ()
     traversable = set(table.names()[table.traversable()].tolist())
     findings = _find_bias([group for group in classes if group.name in traversable], "class")
-    return Removal(classes, slopes), (*findings, *_find_bias(slopes, "slope"))
+    blocked = _find_blocked(classes, grounds[0][0]) if grounds else []
+    return Removal(classes, slopes), (*blocked, *findings, *_find_bias(slopes, "slope"))
+
+
+def _find_blocked(groups: Sequence[Group], source: MapFile) -> list[Finding]:
+    """Return findings on classes that are not traversable, on which much of the distance was driven."""
+    closed = {entry.name: entry.id for entry in source.classes.classes if not entry.traversable}
+    driven_m, least = sum(group.driven_m for group in groups), read_threshold(_BLOCKED, "min_driven_fraction")
+    findings = []
+    for group in (group for group in groups if group.name in closed and group.driven_m > least * driven_m):
+        values = ", ".join(str(value) for value, number in source.id_by_value.items() if number == closed[group.name])
+        subject, names, share = Subject("class", group.name), {"values": values}, group.driven_m / driven_m
+        findings.append(make_finding(_BLOCKED, subject, names=names, driven_m=group.driven_m, driven_fraction=share))
+    return findings
 
 
 def _list_spans(segments: pa.Table, used: NDArray[np.int64]) -> dict[str, _Spans]:

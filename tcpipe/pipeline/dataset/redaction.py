@@ -131,7 +131,7 @@ def _estimate_scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
     if abs(scale - 1.0) > _MOST_SCALE:
         raise DatasetError(
             f"a metre of ground is {scale:.4f} m in the maps' CRS, which would reveal the latitude; add the maps in a CRS whose metres are "
-            "those of the ground, such as UTM (gdalwarp -t_srs), and build the redacted dataset with them"
+            "those of the ground, such as UTM (rio warp in.tif out.tif --dst-crs EPSG:n), and build the redacted dataset with them"
         )
     return scale
 

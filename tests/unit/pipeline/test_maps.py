@@ -171,7 +171,8 @@ def test_the_command_prints_a_few_plain_lines(site, store):
     ]
     assert lines[2].startswith("height   100 % covered, from height.tif: 6")
     assert lines[4].startswith("terrain  100 % covered, from terrain.tif: ")
-    assert len(lines) == 5
+    assert lines[5].endswith("[classes-assumed]")
+    assert len(lines) == 6
 
 
 def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, store):
@@ -290,8 +291,8 @@ def test_what_names_no_file_is_said(site, store, tmp_path):
     given = {"height": [tmp_path, "https://x.org/dem.tif", "/vsicurl/x.tif"], "ortho": str(tmp_path / "*.jpg")}
     assert refused(store, "m", UsageError, **given) == (
         f"{tmp_path}: is a directory, expected its files: '{tmp_path}/*.tif'",
-        "https://x.org/dem.tif: is an address, expected a file on this machine: gdal_translate https://x.org/dem.tif local.tif",
-        "/vsicurl/x.tif: is an address, expected a file on this machine: gdal_translate /vsicurl/x.tif local.tif",
+        "https://x.org/dem.tif: is an address, expected a file on this machine: rio convert https://x.org/dem.tif local.tif",
+        "/vsicurl/x.tif: is an address, expected a file on this machine: rio convert /vsicurl/x.tif local.tif",
         f"{tmp_path}/*.jpg: no file matches",
     )
 

@@ -562,6 +562,13 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     assert placed.tables["pose"]["east_var_m2"].to_pylist() == pytest.approx([0.0004] * 100)
     assert "pose-used-as-gnss" in codes(placed)
     assert "pose-not-georeferenced" not in codes(placed)
+    east, north = (topics["/slam/pose"][1][f"pose.pose.position.{axis}"].to_numpy() for axis in "xy")
+    shifted = "+proj=tmerc +lon_0=-70.5 +k=0.9999 +x_0=304800 +ellps=clrk66 +towgs84=-10,158,187"
+    placed = read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=shifted)
+    expected = pyproj.Transformer.from_crs(shifted, "EPSG:4326", always_xy=True).transform(east, north)
+    assert placed.gnss_crs == "EPSG:4326"
+    np.testing.assert_allclose(placed.tables["pose"]["lon_deg"].to_numpy(), expected[0], atol=1e-11)
+    np.testing.assert_allclose(placed.tables["pose"]["lat_deg"].to_numpy(), expected[1], atol=1e-11)
     local = read(topics, topics={"pose": ["/slam/pose"]})
     assert local.tables["pose"]["lon_deg"].null_count == 100
     assert "pose-not-georeferenced" in codes(local)

@@ -128,14 +128,29 @@ def test_heights_in_feet_are_told_from_heights_in_metres():
     metres = register_track(source, xy, height).scale
     assert metres.value == pytest.approx(1.0, abs=0.02)
     assert metres.is_known
-    assert not metres.is_feet()
+    assert not metres.is_wrong()
     assert not metres.is_off()
     feet = register_track(source, xy, 0.3048 * height).scale
     assert feet.value == pytest.approx(0.3048, abs=0.006)
-    assert feet.is_feet()
-    stretched = register_track(source, xy, 1.25 * height).scale
+    assert (feet.is_wrong(), feet.find_unit()) == (True, "ft")
+    stretched = register_track(source, xy, 1.2 * height).scale
     assert stretched.is_off()
-    assert not stretched.is_feet()
+    assert not stretched.is_wrong()
+    doubled = register_track(source, xy, 2.0 * height).scale
+    assert (doubled.is_wrong(), doubled.find_unit()) == (True, "")
+
+
+@pytest.mark.parametrize(
+    ("per_metre", "unit"), [(10.0, "dm"), (100.0, "cm"), (1000.0, "mm"), (0.1, "m"), (0.3048, "m"), (2.5, "")]
+)
+@pytest.mark.parametrize("std_m", [0.02, 0.08])
+def test_any_unit_of_heights_is_found_and_a_metre_is_none(per_metre, unit, std_m):
+    """GNSS heights that drift leave the scale of metres uncertain, but not that of another unit."""
+    xy = drive()
+    height = 600.0 + rolling(*np.add(xy, (0.6, -0.4)).T) + drift(len(xy), std_m, 100, 2)
+    other = register_track(site(lambda x, y: per_metre * rolling(x, y), noise_m=0.01 * per_metre), xy, height).scale
+    assert (other.is_wrong(), other.find_unit()) == (True, unit)
+    assert not register_track(site(), xy, height).scale.is_wrong()
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.05])
@@ -148,7 +163,7 @@ def test_feet_are_told_on_a_tilted_map_and_a_tilt_is_no_scale(slope):
     xy = drive()
     height = 600.0 + ground(*xy.T) + drift(len(xy), 0.02, 100, 3)
     feet = register_track(site(tilted(lambda x, y: ground(x, y) / 0.3048, 0.02, 2)), xy, height).scale
-    assert feet.is_feet()
+    assert (feet.is_wrong(), feet.find_unit()) == (True, "ft")
     found = register_track(site(tilted(ground, 0.02, 2)), xy, height)
     assert not found.scale.is_off()
     assert found.shape_misfit_m < 0.05
@@ -162,8 +177,10 @@ def test_trees_and_even_ground_say_nothing_of_the_unit():
     trees = register_track(site(noise_m=1.0), xy, height).scale
     assert trees.value < 0.8
     assert not trees.is_known
+    assert not trees.is_wrong()
     even = register_track(site(ground=lambda x, y: 0.0 * (x + y)), xy, height).scale
     assert not even.is_known
+    assert not even.is_wrong()
 
 
 def random_ground(seed, scale_m=3.0, height_m=0.2):

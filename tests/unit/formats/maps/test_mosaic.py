@@ -112,7 +112,7 @@ ODD = {
     "crs.tif": ("EPSG:32634", corner(STEP, 0), "another CRS .*UTM zone 34N, expected WGS 84 / UTM zone 33N"),
     "none.tif": (None, corner(STEP, 0), r"another CRS than the rest \(none"),
     "type.tif": ("EPSG:32633", corner(STEP, 0), r"int16 \(gray\), expected float32"),
-    "pitch.tif": ("EPSG:32633", corner(0, 0, 0.5), "0.5 x 0.5, the rest 0.25 x 0.25.*gdalwarp -r bilinear"),
+    "pitch.tif": ("EPSG:32633", corner(0, 0, 0.5), "0.5 x 0.5, the rest 0.25 x 0.25.*rio merge --resampling bilinear"),
     "shift.tif": ("EPSG:32633", corner(STEP + 0.4, 0), "do not lie on the pixels of the rest"),
 }
 

@@ -114,17 +114,19 @@ def test_every_feature_without_a_class_of_the_table_is_named(tmp_path, height):
         feature(PUDDLE, **{"class": True}),
         feature(ROAD, **{"class": "mud"}),
     )
-    first, second, third = refused(tmp_path, height, path)
+    first, third = refused(tmp_path, height, path)
     assert "feature 0: class 'lava' is not in the class table (obstacle, tree, vegetation, grass, " in first
-    assert "feature 1: has no property 'class' that names its terrain (its properties: fid, terrain)" in second
     assert "feature 2: class True is not in the class table" in third
+    path = collection(tmp_path, feature(ROAD, terrain="grass", fid=3))
+    (only,) = refused(tmp_path, height, path)
+    assert "feature 0: has no property 'class' that names its terrain (its properties: fid, terrain)" in only
 
 
 def test_drawings_that_cannot_be_placed_are_refused_in_one_line(tmp_path, height):
     """Of what the reader of polygons refuses (test_geojson.py) one case."""
     far = [[[10.0, 50.0], [10.1, 50.0], [10.1, 50.1], [10.0, 50.0]]]
-    bow = [ring((0, 0), (9, 9), (9, 0), (0, 9))]
-    for drawing, wanted in ((far, r"they are around 10.05.*the map covers 15.7"), (bow, "Self-intersection")):
+    north = [[[10.0, 95.0], [10.1, 95.0], [10.1, 95.1], [10.0, 95.0]]]
+    for drawing, wanted in ((far, r"they are around 10.05.*the map covers 15.7"), (north, "axes look swapped")):
         path = collection(tmp_path, feature(drawing, **{"class": "mud"}))
         (problem,) = refused(tmp_path, height, path)
         assert str(path) in problem

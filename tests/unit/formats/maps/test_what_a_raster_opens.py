@@ -48,7 +48,7 @@ def read(path):
 
 def hostile(site, secret, address):
     """Names of files, their content, and what is said of them."""
-    refused = r"is a GDAL virtual raster \(VRT\).*write it out as a GeoTIFF: gdal_translate .*{}"
+    refused = r"is a GDAL virtual raster \(VRT\).*write it out as a GeoTIFF: rio convert .*{}"
     for name in ("all.vrt", "called.tif", "a b.vrt"):
         yield name, VRT.format(1, "h.tif"), refused.format(name)
     yield "absolute.tif", VRT.format(0, secret), refused.format("absolute.tif")
@@ -58,7 +58,7 @@ def hostile(site, secret, address):
     yield (
         "hang.tif",
         "<!---->" * 38 + "<?",
-        r"is XML, not a raster that is read.*\(gdal_translate \S*/hang.tif \S*/hang-copy.tif\)",
+        r"is XML, not a raster that is read.*\(rio convert \S*/hang.tif \S*/hang-copy.tif\)",
     )
     yield "wms.tif", f"<GDAL_WMS><Service><ServerUrl>{address}</ServerUrl></Service></GDAL_WMS>", "is XML"
     yield "grid.tif", "ncols 2\nnrows 2\n", "an ASCII grid"
@@ -93,7 +93,7 @@ def test_the_line_on_a_virtual_raster_has_the_command_that_converts_it(folders, 
         read(site / name)
     (line,) = caught.value.problems
     assert line.startswith(f"{site / name}: ")
-    assert shlex.split(line.rpartition("GeoTIFF: ")[2]) == ["gdal_translate", str(site / name), str(site / target)]
+    assert shlex.split(line.rpartition("GeoTIFF: ")[2]) == ["rio", "convert", str(site / name), str(site / target)]
 
 
 def beside(site, secret, address):
@@ -109,12 +109,12 @@ def beside(site, secret, address):
         yield (
             name,
             VRT.format(0, secret),
-            rf"{name}: is a GDAL virtual raster.*: gdal_translate \S*/h.tif \S*/h-copy.tif",
+            rf"{name}: is a GDAL virtual raster.*: rio convert \S*/h.tif \S*/h-copy.tif",
         )
     yield (
         "h.tif.msk",
         f"<GDAL_WMS><ServerUrl>{address}</ServerUrl></GDAL_WMS>",
-        r"h.tif.msk: is XML.*\(gdal_translate \S*/h.tif",
+        r"h.tif.msk: is XML.*\(rio convert \S*/h.tif",
     )
     yield "h.aux", f"EHFA_HEADER_TAG\0{VRT.format(0, secret)}", "damaged"
 

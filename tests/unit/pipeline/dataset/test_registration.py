@@ -1,11 +1,23 @@
 """A map that is off the tracks is said to be, run by run, when a dataset is built."""
 
 import numpy as np
-import pyarrow as pa
 import pytest
+import rasterio
 from made_tracks import with_columns
 from physics_model import PhysicsModel
-from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, open_world, segments
+from raster_commands import run_rio
+from synthetic_store import (
+    GEOID_M,
+    WORLD,
+    add_run,
+    add_world,
+    lanes,
+    open_world,
+    put_map,
+    segments,
+    track_at,
+    winding,
+)
 
 from tcpipe import open_dataset
 from tcpipe.errors import MapError
@@ -19,31 +31,6 @@ from tcpipe.planning.path_files import choose_map
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, select_findings
-from tcpipe.tables.levels import MASKED_TRACK
-
-GEOID_M = 46.3
-
-
-def track_at(xy_m, ground_xy_m, *, std_m=0.02, scale=1.0, seed=3):
-    """Return a track at ``xy_m`` whose heights are those of the world's ground at ``ground_xy_m`` [m from its middle]."""
-    count = len(xy_m)
-    position = lonlat(xy_m)
-    height = scale * WORLD.height(WORLD.x_m + ground_xy_m[:, 0], WORLD.y_m + ground_xy_m[:, 1]) + GEOID_M
-    noise = np.random.default_rng(seed).normal(0.0, 0.01, count)
-    given = {"lon_deg": position[:, 0], "lat_deg": position[:, 1], "alt_m": height + noise}
-    given |= {"x_std_m": np.full(count, std_m), "y_std_m": np.full(count, std_m)}
-    rest = {
-        column.name: np.zeros(count, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
-        for column in MASKED_TRACK.columns
-        if column.name not in given
-    }
-    return MASKED_TRACK.table(**given, **rest)
-
-
-def winding(count=3000):
-    """A drive of 170 m inside the site."""
-    s = np.linspace(0.0, 4.0 * np.pi, count)
-    return np.stack([14.0 * np.sin(s), 13.0 * np.cos(1.5 * s)], 1)
 
 
 def build_with(directory, track, recipe=None):
@@ -262,18 +249,47 @@ def test_the_card_keeps_every_runs_registration(built):
     assert not [of for of in select_findings(result.findings, *HEIGHTS) if of.subject.name == "fits"]
 
 
-@pytest.mark.parametrize(("scale", "wrong"), [(0.3048, "in feet"), (1.4, "")])
-def test_a_map_that_rises_otherwise_than_the_track_is_refused_or_named(tmp_path, scale, wrong):
-    track = track_at(winding(), winding(), scale=scale)
-    if scale < 1.0:
-        with pytest.raises(MapError, match=wrong) as caught:
-            build_with(tmp_path, track)
-        assert "gdal_edit -units ft" in caught.value.problems[0]
-        assert not (tmp_path / "out").exists()
-    else:
-        found = build_with(tmp_path, track)
-        (scaled,) = select_findings(found.findings, *HEIGHTS)
-        assert (scaled.code, scaled.numbers["map_rise_m"]) == ("map-height-scale", pytest.approx(0.71, abs=0.005))
+@pytest.mark.parametrize(
+    ("per_metre", "text"),
+    [
+        (1.0 / 0.3048, r"in feet.*rio edit-info height.tif --bidx 1 --units ft"),
+        (10.0, r"in dm.*rio edit-info height.tif --bidx 1 --units dm"),
+        (100.0, r"in cm.*rio edit-info height.tif --bidx 1 --units cm"),
+        (2.0, r"scaled.*rio calc .* height.tif scaled.tif"),
+    ],
+)
+def test_heights_that_are_no_metres_stop_the_build_until_the_command_is_typed(tmp_path, per_metre, text):
+    """Heights of the site above 612 m, so that the numbers are those of dry land in any unit."""
+    paths = WORLD.write(tmp_path)
+    with rasterio.open(paths["height"], "r+") as dataset:
+        dataset.write(np.float32(per_metre) * (dataset.read() - np.float32(570.0)))
+    store = open_store(tmp_path / "store", create=True)
+    put_map(store, "site", height=paths["height"])
+    add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), track=track_at(winding(), winding()))
+    with pytest.raises(MapError, match=text) as caught:
+        build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    assert not (tmp_path / "out").exists()
+    run_rio(caught.value.problems[0], tmp_path)
+    scaled = tmp_path / "scaled.tif"
+    put_map(store, "site", height=scaled if scaled.exists() else paths["height"])
+    found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    assert not select_findings(found.findings, *HEIGHTS)
+    assert found.card.maps[0].registration[0].height_scale == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_scale_below_the_limit_is_named(tmp_path):
+    found = build_with(tmp_path, track_at(winding(), winding(), scale=1.18))
+    (scaled,) = select_findings(found.findings, *HEIGHTS)
+    assert (scaled.code, scaled.numbers["map_rise_m"]) == ("map-height-scale", pytest.approx(0.85, abs=0.005))
+
+
+def test_heights_of_one_run_in_feet_do_not_blame_the_map(tmp_path):
+    store = open_world(tmp_path)
+    add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), track=track_at(winding(), winding()))
+    feet = track_at(winding(), winding(), scale=3.28084)
+    add_run(store, "b", segments("b", *lanes([2.0], -10.0, 10.0), start_ns=10**13), track=feet)
+    found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    assert [of.subject.name for of in select_findings(found.findings, "map-height-scale")] == ["b"]
 
 
 def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):
