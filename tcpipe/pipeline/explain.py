@@ -342,12 +342,13 @@ def _iterate_differences(
         yield made
         return
     segment, patches = made
+    stored = {**sample, "quality": sample["quality"] & ~Quality.MAP_CONTRADICTS_TRACK}  # the bit is no segment's
     for name, value in segment.items():
-        if name in sample and sample[name] != value:
+        if name in stored and stored[name] != value:
             yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
     for name, values in patches.columns().items():
         now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
-        if now != sample[name]:
+        if name in sample and now != sample[name]:
             yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"
     for layer, stored in _read_stored_layers(files, card, sample["row"]).items():
         pixels = patches.pixels.get(layer)

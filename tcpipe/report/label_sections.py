@@ -39,6 +39,7 @@ QUALITY_WORDS = {
     Quality.PHYSICS_OUTLIER: "power differs much from the physics model",
     Quality.BELOW_FULL_SPEED: "commanded below full speed",
     Quality.SENSORS_DISAGREE: "sensors disagree",
+    Quality.MAP_CONTRADICTS_TRACK: "slope or heights of the map differ from the track",
 }
 """Meaning of each bit."""
 

@@ -63,6 +63,8 @@ class Quality(IntFlag):
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the terrain does not limit the speed."""
     SENSORS_DISAGREE = 1 << 11
     """The track moves unlike every sensor, or contradicted the fixes for seconds."""
+    MAP_CONTRADICTS_TRACK = 1 << 12
+    """Samples only: slope, cross slope or heights of the patch differ from those of the track (`map-contradicts-track`)."""
 
 
 class Loss(IntFlag):

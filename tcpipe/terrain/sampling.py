@@ -50,7 +50,8 @@ class Patches:
 
     ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says; those of several bands are
     (N, bands, own px, own px). The other arrays have shape (N,): smallest height [m], slopes of the fitted plane [rad], valid share, share
-    clipped by the tensor, majority class of terrain under the chord (0: none) and its share.
+    clipped by the tensor, majority class of terrain under the chord (0: none) and its share; how much higher the middle of the front edge
+    is than that of the rear edge, and the centre than the mean of both [m], NaN where one of them has no data.
     """
 
     pixels: Mapping[str, NDArray[Any]]
@@ -61,6 +62,8 @@ class Patches:
     height_clipped_fraction: NDArray[np.float64]
     terrain_class: NDArray[np.uint8]
     terrain_purity: NDArray[np.float64]
+    rise_m: NDArray[np.float64]
+    bulge_m: NDArray[np.float64]
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return all but the pixels, by name."""
@@ -132,6 +135,7 @@ def sample_patches(
         found[name] = _sample_bands(level, name, frames, patch_m=patch_m, patch_px=patch_px)
         known = np.isfinite(found[name]).mean(axis=(1, 2, 3)) if chord_m.size else stats[:, 3]
         stats[:, 3] = np.minimum(stats[:, 3], known)
+    rise_m, bulge_m = _compute_rise(out.relative)
     return Patches(
         pixels=found,
         height_min_m=stats[:, 0] + level.height_reference_m,
@@ -141,7 +145,20 @@ def sample_patches(
         height_clipped_fraction=stats[:, 4],
         terrain_class=stats[:, 5].astype(np.uint8),
         terrain_purity=stats[:, 6],
+        rise_m=rise_m,
+        bulge_m=bulge_m,
     )
+
+
+def _compute_rise(height: NDArray[np.uint16]) -> tuple[FloatArray, FloatArray]:
+    """Return rise and bulge of stored heights along the middle of patches, shape (N, px, px), as those of `Patches`."""
+    middle = slice((height.shape[1] - 1) // 2, height.shape[1] // 2 + 1)
+    rear, centre, front = (height[:, middle, columns] for columns in (slice(1), middle, slice(-1, None)))
+    rear_m, centre_m, front_m = (
+        np.where(part == HEIGHT_NODATA, np.nan, part * HEIGHT_STEP_M).mean(axis=(1, 2))
+        for part in (rear, centre, front)
+    )
+    return front_m - rear_m, centre_m - (rear_m + front_m) / 2.0
 
 
 def _sample_bands(level: MapReader, name: str, frames: PatchFrames, *, patch_m: float, patch_px: int) -> NDArray[Any]:
