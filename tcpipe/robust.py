@@ -17,14 +17,10 @@ def estimate_robust_std(residuals: NDArray[np.float64]) -> float:
 
 
 def estimate_shorth(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return centre and standard deviation by the shortest half of the values: almost as many may be outliers to one side.
-
-    The factor for few values is that of least median of squares (Rousseeuw and Leroy 1987). NaN is left out; no value: 0, 0.
-    """
+    """Return centre and σ of the finite values by the shortest half of them, for few as Rousseeuw and Leroy (1987); of none 0, 0."""
     rising = np.sort(values[np.isfinite(values)])
     if not rising.size:
         return 0.0, 0.0
     widths = rising[rising.size // 2 :] - rising[: rising.size - rising.size // 2]
-    first = int(widths.argmin())
-    factor = (1.0 + 5.0 / rising.size) / (2.0 * NORMAL_MEDIAN)
-    return float(rising[first] + widths[first] / 2.0), float(widths[first] * factor)
+    first, factor = int(widths.argmin()), (1.0 + 5.0 / rising.size) / NORMAL_MEDIAN
+    return float(rising[first] + widths[first] / 2.0), float(factor * widths[first] / 2.0)

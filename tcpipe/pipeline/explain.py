@@ -346,9 +346,9 @@ def _iterate_differences(
     for name, value in segment.items():
         if name in stored and stored[name] != value:
             yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
-    for name, values in patches.columns().items():
+    for name, values in ((name, values) for name, values in patches.columns().items() if name in sample):
         now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
-        if name in sample and now != sample[name]:
+        if now != sample[name]:
             yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"
     for layer, stored in _read_stored_layers(files, card, sample["row"]).items():
         pixels = patches.pixels.get(layer)

@@ -68,7 +68,7 @@ from tcpipe.robots import Robot
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
 from tcpipe.stages.sample import Sampled, sum_losses
 from tcpipe.tables.arrays import make_points
-from tcpipe.tables.bits import Loss, Quality, flag_name
+from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
@@ -162,8 +162,8 @@ class SampleTable:
     map_names: tuple[str, ...]
     class_names: NDArray[np.str_]
     patch: NDArray[np.int64]
-    is_contradicted: NDArray[np.bool_]
-    """Whether the track contradicts the map under each patch of ``sampled``."""
+    flags: NDArray[np.uint32]
+    """Quality bits of each patch of ``sampled`` beyond those of its segment."""
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
     redact: Callable[[pa.Table], pa.Table] | None = None
@@ -201,8 +201,7 @@ class SampleTable:
         }
         of_patches = self.sampled.patches.columns()
         columns |= {name: values[at] for name, values in of_patches.items() if name in SAMPLES.names()}
-        flag = np.where(self.is_contradicted[at], np.uint32(Quality.MAP_CONTRADICTS_TRACK), np.uint32(0))
-        columns["quality"] = segments.column("quality").to_numpy() | flag
+        columns["quality"] = segments.column("quality").to_numpy() | self.flags[at]
         columns["position_std_m"] = self.sampled.position_std_m[at]
         columns["geometry"] = make_points(centres := self._centres_deg(at))
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
@@ -303,7 +302,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
-    contradicted, contradictions = find_contradictions(inputs.runs, segments, sampled, inputs.map_names, recipe.sample)
+    flags, contradictions = find_contradictions(inputs.runs, segments, sampled, inputs.map_names, recipe.sample)
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
     kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
@@ -322,7 +321,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
             inputs.map_names,
             sources[0].classes.names(),
             order,
-            contradicted,
+            flags,
             added,
         ),
         spool=spool,

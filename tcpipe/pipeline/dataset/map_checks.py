@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -30,7 +29,7 @@ from tcpipe.motion.row_sections import number_pieces
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.robust import estimate_shorth
 from tcpipe.stages.sample import Sampled, Shifts
-from tcpipe.tables.bits import DropReason, flag_name
+from tcpipe.tables.bits import DropReason, Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection, compute_geoid_height
@@ -249,110 +248,71 @@ def _make_map_registration(run_id: str, found: Registration, expected_m: float, 
 
 
 _CONTRADICTION = "map-contradicts-track"
+_LIMITS = ("min_slope_rad", "min_slope_rad", "min_rise_m", "min_bulge_m")
 _ATTITUDE_ROLES = {"imu", "visual_odometry", "pose"}
-"""Roles that measure roll, and pitch apart from heights."""
 _MIN_HEIGHT_CHANGE_M = 0.001
 """A track whose heights change by less has no measured heights."""
-_COMPARED = ("start_z_m", "end_z_m", "chord_m", "pitch_rad", "roll_rad", "fused_velocity_mps")
+_MOTION = ("start_z_m", "end_z_m", "chord_m", "pitch_rad", "roll_rad", "fused_velocity_mps")
+_Rows = NDArray[np.float64]
 
 
 def find_contradictions(
     runs: Sequence[RunDirectory], segments: pa.Table, sampled: Sampled, map_names: Sequence[str], config: SampleConfig
-) -> tuple[NDArray[np.bool_], list[Finding]]:
-    """Return whether the track contradicts the map under each patch, shape (N,), and a finding for each large cluster of such patches.
+) -> tuple[NDArray[np.uint32], list[Finding]]:
+    """Return `Quality.MAP_CONTRADICTS_TRACK` or 0 of each patch, shape (N,), and findings on the largest clusters of such patches.
 
-    Slope, cross slope and heights along the middle of a patch are compared with the track's, run by run. A run that measured neither
-    heights nor attitude confirms and contradicts nothing.
+    Slope, cross slope and heights along the middle of patches are compared run by run; a run without heights and attitude has no say.
     """
-    track = {name: to_floats(segments, name)[sampled.kept] for name in _COMPARED}
-    ground = sampled.patches.columns()
+    motion = np.stack([to_floats(segments, name)[sampled.kept] for name in _MOTION])
+    patches, (rear_m, centre_m, front_m) = sampled.patches, sampled.patches.profile_m.T
+    rise_m, bulge_m = front_m - rear_m, centre_m - (rear_m + front_m) / 2.0
+    slope_of_rise = rise_m / (config.patch_m * (1.0 - 1.0 / config.patch_px))
+    ground = np.stack([patches.slope_rad, patches.cross_slope_rad, slope_of_rise, bulge_m])
     run_ids = segments.column("run_id").combine_chunks().dictionary_encode()
-    names, code = run_ids.dictionary.to_pylist(), run_ids.indices.to_numpy(zero_copy_only=False)[sampled.kept]
-    facts = {run.run_id: run.manifest.info.report.facts.fuse for run in runs}
-    excess = np.zeros((4, len(code)))
-    for number, run_id in enumerate(names):
-        rows, fused = np.flatnonzero(code == number), facts[run_id]
-        has_attitude = fused is not None and not _ATTITUDE_ROLES.isdisjoint(fused.sensors)
-        mine, under = ({name: values[rows] for name, values in columns.items()} for columns in (track, ground))
-        excess[:, rows] = _compare_ground(
-            mine, under, has_attitude=has_attitude, reach_m=config.patch_m * (1 - 1 / config.patch_px)
-        )
-    is_wrong = np.any(excess != 0.0, axis=0)
-    return is_wrong, _find_clusters(np.flatnonzero(is_wrong), excess, sampled, map_names)
+    code, excess = run_ids.indices.to_numpy(zero_copy_only=False)[sampled.kept], np.zeros(ground.shape)
+    fused = {run.run_id: run.manifest.info.report.facts.fuse for run in runs}
+    for number in np.unique(code):
+        rows, facts = code == number, fused[run_ids.dictionary[number].as_py()]
+        has_attitude = facts is not None and not _ATTITUDE_ROLES.isdisjoint(facts.sensors)
+        excess[:, rows] = _compare_ground(motion[:, rows], ground[:, rows], has_attitude=has_attitude)
+    flags = excess.any(axis=0) * np.uint32(Quality.MAP_CONTRADICTS_TRACK)
+    return flags, list(_find_clusters(np.flatnonzero(flags), excess, sampled, map_names))
 
 
-def _compare_ground(
-    track: Mapping[str, NDArray[np.float64]],
-    ground: Mapping[str, NDArray[np.float64]],
-    *,
-    has_attitude: bool,
-    reach_m: float,
-) -> NDArray[np.float64]:
-    """Return by how much slope, cross slope [rad], rise and bulge [m] of a run's patches differ from the track, shape (4, N).
+def _compare_ground(motion: _Rows, ground: _Rows, *, has_attitude: bool) -> _Rows:
+    """Return how slope, cross slope [rad], rise and bulge [m] of a run's patches differ from the track, shape (4, N); 0 within limits.
 
-    Differences within the limits are 0. Of pitch and climb of the track the one that is nearer to the map counts: a jump of the fixes
-    or a bump under one wheel is no error of the map. The mounting error of the IMU is a constant of the run.
+    The track's climb or its pitch counts, whichever is nearer to the map: a jump of the fixes is no error of the map. The mounting error
+    of the IMU is a constant of the run.
     """
-    sign = np.where(track["fused_velocity_mps"] < 0.0, -1.0, 1.0)
-    climb = np.arctan2(track["end_z_m"] - track["start_z_m"], track["chord_m"])
-    slopes = np.full((2, len(climb)), np.nan)
-    if has_height := np.ptp(track["end_z_m"]) > _MIN_HEIGHT_CHANGE_M:
-        slopes[0] = climb
-    if has_attitude:
-        mounting_rad = estimate_shorth(-track["pitch_rad"] - sign * climb)[0] if has_height else 0.0
-        slopes[1] = sign * (-track["pitch_rad"] - mounting_rad)
-    cross_rad = sign * ground["cross_slope_rad"] - track["roll_rad"]
-    differences = (
-        _take_nearest(ground["slope_rad"] - slopes),
-        cross_rad - estimate_shorth(cross_rad)[0] if has_attitude else np.full(len(climb), np.nan),
-        _take_nearest(ground["rise_m"] - reach_m * np.tan(slopes)),
-        np.where(np.isfinite(slopes).any(axis=0), ground["bulge_m"], np.nan),
-    )
-    found = np.zeros((4, len(climb)))
-    for row, name in enumerate(("min_slope_rad", "min_slope_rad", "min_rise_m", "min_bulge_m")):
-        sigmas = read_threshold(_CONTRADICTION, "min_sigma_ratio") * estimate_shorth(differences[row])[1]
-        is_large = np.abs(differences[row]) > max(read_threshold(_CONTRADICTION, name), sigmas)
-        found[row, is_large] = differences[row][is_large]
-    return found
+    start_z_m, end_z_m, chord_m, pitch_rad, roll_rad, speed_mps = motion
+    sign, has_height = np.where(speed_mps < 0.0, -1.0, 1.0), np.ptp(end_z_m) > _MIN_HEIGHT_CHANGE_M
+    climb_rad = np.where(has_height, np.arctan2(end_z_m - start_z_m, chord_m), np.nan)
+    tilt_rad, roll_rad = (np.where(has_attitude, sign * angle, np.nan) for angle in (-pitch_rad, roll_rad))
+    tilt_rad -= sign * estimate_shorth(sign * (tilt_rad - climb_rad))[0]
+    climb_error, tilt_error = (np.nan_to_num(np.abs(each - ground[0]), nan=np.inf) for each in (climb_rad, tilt_rad))
+    slope_rad, cross_rad = np.where(tilt_error < climb_error, tilt_rad, climb_rad), ground[1] - roll_rad
+    cross_rad -= sign * estimate_shorth(sign * cross_rad)[0]
+    rise_m = chord_m * (ground[2] - np.tan(slope_rad))
+    excess = np.stack([ground[0] - slope_rad, cross_rad, rise_m, ground[3] + 0.0 * slope_rad])
+    for row, name in zip(excess, _LIMITS, strict=True):
+        sigmas = read_threshold(_CONTRADICTION, "min_sigma_ratio") * estimate_shorth(row)[1]
+        row[~(np.abs(row) > max(read_threshold(_CONTRADICTION, name), sigmas))] = 0.0
+    return excess
 
 
-def _take_nearest(differences: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return of each column of (2, N) the value nearest to zero; NaN only where both are."""
-    nearest = np.where(np.isnan(differences), np.inf, np.abs(differences)).argmin(axis=0)
-    return np.asarray(np.take_along_axis(differences, nearest[None], axis=0)[0])
-
-
-def _find_clusters(
-    rows: NDArray[np.int64], excess: NDArray[np.float64], sampled: Sampled, map_names: Sequence[str]
-) -> list[Finding]:
-    """Return a finding for each of the largest clusters of contradicted patches (``rows``), with its place and size."""
-    if not rows.size:
-        return []
-    centres = sampled.footprint_xy_m[rows].mean(axis=1)
-    pairs = KDTree(np.column_stack([centres, 1e9 * sampled.map_index[rows]])).query_pairs(
-        read_threshold(_CONTRADICTION, "max_gap_m"), output_type="ndarray"
-    )
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
-    cluster = connected_components(links, directed=False)[1]
-    largest = np.argsort(-np.bincount(cluster), kind="stable")[
-        : int(read_threshold(_CONTRADICTION, "max_finding_count"))
-    ]
-    findings = []
-    for patches in (rows[cluster == number] for number in largest):
-        lon, lat = sampled.footprint_lonlat_deg[patches].mean(axis=(0, 1))
-        slope_rad, height_m = (float(np.abs(part[:, patches]).max()) for part in np.split(excess, 2))
-        findings.append(
-            make_finding(
-                _CONTRADICTION,
-                Subject("map", map_names[sampled.map_index[patches[0]]]),
-                names={"place": f"{lon:.6f}, {lat:.6f}"},
-                sample_count=len(patches),
-                extent_m=float(np.hypot(*np.ptp(sampled.footprint_xy_m[patches].reshape(-1, 2), axis=0))),
-                slope_rad=slope_rad,
-                height_m=height_m,
-            )
-        )
-    return findings
+def _find_clusters(rows: NDArray[np.int64], excess: _Rows, sampled: Sampled, maps: Sequence[str]) -> Iterator[Finding]:
+    """Yield findings on the largest clusters of patches ``rows``: place, size, and largest differences of slope and height."""
+    places = KDTree(np.column_stack([sampled.footprint_xy_m[rows].mean(axis=1), 1e9 * sampled.map_index[rows]]))
+    near = places.sparse_distance_matrix(places, read_threshold(_CONTRADICTION, "max_gap_m"))
+    cluster, most = connected_components(near)[1], int(read_threshold(_CONTRADICTION, "max_finding_count"))
+    for mine in (rows[cluster == number] for number in np.argsort(-np.bincount(cluster), kind="stable")[:most]):
+        lon, lat = sampled.footprint_lonlat_deg[mine].mean(axis=(0, 1))
+        slope_rad, height_m = (float(np.abs(part[:, mine]).max()) for part in np.split(excess, 2))
+        names, subject = {"place": f"{lon:.6f}, {lat:.6f}"}, Subject("map", maps[sampled.map_index[mine[0]]])
+        extent_m = float(np.hypot(*np.ptp(sampled.footprint_xy_m[mine].reshape(-1, 2), axis=0)))
+        numbers = {"sample_count": len(mine), "extent_m": extent_m, "slope_rad": slope_rad, "height_m": height_m}
+        yield make_finding(_CONTRADICTION, subject, names=names, **numbers)
 
 
 def find_removed_by_ground(
