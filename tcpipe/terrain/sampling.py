@@ -134,17 +134,13 @@ def sample_patches(
         found[name] = _sample_bands(level, name, frames, patch_m=patch_m, patch_px=patch_px)
         known = np.isfinite(found[name]).mean(axis=(1, 2, 3)) if chord_m.size else stats[:, 3]
         stats[:, 3] = np.minimum(stats[:, 3], known)
-    return Patches(
-        pixels=found,
-        height_min_m=stats[:, 0] + level.height_reference_m,
-        slope_rad=stats[:, 1],
-        cross_slope_rad=stats[:, 2],
-        valid_fraction=stats[:, 3],
-        height_clipped_fraction=stats[:, 4],
-        terrain_class=stats[:, 5].astype(np.uint8),
-        terrain_purity=stats[:, 6],
-        profile_m=_compute_profile(out.relative),
+    height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity = stats.T
+    height_m, terrain_class, profile_m = (
+        height_m + level.height_reference_m,
+        terrain_class.astype(np.uint8),
+        _compute_profile(out.relative),
     )
+    return Patches(found, height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity, profile_m)
 
 
 def _compute_profile(height: NDArray[np.uint16]) -> FloatArray:

@@ -360,8 +360,8 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         palette = dataset.colorinterp[0] == ColorInterp.palette
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
             some = dataset.read(plain, out_shape=(len(plain), 512, 512), masked=True).compressed()
-            remedy = suggest_bytes(dataset, path, float(some[np.isfinite(some)].max(initial=0.0)) or 1.0)
-            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected 8 or 16 bits, unsigned; scale it: {remedy}")
+            how = suggest_bytes(dataset, path, float(some[np.isfinite(some)].max(initial=0.0)) or 1.0)
+            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected 8-bit or 16-bit unsigned; scale it: {how}")
         if None not in rgb:
             more = make_finding("ortho-bands-unused", subject, names={**file, "bands": names})
             return tuple(band for band in rgb if band is not None), (more,) if len(plain) > 3 else ()

@@ -208,13 +208,11 @@ _TAIL = 0.001
 
 @dataclass(slots=True)
 class Plateau:
-    """Pixels of exactly the smallest value of a raster, of all; steps to their neighbours, and large ones of these."""
+    """Pixels of exactly the smallest value of a raster; ``counts`` are these, steps to their neighbours, and the large steps."""
 
     value: float = math.inf
-    pixels: int = 0
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(3, np.int64))
     total: int = 0
-    steps: int = 0
-    large_steps: int = 0
 
     def count(self, values: NDArray[np.float64], valid: NDArray[np.bool_], *, min_step: float) -> None:
         """Count a window that has data."""
@@ -223,17 +221,16 @@ class Plateau:
         if lowest > self.value or inside.sum() < read_threshold(_ISOLATED, "min_pixel_count"):
             return
         if lowest < self.value:
-            self.value, self.pixels, self.steps, self.large_steps = lowest, 0, 0, 0
-        self.pixels += int(inside.sum())
-        for axis in (0, 1):
-            step = np.abs(np.diff(np.where(valid, values, np.nan), axis=axis))[np.diff(inside, axis=axis)]
-            self.steps += int(np.isfinite(step).sum())
-            self.large_steps += int((step >= min_step).sum())
+            self.value, self.counts = lowest, np.zeros(3, np.int64)
+        known = np.where(valid, values, np.nan)
+        step = np.concatenate([np.abs(np.diff(known, axis=axis))[np.diff(inside, axis=axis)] for axis in (0, 1)])
+        self.counts += (inside.sum(), np.isfinite(step).sum(), (step >= min_step).sum())
 
     def is_isolated(self, min_fraction: float) -> bool:
-        """Return whether such a share of pixels has the value, in areas, with large steps at nearly all of their borders."""
-        is_area = 0 < self.steps < self.pixels and self.pixels >= min_fraction * self.total
-        return is_area and self.large_steps >= read_threshold(_ISOLATED, "min_large_step_fraction") * self.steps
+        """Return whether such a share of pixels has the value, in areas, with large steps at most of their borders."""
+        pixels, steps, large_steps = self.counts.tolist()
+        is_steep = large_steps >= read_threshold(_ISOLATED, "min_large_step_fraction") * steps
+        return is_steep and 0 < steps < pixels and pixels >= min_fraction * self.total
 
 
 @dataclass(slots=True)
@@ -246,9 +243,8 @@ class Tally:
     by_class: NDArray[np.int64] = field(default_factory=lambda: np.zeros(256, np.int64))
     unnamed: set[int] = field(default_factory=set)
     unnamed_pixels: int = 0
-    lowest: Plateau = field(default_factory=Plateau)
-    highest: Plateau = field(default_factory=Plateau)
-    """Of the negative values of an orthophoto."""
+    plateaus: dict[float, Plateau] = field(default_factory=lambda: {1.0: Plateau(), -1.0: Plateau()})
+    """Of values times 1 and -1; in heights the lowest alone."""
 
     def count(self, layer: Layer, label: str, shard: Pixels) -> bool:
         """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
@@ -344,9 +340,9 @@ class RasterLayer:
         subject, tiles, names = Subject("layer", self.layer.name), self.raster.tiles, {"file": self.name}
         files = [self.raster.open_file(tile.path, tile.driver) for tile in tiles[:_NAMED]]
         least = 0.0 if self.layer.kind == "relative" else read_threshold(_ISOLATED, "min_ortho_fraction")
-        for plateau, sign in ((self.tally.lowest, 1.0), (self.tally.highest, -1.0)):
+        for sign, plateau in self.tally.plateaus.items():
             if plateau.is_isolated(least):
-                value, share = sign * plateau.value, plateau.pixels / plateau.total
+                value, share = sign * plateau.value, plateau.counts[0] / plateau.total
                 commands = [suggest_nodata(file, tile, value) for file, tile in zip(files, tiles, strict=False)]
                 remedies, named = (
                     [Remedy("nodata", command=text) for text in commands if text],
@@ -358,8 +354,8 @@ class RasterLayer:
             low, high = np.searchsorted(np.cumsum(counts) / counts.sum(), (_TAIL, 1.0 - _TAIL)).tolist()
             if (share := (high - low + 1) / 255.0) < read_threshold(_NARROW, "min_range_fraction"):
                 command = suggest_bytes(files[0], tiles[0].path, (high + 1.5) / tiles[0].scale[0])
-                remedies = [Remedy("scale", command=command)]
-                yield make_finding(_NARROW, subject, names=names, remedies=remedies, range_fraction=share)
+                scale = [Remedy("scale", command=command)]
+                yield make_finding(_NARROW, subject, names=names, remedies=scale, range_fraction=share)
 
     def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
         return compute_source_lattice(self.grid, self.raster.georeference, self.projection, row0, rows, col0, cols)
@@ -389,12 +385,11 @@ class RasterLayer:
             self.tally.note_unnamed(values[valid & (ids == 0)])
             resample_majority(ids, lattice, parts, part)
             return
-        if self.layer.kind == "relative":
+        if self.layer.name == "height":
             steep = read_threshold(_ISOLATED, "min_step_ratio") * self.grid.pixel_size_m / ratio
-            self.tally.lowest.count(values, valid, min_step=max(steep, read_threshold(_ISOLATED, "min_step_m")))
-        elif self.layer.name == "ortho":
-            for plateau, sign in ((self.tally.lowest, 1.0), (self.tally.highest, -1.0)):
-                plateau.count(sign * values, valid, min_step=read_threshold(_ISOLATED, "min_grey_step"))
+            self.tally.plateaus[1.0].count(values, valid, min_step=max(steep, read_threshold(_ISOLATED, "min_step_m")))
+        for sign, plateau in self.tally.plateaus.items() if self.layer.name == "ortho" else ():
+            plateau.count(sign * values, valid, min_step=read_threshold(_ISOLATED, "min_step_grey"))
         source = np.where(valid, values, np.nan).astype(np.float64, copy=False)
         if parts > 1:
             mean(source, lattice, parts, part)

@@ -199,8 +199,8 @@ class SampleTable:
         columns: dict[str, Any] = {
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
-        of_patches = self.sampled.patches.columns()
-        columns |= {name: values[at] for name, values in of_patches.items() if name in SAMPLES.names()}
+        shown = {*SAMPLES.names()}
+        columns |= {name: values[at] for name, values in self.sampled.patches.columns().items() if name in shown}
         columns["quality"] = segments.column("quality").to_numpy() | self.flags[at]
         columns["position_std_m"] = self.sampled.position_std_m[at]
         columns["geometry"] = make_points(centres := self._centres_deg(at))
@@ -311,19 +311,11 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     )
     robots = [run.robot for run in inputs.sources]
     narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m)
+    class_names, has_terrain = sources[0].classes.names(), "terrain" in spool.layers
+    more = inputs.map_names, class_names, order, flags, added
+    found = (*inputs.findings, *unusable, *shifted, *sampled.findings, *contradictions)
     return Content(
-        samples=SampleTable(
-            segments,
-            sampled,
-            slot,
-            "terrain" in spool.layers,
-            assigned,
-            inputs.map_names,
-            sources[0].classes.names(),
-            order,
-            flags,
-            added,
-        ),
+        samples=SampleTable(segments, sampled, slot, has_terrain, assigned, *more),
         spool=spool,
         sources=sources,
         split=result,
@@ -333,17 +325,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         exclusions=excluded.lists,
         excluded=excluded.ids,
         removal=removal,
-        findings=(
-            *inputs.findings,
-            *unusable,
-            *shifted,
-            *sampled.findings,
-            *contradictions,
-            *excluded.findings,
-            *narrow,
-            *biased,
-            *incomplete,
-        ),
+        findings=(*found, *excluded.findings, *narrow, *biased, *incomplete),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -275,7 +276,7 @@ def find_contradictions(
         rows, facts = code == number, fused[run_ids.dictionary[number].as_py()]
         has_attitude = facts is not None and not _ATTITUDE_ROLES.isdisjoint(facts.sensors)
         excess[:, rows] = _compare_ground(motion[:, rows], ground[:, rows], has_attitude=has_attitude)
-    flags = excess.any(axis=0) * np.uint32(Quality.MAP_CONTRADICTS_TRACK)
+    flags = np.where(excess.any(axis=0), np.uint32(Quality.MAP_CONTRADICTS_TRACK), np.uint32(0))
     return flags, list(_find_clusters(np.flatnonzero(flags), excess, sampled, map_names))
 
 
@@ -311,8 +312,8 @@ def _find_clusters(rows: NDArray[np.int64], excess: _Rows, sampled: Sampled, map
         slope_rad, height_m = (float(np.abs(part[:, mine]).max()) for part in np.split(excess, 2))
         names, subject = {"place": f"{lon:.6f}, {lat:.6f}"}, Subject("map", maps[sampled.map_index[mine[0]]])
         extent_m = float(np.hypot(*np.ptp(sampled.footprint_xy_m[mine].reshape(-1, 2), axis=0)))
-        numbers = {"sample_count": len(mine), "extent_m": extent_m, "slope_rad": slope_rad, "height_m": height_m}
-        yield make_finding(_CONTRADICTION, subject, names=names, **numbers)
+        sizes: dict[str, Any] = {"sample_count": len(mine), "extent_m": extent_m, "slope_rad": slope_rad}
+        yield make_finding(_CONTRADICTION, subject, names=names, height_m=height_m, **sizes)
 
 
 def find_removed_by_ground(

@@ -137,7 +137,7 @@ def test_few_grey_levels_are_reported_and_the_command_scales_them(tmp_path, high
 @pytest.mark.parametrize("nodata", [None, -9999.0, np.nan])
 def test_reflectance_as_floats_is_refused_with_the_command_that_scales_it(tmp_path, nodata):
     values = np.where(HOLE & (nodata is not None), nodata or 0.0, GREY / 255.0)
-    with pytest.raises(MapError, match="float32, expected 8 or 16 bits") as error:
+    with pytest.raises(MapError, match="float32, expected 8-bit or 16-bit") as error:
         add(tmp_path, **photo(tmp_path, values, np.float32, nodata=nodata))
     source, left = add(tmp_path, height=tmp_path / "h.tif", ortho=follow(str(error.value).partition("scale it: ")[2]))
     assert not left
