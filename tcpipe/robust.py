@@ -14,3 +14,13 @@ MEDIAN_OF_SQUARES = NORMAL_MEDIAN**2
 def estimate_robust_std(residuals: NDArray[np.float64]) -> float:
     """Return the standard deviation of residuals about zero: that of the normal variate whose median absolute value is theirs."""
     return float(np.median(np.abs(residuals))) / NORMAL_MEDIAN
+
+
+def estimate_shorth(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return centre and σ of the finite values by the shortest half of them, for few as Rousseeuw and Leroy (1987); of none 0, 0."""
+    rising = np.sort(values[np.isfinite(values)])
+    if not rising.size:
+        return 0.0, 0.0
+    widths = rising[rising.size // 2 :] - rising[: rising.size - rising.size // 2]
+    first, factor = int(widths.argmin()), (1.0 + 5.0 / rising.size) / NORMAL_MEDIAN
+    return float(rising[first] + widths[first] / 2.0), float(factor * widths[first] / 2.0)

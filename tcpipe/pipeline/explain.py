@@ -342,10 +342,11 @@ def _iterate_differences(
         yield made
         return
     segment, patches = made
+    of_segment = {**sample, "quality": sample["quality"] & ~Quality.MAP_CONTRADICTS_TRACK}
     for name, value in segment.items():
-        if name in sample and sample[name] != value:
+        if name in of_segment and of_segment[name] != value:
             yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
-    for name, values in patches.columns().items():
+    for name, values in ((name, values) for name, values in patches.columns().items() if name in sample):
         now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
         if now != sample[name]:
             yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"

@@ -39,6 +39,7 @@ QUALITY_WORDS = {
     Quality.BELOW_FULL_SPEED: "commanded below full speed",
     Quality.SENSORS_DISAGREE: "sensors disagree",
     Quality.UNPOWERED: "the robot moves with its idle power",
+    Quality.MAP_CONTRADICTS_TRACK: "slope or heights of the map differ from the track",
 }
 """Meaning of each bit."""
 

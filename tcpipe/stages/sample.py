@@ -176,16 +176,10 @@ def sample_on_maps(
         placed = _project_to_first_map(found, source, sources[0])
         parts.append(replace(found, kept=waiting[found.kept], map_index=place, footprint_xy_m=placed))
         waiting = waiting[np.isin(found.lost_by, _ELSEWHERE)]
-    return Sampled(
-        kept=np.concatenate([part.kept for part in parts]),
-        map_index=np.concatenate([part.map_index for part in parts]),
-        patches=join_patches([part.patches for part in parts]),
-        position_std_m=np.concatenate([part.position_std_m for part in parts]),
-        footprint_xy_m=np.concatenate([part.footprint_xy_m for part in parts]),
-        footprint_lonlat_deg=np.concatenate([part.footprint_lonlat_deg for part in parts]),
-        lost_by=lost_by,
-        findings=tuple(dict.fromkeys(finding for part in parts for finding in part.findings)),
-    )
+    names = ("kept", "map_index", "position_std_m", "footprint_xy_m", "footprint_lonlat_deg")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    findings = tuple(dict.fromkeys(finding for part in parts for finding in part.findings))
+    return Sampled(patches=join_patches([part.patches for part in parts]), lost_by=lost_by, findings=findings, **joined)
 
 
 def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader) -> NDArray[np.float64]:

@@ -64,6 +64,8 @@ class Quality(IntFlag):
     """The track moves unlike every sensor, or contradicted the fixes for seconds."""
     UNPOWERED = 1 << 12
     """The robot moves with its idle power over several segments, though their speed and slope need clearly more."""
+    MAP_CONTRADICTS_TRACK = 1 << 13
+    """Samples only: slope, cross slope or heights of the patch differ from those of the track (`map-contradicts-track`)."""
 
 
 class Loss(IntFlag):

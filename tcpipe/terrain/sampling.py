@@ -50,7 +50,8 @@ class Patches:
 
     ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says; those of several bands are
     (N, bands, own px, own px). The other arrays have shape (N,): smallest height [m], slopes of the fitted plane [rad], valid share, share
-    clipped by the tensor, majority class of terrain under the chord (0: none) and its share.
+    clipped by the tensor, majority class of terrain under the chord (0: none) and its share. ``profile_m``: heights in the middle of rear
+    edge, patch and front edge above the smallest [m], NaN without data, (N, 3).
     """
 
     pixels: Mapping[str, NDArray[Any]]
@@ -61,6 +62,7 @@ class Patches:
     height_clipped_fraction: NDArray[np.float64]
     terrain_class: NDArray[np.uint8]
     terrain_purity: NDArray[np.float64]
+    profile_m: NDArray[np.float64]
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return all but the pixels, by name."""
@@ -132,16 +134,20 @@ def sample_patches(
         found[name] = _sample_bands(level, name, frames, patch_m=patch_m, patch_px=patch_px)
         known = np.isfinite(found[name]).mean(axis=(1, 2, 3)) if chord_m.size else stats[:, 3]
         stats[:, 3] = np.minimum(stats[:, 3], known)
-    return Patches(
-        pixels=found,
-        height_min_m=stats[:, 0] + level.height_reference_m,
-        slope_rad=stats[:, 1],
-        cross_slope_rad=stats[:, 2],
-        valid_fraction=stats[:, 3],
-        height_clipped_fraction=stats[:, 4],
-        terrain_class=stats[:, 5].astype(np.uint8),
-        terrain_purity=stats[:, 6],
+    height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity = stats.T
+    height_m, terrain_class, profile_m = (
+        height_m + level.height_reference_m,
+        terrain_class.astype(np.uint8),
+        _compute_profile(out.relative),
     )
+    return Patches(found, height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity, profile_m)
+
+
+def _compute_profile(height: NDArray[np.uint16]) -> FloatArray:
+    """Return ``profile_m`` of `Patches` by stored heights, shape (N, px, px)."""
+    middle = slice((height.shape[1] - 1) // 2, height.shape[1] // 2 + 1)
+    along_m = np.where((line := height[:, middle]) == HEIGHT_NODATA, np.nan, line * HEIGHT_STEP_M).mean(axis=1)
+    return np.stack([along_m[:, part].mean(axis=1) for part in (slice(1), middle, slice(-1, None))], axis=1)
 
 
 def _sample_bands(level: MapReader, name: str, frames: PatchFrames, *, patch_m: float, patch_px: int) -> NDArray[Any]:

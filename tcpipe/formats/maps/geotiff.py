@@ -27,7 +27,7 @@ import rasterio
 import rasterio.shutil
 from numpy.typing import NDArray
 from pyproj import CRS
-from rasterio.enums import ColorInterp
+from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.features import rasterize
 from rasterio.io import MemoryFile
@@ -135,7 +135,7 @@ class Tile:
     """The tag; NaN also if there is none."""
     bands: tuple[int, ...]
     scale: tuple[float, float]
-    """Scale and offset to metres, or to the numbers that are meant."""
+    """Scale and offset to metres, to grey from 0 to 255, or to the numbers that are meant."""
     unit: str
     """Of numbers, as the file says; empty where it does not."""
     is_half: bool
@@ -187,9 +187,7 @@ def read_window(  # noqa: PLR0917
     if tile.use == "classes":
         return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
     weights = _WEIGHTS.get(tile.use)
-    values = (
-        raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _read_grey(dataset, tile.bands, raw, weights)
-    )
+    values = raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _read_grey(dataset, tile, raw, weights)
     return values, valid & np.isfinite(values)
 
 
@@ -206,11 +204,11 @@ def _read_whole_numbers(tile: Tile, values: NDArray[Any], valid: NDArray[np.bool
 
 
 def _read_grey(
-    dataset: Any, bands: tuple[int, ...], raw: NDArray[Any], weights_rgb: tuple[float, float, float]
+    dataset: Any, tile: Tile, raw: NDArray[Any], weights_rgb: tuple[float, float, float]
 ) -> NDArray[np.float64]:
-    if dataset.colorinterp[bands[0] - 1] == ColorInterp.palette:
-        return np.asarray(_read_palette_grey(dataset.colormap(bands[0]), weights_rgb)[raw[0]])
-    weights = np.array(weights_rgb if len(bands) == 3 else (1.0,)) * (255.0 / np.iinfo(raw.dtype).max)
+    if dataset.colorinterp[tile.bands[0] - 1] == ColorInterp.palette:
+        return np.asarray(_read_palette_grey(dataset.colormap(tile.bands[0]), weights_rgb)[raw[0]])
+    weights = np.array(weights_rgb if len(tile.bands) == 3 else (1.0,)) * tile.scale[0]
     return np.asarray(np.tensordot(weights, raw.astype(np.float64), 1))
 
 
@@ -389,7 +387,9 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         rgb = [colours.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         palette = dataset.colorinterp[0] == ColorInterp.palette
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
-            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected 8-bit or 16-bit unsigned")
+            some = dataset.read(plain, out_shape=(len(plain), 512, 512), masked=True).compressed()
+            how = suggest_bytes(dataset, path, float(some[np.isfinite(some)].max(initial=0.0)) or 1.0)
+            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected 8-bit or 16-bit unsigned; scale it: {how}")
         if None not in rgb:
             more = make_finding("ortho-bands-unused", subject, names={**file, "bands": names})
             return tuple(band for band in rgb if band is not None), (more,) if len(plain) > 3 else ()
@@ -452,17 +452,20 @@ def _fits_half(dataset: Any, bands: tuple[int, ...], scale: tuple[float, float])
 def _read_scaling(
     dataset: Any, path: Path, role: str, use: Use, bands: tuple[int, ...]
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
-    """Return scale and offset to metres or numbers; for other uses, a finding that such tags were not applied."""
+    """Return scale and offset to metres, numbers or grey; for grey and classes, a finding that such tags were not applied."""
     scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
     if use == "numbers":
         if len({(dataset.scales[band - 1], dataset.offsets[band - 1], dataset.units[band - 1]) for band in bands}) > 1:
             raise MapError(f"{path}: bands of {role} differ in scale, offset or unit; write them as one kind of number")
         return (scale, offset), ()
     if use != "metres":
+        size = np.dtype(dataset.dtypes[bands[0] - 1]).itemsize
+        bits = dataset.tags(bands[0], ns="IMAGE_STRUCTURE").get("NBITS", 8 * size)  # 12 of 16
+        grey = (255.0 / (2 ** int(bits) - 1) if use in _WEIGHTS else 1.0, 0.0)
         if (scale, offset) == (1.0, 0.0):
-            return (1.0, 0.0), ()
+            return grey, ()
         subject, file = Subject("layer", role), {"file": path.name}
-        return (1.0, 0.0), (make_finding("scale-not-applied", subject, names=file, scale=scale, offset=offset),)
+        return grey, (make_finding("scale-not-applied", subject, names=file, scale=scale, offset=offset),)
     unit = (dataset.units[bands[0] - 1] or "").strip()
     name = "".join(letter for letter in unit.lower() if letter.isalpha())
     name = name.replace("meter", "metre").replace("metres", "metre").replace("feet", "foot")
@@ -473,6 +476,27 @@ def _read_scaling(
         )
     metres = _METRES[name] if unit else _find_vertical_unit_m(dataset, path)
     return (scale * metres, offset * metres), ()
+
+
+def suggest_bytes(dataset: Any, path: Path, highest: float) -> str:
+    """Return the command that writes an orthophoto with 8 bits: values from 0 to ``highest`` as 1 to 255, no data as 0."""
+    text = f"(where (> (read 1) {highest:.6g}) 255 (+ 1 (* {254.0 / highest:.6g} (read 1))))"
+    options = [] if dataset.nodata is None else ["--co", "nodata=0"]
+    if options and not np.isnan(dataset.nodata):  # NaN becomes 0 by itself
+        text = f"(where (== (read 1) {dataset.nodata:.9g}) 0 {text})"
+    files = [str(path), str(path.with_name(f"{path.stem}-8bit.tif"))]
+    return shlex.join(["rio", "calc", "--not-masked", "--dtype", "uint8", *options, text, *files])
+
+
+def suggest_nodata(dataset: Any, tile: Tile, value: float) -> str:
+    """Return the command that declares a value as no data; none if a mask, a palette, or nodata of several bands prevents it."""
+    nodata = None if dataset.nodata is None or np.isnan(dataset.nodata) else f"{dataset.nodata:.9g}"
+    is_masked = MaskFlags.per_dataset in dataset.mask_flag_enums[0] or (nodata and dataset.count > 1)
+    if is_masked or "palette" in tile.kind:
+        return ""
+    raw, copy = f"{(value - tile.scale[1]) / tile.scale[0]:.9g}", tile.path.with_stem(f"{tile.path.stem}-nodata")
+    changed = ["calc", "--not-masked", f"(where (== (read 1) {raw}) {nodata} (read 1))", str(tile.path), str(copy)]
+    return shlex.join(["rio", *(changed if nodata else ["edit-info", "--nodata", raw, str(tile.path)])])
 
 
 def _find_vertical_unit_m(dataset: Any, path: Path) -> float:

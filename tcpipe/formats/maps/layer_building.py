@@ -19,8 +19,17 @@ from pyproj import CRS
 
 from tcpipe.errors import MapError
 from tcpipe.formats.geojson import shorten_problems
-from tcpipe.formats.maps.geotiff import OpenFile, Tile, Use, make_table_command, read_tile, read_window
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.formats.maps.geotiff import (
+    OpenFile,
+    Tile,
+    Use,
+    make_table_command,
+    read_tile,
+    read_window,
+    suggest_bytes,
+    suggest_nodata,
+)
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.projection import Projection, parse_crs
@@ -48,7 +57,7 @@ class Raster:
     tiles: tuple[Tile, ...]
     _corners: NDArray[np.int64] = field(repr=False)
     """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
-    _open_file: OpenFile = field(repr=False)
+    open_file: OpenFile = field(repr=False)
 
     def select_band(self, number: int) -> Raster:
         """Return one band, by its number from 0."""
@@ -68,7 +77,7 @@ class Raster:
         for n in np.flatnonzero((low < high).all(axis=1)).tolist():
             (top, left), (bottom, right) = low[n].tolist(), high[n].tolist()
             row, _, col, _ = self._corners[n].tolist()
-            part, there = read_window(self._open_file, self.tiles[n], top - row, bottom - row, left - col, right - col)
+            part, there = read_window(self.open_file, self.tiles[n], top - row, bottom - row, left - col, right - col)
             if part.shape == values.shape and len(self.tiles) == 1:
                 return part, there
             window = slice(top - row0, bottom - row0), slice(left - col0, right - col0)
@@ -114,7 +123,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
         names=_join_value_names(tiles),
         tiles=tuple(tiles),
         _corners=corners,
-        _open_file=open_file,
+        open_file=open_file,
     )
 
 
@@ -203,6 +212,36 @@ _MEAN_FROM = 1.5
 """From so many source pixels a map pixel on, a layer is averaged instead of interpolated."""
 _LISTED = 8
 _NAMED = 3
+_ISOLATED, _NARROW = "value-isolated", "ortho-range-narrow"
+_TAIL = 0.001
+"""Share of the darkest, and of the brightest, pixels of an orthophoto outside the range that counts."""
+
+
+@dataclass(slots=True)
+class Plateau:
+    """Pixels of exactly the smallest value of a raster; ``counts`` are these, steps to their neighbours, and the large steps."""
+
+    value: float = math.inf
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(3, np.int64))
+    total: int = 0
+
+    def count(self, values: NDArray[np.float64], valid: NDArray[np.bool_], *, min_step: float) -> None:
+        """Count a window that has data."""
+        lowest = float(values[valid].min())
+        inside, self.total = valid & (values == lowest), self.total + int(valid.sum())
+        if lowest > self.value or inside.sum() < read_threshold(_ISOLATED, "min_pixel_count"):
+            return
+        if lowest < self.value:
+            self.value, self.counts = lowest, np.zeros(3, np.int64)
+        known = np.where(valid, values, np.nan)
+        step = np.concatenate([np.abs(np.diff(known, axis=axis))[np.diff(inside, axis=axis)] for axis in (0, 1)])
+        self.counts += (inside.sum(), np.isfinite(step).sum(), (step >= min_step).sum())
+
+    def is_isolated(self, min_fraction: float) -> bool:
+        """Return whether such a share of pixels has the value, in areas, with large steps at most of their borders."""
+        pixels, steps, large_steps = self.counts.tolist()
+        is_steep = large_steps >= read_threshold(_ISOLATED, "min_large_step_fraction") * steps
+        return is_steep and 0 < steps < pixels and pixels >= min_fraction * self.total
 
 
 @dataclass(slots=True)
@@ -217,6 +256,8 @@ class Tally:
     unnamed_pixels: int = 0
     nodata: float = math.nan
     """Tag of the raster; NaN also if it has none."""
+    plateaus: dict[float, Plateau] = field(default_factory=lambda: {1.0: Plateau(), -1.0: Plateau()})
+    """Of values times 1 and -1; in heights the lowest alone."""
 
     def count(self, layer: Layer, label: str, shard: Pixels) -> bool:
         """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
@@ -227,7 +268,9 @@ class Tally:
             return bool(found[1:].any())
         present = shard[layer.has_data(shard)]
         self.pixels += present.size
-        if layer.stack != "greys" and present.size:
+        if layer.stack == "greys":
+            self.by_class += np.bincount(shard.reshape(-1), minlength=256)
+        elif present.size:
             self.low, self.high = min(self.low, float(present.min())), max(self.high, float(present.max()))
             if layer.kind == "relative" and (self.high > _HIGHEST_M or self.low < _DEEPEST_M):
                 raise MapError(self._describe_range(label))
@@ -309,7 +352,7 @@ class RasterLayer:
         subject, unnamed = Subject("layer", self.layer.name), sorted(self.tally.unnamed)
         rough = self.projection.find_rough_shift(subject) if self.projection else ()
         if not unnamed:
-            return (*self.raster.findings, *rough)
+            return (*self.raster.findings, *rough, *self._find_isolated())
         values = ", ".join(map(str, unnamed[:_NAMED])) + (" …" if len(unnamed) > _NAMED else "")
         finding = make_finding(
             "class-values-unnamed",
@@ -319,6 +362,28 @@ class RasterLayer:
             value_count=len(unnamed),
         )
         return (*self.raster.findings, *rough, finding)
+
+    def _find_isolated(self) -> Iterator[Finding]:
+        """Yield findings on values that are probably no data, and on a photo that uses little of 16 bits; white may be a collar."""
+        subject, tiles, names = Subject("layer", self.layer.name), self.raster.tiles, {"file": self.name}
+        files = [self.raster.open_file(tile.path, tile.driver) for tile in tiles[:_NAMED]]
+        least = 0.0 if self.layer.kind == "relative" else read_threshold(_ISOLATED, "min_ortho_fraction")
+        for sign, plateau in self.tally.plateaus.items():
+            if plateau.is_isolated(least):
+                value, share = sign * plateau.value, plateau.counts[0] / plateau.total
+                commands = [suggest_nodata(file, tile, value) for file, tile in zip(files, tiles, strict=False)]
+                remedies, named = (
+                    [Remedy("nodata", command=text) for text in commands if text],
+                    {"value": f"{value:.6g}"},
+                )
+                yield make_finding(_ISOLATED, subject, names=names | named, remedies=remedies, pixel_fraction=share)
+        counts = self.tally.by_class[1:255]
+        if self.layer.name == "ortho" and "uint16" in tiles[0].kind and counts.any():
+            low, high = np.searchsorted(np.cumsum(counts) / counts.sum(), (_TAIL, 1.0 - _TAIL)).tolist()
+            if (share := (high - low + 1) / 255.0) < read_threshold(_NARROW, "min_range_fraction"):
+                command = suggest_bytes(files[0], tiles[0].path, (high + 1.5) / tiles[0].scale[0])
+                scale = [Remedy("scale", command=command)]
+                yield make_finding(_NARROW, subject, names=names, remedies=scale, range_fraction=share)
 
     def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
         return compute_source_lattice(self.grid, self.raster.georeference, self.projection, row0, rows, col0, cols)
@@ -348,6 +413,11 @@ class RasterLayer:
             self.tally.note_unnamed(values[valid & (ids == 0)])
             resample_majority(ids, lattice, parts, part)
             return
+        if self.layer.name == "height":
+            steep = read_threshold(_ISOLATED, "min_step_ratio") * self.grid.pixel_size_m / ratio
+            self.tally.plateaus[1.0].count(values, valid, min_step=max(steep, read_threshold(_ISOLATED, "min_step_m")))
+        for sign, plateau in self.tally.plateaus.items() if self.layer.name == "ortho" else ():
+            plateau.count(sign * values, valid, min_step=read_threshold(_ISOLATED, "min_step_grey"))
         source = np.where(valid, values, np.nan).astype(np.float64, copy=False)
         if parts > 1:
             mean(source, lattice, parts, part)

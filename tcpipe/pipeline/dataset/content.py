@@ -59,7 +59,7 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
-from tcpipe.pipeline.dataset.map_checks import find_removed_by_ground, register_runs
+from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
@@ -162,6 +162,8 @@ class SampleTable:
     map_names: tuple[str, ...]
     class_names: NDArray[np.str_]
     patch: NDArray[np.int64]
+    flags: NDArray[np.uint32]
+    """Quality bits of each patch of ``sampled`` beyond those of its segment."""
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
     redact: Callable[[pa.Table], pa.Table] | None = None
@@ -197,7 +199,9 @@ class SampleTable:
         columns: dict[str, Any] = {
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
-        columns |= {name: values[at] for name, values in self.sampled.patches.columns().items()}
+        shown = {*SAMPLES.names()}
+        columns |= {name: values[at] for name, values in self.sampled.patches.columns().items() if name in shown}
+        columns["quality"] = segments.column("quality").to_numpy() | self.flags[at]
         columns["position_std_m"] = self.sampled.position_std_m[at]
         columns["geometry"] = make_points(centres := self._centres_deg(at))
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
@@ -300,6 +304,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
+    flags, contradictions = find_contradictions(inputs.runs, segments, sampled, inputs.map_names, recipe.sample)
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
     kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
@@ -308,18 +313,11 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     )
     robots = [run.robot for run in inputs.sources]
     narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m)
+    class_names, has_terrain = sources[0].classes.names(), "terrain" in spool.layers
+    more = inputs.map_names, class_names, order, flags, added
+    found = (*inputs.findings, *unusable, *shifted, *sampled.findings, *contradictions)
     return Content(
-        samples=SampleTable(
-            segments,
-            sampled,
-            slot,
-            "terrain" in spool.layers,
-            assigned,
-            inputs.map_names,
-            sources[0].classes.names(),
-            order,
-            added,
-        ),
+        samples=SampleTable(segments, sampled, slot, has_terrain, assigned, *more),
         spool=spool,
         sources=sources,
         split=result,
@@ -329,16 +327,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         exclusions=excluded.lists,
         excluded=excluded.ids,
         removal=removal,
-        findings=(
-            *inputs.findings,
-            *unusable,
-            *shifted,
-            *sampled.findings,
-            *excluded.findings,
-            *narrow,
-            *biased,
-            *incomplete,
-        ),
+        findings=(*found, *excluded.findings, *narrow, *biased, *incomplete),
     )
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from tcpipe.errors import MapError
 from tcpipe.formats.dataset_card import MapRegistration, Removal
@@ -26,8 +29,9 @@ from tcpipe.motion.distance_breakdown import (
 )
 from tcpipe.motion.row_sections import number_pieces
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.stages.sample import Shifts
-from tcpipe.tables.bits import DropReason, flag_name
+from tcpipe.robust import estimate_shorth
+from tcpipe.stages.sample import Sampled, Shifts
+from tcpipe.tables.bits import DropReason, Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection, compute_geoid_height
@@ -254,6 +258,74 @@ def _make_map_registration(run_id: str, found: Registration, expected_m: float, 
         height_scale_std=found.scale.std if found.scale.is_known else None,
         expected_misfit_m=expected_m,
     )
+
+
+_CONTRADICTION = "map-contradicts-track"
+_LIMITS = ("min_slope_rad", "min_slope_rad", "min_rise_m", "min_bulge_m")
+_ATTITUDE_ROLES = {"imu", "visual_odometry", "pose"}
+_MIN_HEIGHT_CHANGE_M = 0.001
+"""A track whose heights change by less has no measured heights."""
+_MOTION = ("start_z_m", "end_z_m", "chord_m", "pitch_rad", "roll_rad", "fused_velocity_mps")
+_Rows = NDArray[np.float64]
+
+
+def find_contradictions(
+    runs: Sequence[RunDirectory], segments: pa.Table, sampled: Sampled, map_names: Sequence[str], config: SampleConfig
+) -> tuple[NDArray[np.uint32], list[Finding]]:
+    """Return `Quality.MAP_CONTRADICTS_TRACK` or 0 of each patch, shape (N,), and findings on the largest clusters of such patches.
+
+    Slope, cross slope and heights along the middle of patches are compared run by run; a run without heights and attitude has no say.
+    """
+    motion = np.stack([to_floats(segments, name)[sampled.kept] for name in _MOTION])
+    patches, (rear_m, centre_m, front_m) = sampled.patches, sampled.patches.profile_m.T
+    rise_m, bulge_m = front_m - rear_m, centre_m - (rear_m + front_m) / 2.0
+    slope_of_rise = rise_m / (config.patch_m * (1.0 - 1.0 / config.patch_px))
+    ground = np.stack([patches.slope_rad, patches.cross_slope_rad, slope_of_rise, bulge_m])
+    run_ids = segments.column("run_id").combine_chunks().dictionary_encode()
+    code, excess = run_ids.indices.to_numpy(zero_copy_only=False)[sampled.kept], np.zeros(ground.shape)
+    fused = {run.run_id: run.manifest.info.report.facts.fuse for run in runs}
+    for number in np.unique(code):
+        rows, facts = code == number, fused[run_ids.dictionary[number].as_py()]
+        has_attitude = facts is not None and not _ATTITUDE_ROLES.isdisjoint(facts.sensors)
+        excess[:, rows] = _compare_ground(motion[:, rows], ground[:, rows], has_attitude=has_attitude)
+    flags = np.where(excess.any(axis=0), np.uint32(Quality.MAP_CONTRADICTS_TRACK), np.uint32(0))
+    return flags, list(_find_clusters(np.flatnonzero(flags), excess, sampled, map_names))
+
+
+def _compare_ground(motion: _Rows, ground: _Rows, *, has_attitude: bool) -> _Rows:
+    """Return how slope, cross slope [rad], rise and bulge [m] of a run's patches differ from the track, shape (4, N); 0 within limits.
+
+    The track's climb or its pitch counts, whichever is nearer to the map: a jump of the fixes is no error of the map. The mounting error
+    of the IMU is a constant of the run.
+    """
+    start_z_m, end_z_m, chord_m, pitch_rad, roll_rad, speed_mps = motion
+    sign, has_height = np.where(speed_mps < 0.0, -1.0, 1.0), np.ptp(end_z_m) > _MIN_HEIGHT_CHANGE_M
+    climb_rad = np.where(has_height, np.arctan2(end_z_m - start_z_m, chord_m), np.nan)
+    tilt_rad, roll_rad = (np.where(has_attitude, sign * angle, np.nan) for angle in (-pitch_rad, roll_rad))
+    tilt_rad -= sign * estimate_shorth(sign * (tilt_rad - climb_rad))[0]
+    climb_error, tilt_error = (np.nan_to_num(np.abs(each - ground[0]), nan=np.inf) for each in (climb_rad, tilt_rad))
+    slope_rad, cross_rad = np.where(tilt_error < climb_error, tilt_rad, climb_rad), ground[1] - roll_rad
+    cross_rad -= sign * estimate_shorth(sign * cross_rad)[0]
+    rise_m = chord_m * (ground[2] - np.tan(slope_rad))
+    excess = np.stack([ground[0] - slope_rad, cross_rad, rise_m, ground[3] + 0.0 * slope_rad])
+    for row, name in zip(excess, _LIMITS, strict=True):
+        sigmas = read_threshold(_CONTRADICTION, "min_sigma_ratio") * estimate_shorth(row)[1]
+        row[~(np.abs(row) > max(read_threshold(_CONTRADICTION, name), sigmas))] = 0.0
+    return excess
+
+
+def _find_clusters(rows: NDArray[np.int64], excess: _Rows, sampled: Sampled, maps: Sequence[str]) -> Iterator[Finding]:
+    """Yield findings on the largest clusters of patches ``rows``: place, size, and largest differences of slope and height."""
+    places = KDTree(np.column_stack([sampled.footprint_xy_m[rows].mean(axis=1), 1e9 * sampled.map_index[rows]]))
+    near = places.sparse_distance_matrix(places, read_threshold(_CONTRADICTION, "max_gap_m"))
+    cluster, most = connected_components(near)[1], int(read_threshold(_CONTRADICTION, "max_finding_count"))
+    for mine in (rows[cluster == number] for number in np.argsort(-np.bincount(cluster), kind="stable")[:most]):
+        lon, lat = sampled.footprint_lonlat_deg[mine].mean(axis=(0, 1))
+        slope_rad, height_m = (float(np.abs(part[:, mine]).max()) for part in np.split(excess, 2))
+        names, subject = {"place": f"{lon:.6f}, {lat:.6f}"}, Subject("map", maps[sampled.map_index[mine[0]]])
+        extent_m = float(np.hypot(*np.ptp(sampled.footprint_xy_m[mine].reshape(-1, 2), axis=0)))
+        sizes: dict[str, Any] = {"sample_count": len(mine), "extent_m": extent_m, "slope_rad": slope_rad}
+        yield make_finding(_CONTRADICTION, subject, names=names, height_m=height_m, **sizes)
 
 
 def find_removed_by_ground(

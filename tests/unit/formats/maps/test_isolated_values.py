@@ -1,0 +1,171 @@
+"""Holes and collars without a tag, and orthophotos in a corner of their range, are reported with a command that works."""
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from map_worlds import write_tif
+from rasterio import Affine
+from shared_data import shared_data
+
+from tcpipe.errors import MapError
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_files import open_map
+from tcpipe.tables.findings import select_findings
+
+PX, COUNT = 0.1, 300
+AFFINE = Affine(PX, 0.0, 500_000.0, 0.0, -PX, 5_200_000.0)
+X, Y = np.meshgrid(np.arange(COUNT) * PX, np.arange(COUNT) * PX)
+HEIGHT = 312.0 + 0.2 * X - 0.1 * Y + 0.3 * np.sin(X / 1.7) * np.cos(Y / 1.3)
+GREY = 130.0 + 90.0 * np.sin(X / 2.1) * np.sin(Y / 1.9)
+HOLE = np.hypot(X - 14.0, Y - 11.0) < 2.0
+COLLAR = 0.3 * X + Y > 33.0
+
+
+def write(path, values, dtype=np.float32, **options):
+    bands = values if values.ndim == 3 else values[None]
+    return write_tif(path, bands.astype(dtype), "EPSG:32633", AFFINE, **options)
+
+
+def add(tmp_path, **layers):
+    """Build a map of the rasters; return it, and its findings of the two kinds."""
+    facts = build_map(tmp_path / "m.zarr", name="m", **layers)
+    return open_map(tmp_path / "m.zarr"), select_findings(facts.findings, "value-isolated", "ortho-range-narrow")
+
+
+def follow(command):
+    """Run a suggested command of the installation; return the last file that it names."""
+    program, *arguments = shlex.split(command)
+    subprocess.run([Path(sys.executable).with_name(program), *arguments], check=True, capture_output=True, timeout=120)
+    return Path(arguments[-1])
+
+
+def read(source, layer):
+    return source.read(layer, 0, source.grid.rows, 0, source.grid.cols)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, -99.0])
+@pytest.mark.parametrize("nodata", [None, -9999.0])
+@pytest.mark.parametrize("place", [HOLE, COLLAR], ids=["hole", "collar"])
+def test_a_height_far_below_all_others_is_reported_and_the_command_makes_it_no_data(tmp_path, value, nodata, place):
+    path = write(tmp_path / "h.tif", np.where(place, value, HEIGHT), nodata=nodata)
+    _, (finding,) = add(tmp_path, height=path)
+    assert finding.severity == "warning"
+    assert finding.names["value"] == f"{value:g}"
+    assert finding.numbers["pixel_fraction"] == pytest.approx(place.mean(), rel=1e-3)
+    source, left = add(tmp_path, height=follow(finding.remedies[0].command))
+    assert not left
+    assert np.array_equal(np.isnan(read(source, "height")), place)
+
+
+def test_one_of_several_tiles_has_the_hole(tmp_path):
+    paths = [write(tmp_path / "a.tif", np.where(HOLE, 0.0, HEIGHT))]
+    with rasterio.open(paths[0]) as dataset:
+        beside = dataset.transform @ Affine.translation(COUNT, 0)
+    paths.append(
+        write_tif(tmp_path / "b.tif", (HEIGHT + 0.2 * COUNT * PX).astype(np.float32)[None], "EPSG:32633", beside)
+    )
+    _, (finding,) = add(tmp_path, height=paths)
+    for remedy in finding.remedies:
+        follow(remedy.command)
+    source, left = add(tmp_path, height=paths)
+    assert not left
+    assert np.isnan(read(source, "height")).sum() == HOLE.sum()
+
+
+def test_a_hole_with_smeared_edges_is_reported(tmp_path):
+    soft = np.clip((2.2 - np.hypot(X - 14.0, Y - 11.0)) / 0.2, 0.0, 1.0)
+    _, findings = add(tmp_path, height=write(tmp_path / "h.tif", HEIGHT * (1.0 - soft)))
+    assert len(findings) == 1
+
+
+@pytest.mark.parametrize(
+    "height",
+    {
+        "sound": HEIGHT,
+        "lake": np.maximum(HEIGHT, 313.0),
+        "lake below a bank of 1 m": np.where(HEIGHT < 313.0, 312.0, HEIGHT),
+        "clipped plain": np.maximum(HEIGHT - 313.0, 0.0),
+        "metres as integers": np.rint(HEIGHT),
+        "flat": np.zeros_like(HEIGHT),
+        "pits of one pixel": np.where((X * 10 % 50 < 1) & (Y * 10 % 50 < 1), HEIGHT - 20.0, HEIGHT),
+    }.items(),
+    ids=lambda item: item[0],
+)
+def test_lakes_plains_and_pits_are_not_reported(tmp_path, height):
+    assert not add(tmp_path, height=write(tmp_path / "h.tif", height[1]))[1]
+
+
+def photo(tmp_path, values, dtype=np.uint8, **options):
+    """Return a height raster, and an orthophoto of three bands."""
+    height = write(tmp_path / "h.tif", HEIGHT)
+    return {
+        "height": height,
+        "ortho": write(tmp_path / "o.tif", np.stack([values] * 3), dtype, photometric="RGB", **options),
+    }
+
+
+def test_bits_in_use_are_the_range_of_an_orthophoto(tmp_path):
+    source, findings = add(tmp_path, **photo(tmp_path, GREY / 255.0 * 4095.0, np.uint16, nbits=12))
+    assert not findings
+    assert np.abs(read(source, "ortho") - GREY).max() < 1.1
+    good = {"height": shared_data("reports/maps/good_height.tif"), "ortho": shared_data("reports/maps/good_ortho.tif")}
+    eight = read(add(tmp_path, **good)[0], "ortho").astype(int)
+    twelve = read(add(tmp_path, **good | {"ortho": shared_data("reports/maps/ortho_12bit.tif")})[0], "ortho")
+    assert np.abs(twelve - eight)[(eight > 0) & (twelve > 0)].max() <= 1
+
+
+@pytest.mark.parametrize("nodata", [None, 65535])
+@pytest.mark.parametrize("highest", [4095.0, 10_000.0, 900.0])
+def test_few_grey_levels_are_reported_and_the_command_scales_them(tmp_path, highest, nodata):
+    values = np.where(HOLE & (nodata is not None), 65535.0, GREY / 255.0 * highest)
+    _, (finding,) = add(tmp_path, **photo(tmp_path, values, np.uint16, nodata=nodata))
+    assert finding.code == "ortho-range-narrow"
+    assert finding.numbers["range_fraction"] < 0.25
+    source, left = add(tmp_path, height=tmp_path / "h.tif", ortho=follow(finding.remedies[0].command))
+    assert not left
+    grey = read(source, "ortho")
+    assert np.array_equal(grey == 0, HOLE & (nodata is not None))
+    assert np.ptp(grey[grey > 0].astype(int)) > 100
+    assert np.corrcoef(grey[grey > 0], GREY[grey > 0])[0, 1] > 0.99
+
+
+@pytest.mark.parametrize("nodata", [None, -9999.0, np.nan])
+def test_reflectance_as_floats_is_refused_with_the_command_that_scales_it(tmp_path, nodata):
+    values = np.where(HOLE & (nodata is not None), nodata or 0.0, GREY / 255.0)
+    with pytest.raises(MapError, match="float32, expected 8-bit or 16-bit") as error:
+        add(tmp_path, **photo(tmp_path, values, np.float32, nodata=nodata))
+    source, left = add(tmp_path, height=tmp_path / "h.tif", ortho=follow(str(error.value).partition("scale it: ")[2]))
+    assert not left
+    grey = read(source, "ortho")
+    assert np.array_equal(grey == 0, HOLE & (nodata is not None))
+    assert np.corrcoef(grey[grey > 0], GREY[grey > 0])[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(("value", "dtype"), [(0, np.uint8), (255, np.uint8), (0, np.uint16), (65535, np.uint16)])
+@pytest.mark.parametrize("place", [HOLE, COLLAR], ids=["hole", "collar"])
+def test_black_and_white_areas_without_mask_are_reported_and_kept(tmp_path, value, dtype, place):
+    full = float(np.iinfo(dtype).max)
+    source, (finding,) = add(tmp_path, **photo(tmp_path, np.where(place, value, GREY / 255.0 * full), dtype))
+    assert finding.code == "value-isolated"
+    assert finding.numbers["pixel_fraction"] == pytest.approx(place.mean(), rel=1e-3)
+    assert (read(source, "ortho") > 0).all()
+    source, left = add(tmp_path, height=tmp_path / "h.tif", ortho=follow(finding.remedies[0].command))
+    assert not left
+    assert np.array_equal(read(source, "ortho") == 0, place)
+
+
+@pytest.mark.parametrize("grey", [GREY, np.clip(2.0 * GREY - 130.0, 0.0, 255.0)], ids=["sound", "saturated"])
+def test_dark_and_bright_ground_is_not_reported(tmp_path, grey):
+    assert not add(tmp_path, **photo(tmp_path, grey))[1]
+
+
+def test_a_mask_is_enough(tmp_path):
+    layers = photo(tmp_path, np.where(COLLAR, 0.0, GREY))
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(layers["ortho"], "r+") as dataset:
+        dataset.write_mask(~COLLAR)
+    assert not add(tmp_path, **layers)[1]
