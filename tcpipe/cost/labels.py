@@ -167,7 +167,7 @@ def estimate_energy_budget(
 ) -> EnergyBudget | None:
     """Return the noise floor of E, shape (M,) [J], NaN without a label; None without energies.
 
-    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, of ``at_20_hz`` and ``common``.
+    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, and of other keys of the budget.
     """
     known = np.isfinite(energy_joule)
     mean_joule = float(np.abs(energy_joule[known]).mean()) if known.any() else 0.0
@@ -188,7 +188,7 @@ def pool_budgets(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
     mean_joule = sum(each["segments"] * each["mean_energy_joule"] for each in known) / count
     squares = {
         name: sum(each["segments"] * (each[name] * each["mean_energy_joule"]) ** 2 for each in known) / count
-        for name in ("total", *CAUSES, "at_20_hz", "common")
+        for name in ("total", *CAUSES, "at_20_hz", "common", "delay")
         if all(each[name] is not None for each in known)
     }
     return EnergyBudget(

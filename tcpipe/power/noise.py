@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.rails import Rail, Samples, interpolate_rail, sum_power
+from tcpipe.power.rails import Rail, Rule, Samples, integrate_energy, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
 from tcpipe.robust import MEDIAN_OF_SQUARES
 from tcpipe.tables.facts import Smoothing
@@ -92,6 +92,22 @@ def estimate_energy_noise(
         steady = _select_used_samples(power.stamp_ns, start_ns, end_ns)
         rate += np.square((end_ns - start_ns) * _NS) * estimate_smoothing_variance(power, steady, smoothing)
     return EnergyNoise(rate, current, voltage)
+
+
+def estimate_delay_variance(
+    rails: list[Rail], start_ns: Stamps, end_ns: Stamps, delay_s: float, std_s: float, *, rule: Rule
+) -> Floats:
+    """Return the mean square of what a delay of power changes of each span's energy [J²], shape (M,); 0 where it is unknown.
+
+    The energies of two spans in a row change by opposite amounts at their border: over a path the error averages out. The mean is over
+    the normal distribution of the delay (``delay_s``, ``std_s`` [s]), by Gauss and Hermite's three nodes.
+    """
+    stamped = integrate_energy(rails, start_ns, end_ns, rule=rule)
+    squares = []
+    for node_s in delay_s + std_s * np.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]):
+        shift_ns = round(node_s / _NS)
+        squares.append((integrate_energy(rails, start_ns + shift_ns, end_ns + shift_ns, rule=rule) - stamped) ** 2)
+    return np.nan_to_num(np.average(squares, axis=0, weights=[1 / 6, 2 / 3, 1 / 6]))
 
 
 def compute_median_period_s(signal: Samples) -> float:

@@ -15,6 +15,8 @@ Where the power of a run wanders like a random walk, a mean over a seconds befor
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -137,10 +139,13 @@ def is_stated_averaged(
         (motion_ns - motion_ns[0]) / 1e9,
         period_ns / 1e9,
     )
-    sums = _integrate_causes(motion_s, _collect_causes(motion_s, forward_mps, yaw_rate_radps))
+    causes = np.column_stack((_collect_causes(motion_s, forward_mps, yaw_rate_radps), forward_mps**2))
+    sums = _integrate_causes(motion_s, causes)
     left = np.array(
         [
-            _compute_unexplained(power_watt[inside], _mean_about(at_s - late * period_s, period_s, motion_s, sums))
+            _compute_squared_residuals(
+                power_watt[inside], _mean_about(at_s - late * period_s, period_s, motion_s, sums)
+            ).sum()
             for late in _LATE
         ]
     )
@@ -152,20 +157,20 @@ def is_stated_averaged(
 
 
 def _collect_causes(motion_s: Floats, forward_mps: Floats, yaw_rate_radps: Floats) -> Floats:
-    """Return what power follows, shape (M, 5)."""
+    """Return what power follows, shape (M, 4): a constant, speed, turning and the gain of kinetic energy."""
     speed, turning = np.abs(forward_mps), np.abs(yaw_rate_radps)
     gained = np.gradient(0.5 * speed**2, motion_s)
-    return np.column_stack((np.ones_like(speed), speed, speed**2, turning, gained))
+    return np.column_stack((np.ones_like(speed), speed, turning, gained))
 
 
 def _integrate_causes(motion_s: Floats, causes: Floats) -> Floats:
-    """Return the integral of each cause from the first time, shape (M, 5)."""
+    """Return the integral of each cause from the first time, shape (M, K)."""
     steps = np.diff(motion_s)[:, None] * (causes[1:] + causes[:-1]) / 2.0
     return np.concatenate((np.zeros((1, causes.shape[1])), np.cumsum(steps, axis=0)))
 
 
 def _mean_about(at_s: Floats, width_s: float, motion_s: Floats, sums: Floats) -> Floats:
-    """Return the means of the causes over a width about each time, shape (N, 5)."""
+    """Return the means of the causes over a width about each time, shape (N, K)."""
     later, earlier = at_s + width_s / 2, at_s - width_s / 2
     return (
         np.column_stack(
@@ -175,57 +180,118 @@ def _mean_about(at_s: Floats, width_s: float, motion_s: Floats, sums: Floats) ->
     )
 
 
-def _compute_unexplained(power_watt: Floats, causes: Floats) -> float:
-    fitted = causes @ np.linalg.lstsq(causes, power_watt, rcond=None)[0]
-    return float(np.sum((power_watt - fitted) ** 2))
+def _compute_squared_residuals(power_watt: Floats, causes: Floats) -> Floats:
+    return np.asarray(np.square(power_watt - causes @ np.linalg.lstsq(causes, power_watt, rcond=None)[0]))
 
 
 _INSTANT_S = 0.1
 """Motion is averaged over so much about a sample."""
 _WIDTHS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+_DELAYS_S = np.linspace(-2.0, 2.0, 81)
+SMOOTHING_MARGIN_S, DELAY_MARGIN_S = _WIDTHS_S[-1], 2.0 + _INSTANT_S
+"""Motion that must be known before and after a power sample [s]."""
+_DELAY_GROUPS = 8
+"""Parts of the run, each of which is left out once."""
+_MAX_ROWS = 20_000
+"""Power samples that are compared with the motion, evenly taken of more."""
 _FEWEST_MEANS = 20
-"""Of a width, one after the other in the record: to fewer the six causes fit by chance, where power wanders slowly."""
+"""Of a width, one after the other in the record: to fewer the five causes fit by chance, where power wanders slowly."""
 
 
-def find_smoothing(
-    power: Samples, motion_ns: Stamps, motion: Floats, *, averaged: bool, corrected_s: float = 0.0
-) -> Smoothing | None:
-    """Return over how long power [W] is smoothed, by the motion that it follows; None where that is not sure.
+@dataclass(frozen=True, slots=True)
+class PowerFit:
+    """Power samples and the motion around them, for fits of one by the other.
 
-    It has to explain clearly more than power as it is, and than means about the stamp, which fit better where the motion is noisy.
+    Attributes
+    ----------
+    at_s, power_watt : times of the samples (the middle of a stated mean) and values, shape (N,).
+    motion_s, sums : times of the motion, shape (M,), and integrals of the causes of power, shape (M, 5).
+    stated_s : width of the means that the source states; 0 for instantaneous values.
+    """
+
+    at_s: Floats
+    power_watt: Floats
+    motion_s: Floats
+    sums: Floats
+    stated_s: float
+
+    def compute_squared_residuals(self, smoothing: Smoothing) -> Floats:
+        """Return the squared residuals [W²], shape (N,), of power that is smoothed and delayed so; zero width is a delay alone."""
+        width_s = max(self.stated_s + smoothing.width_s, _INSTANT_S)
+        means = _mean_about(self.at_s - smoothing.late_s, width_s, self.motion_s, self.sums)
+        return _compute_squared_residuals(self.power_watt, means)
+
+
+def make_power_fit(
+    power: Samples, motion_ns: Stamps, motion: Floats, *, averaged: bool, margin_s: float
+) -> PowerFit | None:
+    """Return the power samples that have known motion around them; None for fewer than 60.
 
     Parameters
     ----------
     motion_ns, motion : rising stamps [ns], shape (M,), with forward velocity, yaw rate and rate of climb, shape (M, 3).
     averaged : whether a value is stated to be the mean since the one before it.
-    corrected_s : what the recipe adds to the stamps [s]: a mean ends at the stamp before that.
+    margin_s : motion that must be known before and after a sample [s].
     """
     if min(power.value.size, motion_ns.size) < _FEWEST:
         return None
-    margin_ns = round(_WIDTHS_S[-1] * 1e9)
-    inside = (power.stamp_ns > motion_ns[0] + margin_ns) & (power.stamp_ns < motion_ns[-1] - margin_ns)
-    if inside.sum() < _FEWEST:
+    margin_ns = round(margin_s * 1e9)
+    inside = np.flatnonzero((power.stamp_ns > motion_ns[0] + margin_ns) & (power.stamp_ns < motion_ns[-1] - margin_ns))
+    if inside.size < _FEWEST:
         return None
+    inside = inside[:: -(-inside.size // _MAX_ROWS)]
     stated_s = float(np.median(np.diff(power.stamp_ns))) / 1e9 if averaged else 0.0
-    at_s, motion_s = (power.stamp_ns[inside] - motion_ns[0]) / 1e9, (motion_ns - motion_ns[0]) / 1e9
+    at_s, motion_s = (power.stamp_ns[inside] - motion_ns[0]) / 1e9 - stated_s / 2.0, (motion_ns - motion_ns[0]) / 1e9
     sums = _integrate_causes(motion_s, np.column_stack((_collect_causes(motion_s, *motion[:, :2].T), motion[:, 2])))
+    return PowerFit(at_s, power.value[inside], motion_s, sums, stated_s)
 
-    def judge(smoothing: Smoothing) -> float:
-        width_s = max(stated_s + smoothing.width_s, _INSTANT_S)
-        means = _mean_about(at_s - stated_s / 2.0 - smoothing.late_s, width_s, motion_s, sums)
-        return _compute_unexplained(power.value[inside], means)
 
+def find_delay(fit: PowerFit) -> tuple[float, float] | None:
+    """Return the delay of power behind motion [s] and its standard deviation; None where motion does not determine it.
+
+    The standard deviation is that of the delete-a-group jackknife over parts of the run.
+    """
+    part = np.arange(fit.at_s.size) * _DELAY_GROUPS // fit.at_s.size
+    squares = np.array([np.bincount(part, fit.compute_squared_residuals(Smoothing(d, -d))) for d in _DELAYS_S])
+    whole = squares.sum(axis=1)
+    total = fit.power_watt.size * float(np.var(fit.power_watt))
+    explained = (total - whole.min()) / max(total, 1.0)  # 0 for constant power
+    delay_s, *others_s = (_find_minimum(whole - left_out) for left_out in (0.0, *squares.T))
+    std_s = float(np.sqrt((_DELAY_GROUPS - 1) * np.var(others_s)))
+    least, most_s = (read_threshold("power-delayed", name) for name in ("min_explained_fraction", "max_std_s"))
+    return (delay_s, std_s) if explained >= least and std_s <= most_s and np.isfinite(delay_s) else None
+
+
+def _find_minimum(squares: Floats) -> float:
+    """Return the delay [s] of the least sum of squares, by a parabola through its neighbours; NaN at the ends."""
+    best = int(np.argmin(squares))
+    if best in {0, squares.size - 1}:
+        return np.nan
+    before, at, after = squares[best - 1 : best + 2]
+    curvature = before - 2.0 * at + after
+    step_s = float(_DELAYS_S[1] - _DELAYS_S[0])
+    return float(_DELAYS_S[best] + (0.5 * step_s * (before - after) / curvature if curvature > 0.0 else 0.0))
+
+
+def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | None:
+    """Return over how long power [W] is smoothed, by the motion that it follows; None where that is not sure.
+
+    A mean must explain more than a delay alone, and clearly more than means about the stamp, which fit better where the motion is noisy.
+    ``corrected_s`` is what the recipe adds to the stamps [s]: a mean ends at the stamp before that.
+    """
     after_s = max(-corrected_s, 0.0)
-    longest_s = float(at_s[-1] - at_s[0]) / _FEWEST_MEANS
+    longest_s = float(fit.at_s[-1] - fit.at_s[0]) / _FEWEST_MEANS
     tried = [Smoothing(width_s - after_s, after_s) for width_s in _WIDTHS_S if after_s < width_s <= longest_s]
     if not tried:
         return None
     about = [Smoothing(width_s / 2.0 - after_s, width_s / 2.0 + after_s) for width_s in _WIDTHS_S]
-    unexplained = [judge(smoothing) for smoothing in tried]
-    least = min(judge(smoothing) for smoothing in (Smoothing(0.0, 0.0), *about))
-    if min(unexplained) > read_threshold("power-smoothed", "max_unexplained_fraction") * least:
-        return None
-    return tried[int(np.argmin(unexplained))]
+    delayed = [Smoothing(delay_s, -delay_s) for delay_s in _DELAYS_S[::2]]
+    unexplained, least, by_delay = (
+        [fit.compute_squared_residuals(smoothing).sum() for smoothing in each]
+        for each in (tried, [Smoothing(0.0, 0.0), *about], delayed)
+    )
+    limit = min(read_threshold("power-smoothed", "max_unexplained_fraction") * min(least), *by_delay)
+    return tried[int(np.argmin(unexplained))] if min(unexplained) <= limit else None
 
 
 def estimate_smoothing_variance(power: Samples, steady: NDArray[np.bool_], smoothing: Smoothing) -> float:

@@ -88,6 +88,7 @@ _BUDGET_ROWS = {
     "total": "all together",
     "at_20_hz": "all together, with power at 20 Hz",
     "common": "one error of the whole run: power sensor, scale of a lone odometry (apart)",
+    "delay": "delay of power against the motion (apart)",
 }
 
 

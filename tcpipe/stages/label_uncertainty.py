@@ -21,15 +21,22 @@ from tcpipe.power.audit import (
     summarize_rest,
 )
 from tcpipe.power.rails import Rail, Rule, integrate_energy, sum_power
-from tcpipe.power.sampling import find_smoothing
+from tcpipe.power.sampling import (
+    DELAY_MARGIN_S,
+    SMOOTHING_MARGIN_S,
+    PowerFit,
+    find_delay,
+    find_smoothing,
+    make_power_fit,
+)
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
 from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, Smoothing, StageFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, StageFacts
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
 
 Floats = NDArray[np.float64]
@@ -52,11 +59,14 @@ def audit_power_sensor(
     ``rows`` are those of the masked track.
     """
     power = info.report.facts.power
-    clocks = info.report.facts.clock_offsets
-    late = clocks is not None and "power" in clocks.offsets and clocks.offsets["power"].noted  # flags every label
     corrected_s = info.report.facts.time_offset_s.get("power", 0.0)
-    smoothing = None if late else _find_longest_smoothing(rows, rails_by_epoch, corrected_s)
-    facts = PowerSensorFacts(*_find_prior(power), smoothing=smoothing)
+    found = [
+        find_smoothing(fit, corrected_s=corrected_s) for fit in _fit_power(rows, rails_by_epoch, SMOOTHING_MARGIN_S)
+    ]
+    smoothing = max(filter(None, found), key=lambda of_epoch: of_epoch.width_s, default=None)
+    delays = [] if smoothing else [find_delay(fit) for fit in _fit_power(rows, rails_by_epoch, DELAY_MARGIN_S)]
+    delay_s = min(filter(None, delays), key=lambda delay_and_std: delay_and_std[1], default=None)
+    facts = PowerSensorFacts(*_find_prior(power), smoothing=smoothing, delay_s=delay_s)
     if config.power_gain_std_fraction is not None:
         facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
     else:
@@ -66,10 +76,10 @@ def audit_power_sensor(
     if power is None or power.rest_current_amp is None:
         return facts
     rest_amp: dict[str, list[Floats]] = {}
-    settling_s = np.array((smoothing.settles_s, -smoothing.after_s) if smoothing else (0.0, 0.0))
+    unsettled_s = np.array(facts.unsettled_s) * (1.0, -1.0)
     for epoch, rails in rails_by_epoch.items():
         still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz, but=DropReason.STUCK)
-        still_ns = still_ns + np.rint(1e9 * settling_s).astype(np.int64)
+        still_ns = still_ns + np.rint(1e9 * unsettled_s).astype(np.int64)
         for rail in rails:
             rest_amp.setdefault(rail.name, []).append(measure_rest_currents(rail, still_ns))
     joined = [current_amp for parts in rest_amp.values() if (current_amp := np.concatenate(parts)).size]
@@ -98,11 +108,9 @@ def _add_gain_change(facts: PowerSensorFacts, rails_by_epoch: Mapping[int, list[
     return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
 
 
-def _find_longest_smoothing(
-    rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], corrected_s: float
-) -> Smoothing | None:
-    """Return how power is smoothed in the clock epoch in which it is most; None where none shows it."""
-    found = []
+def _fit_power(rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], margin_s: float) -> list[PowerFit]:
+    """Return the power of each clock epoch beside the motion of the track, where both are known for long enough."""
+    fits = []
     for epoch, rails in rails_by_epoch.items():
         mine = select_rows(rows, "clock_epoch", epoch)
         motion = np.column_stack(
@@ -112,8 +120,8 @@ def _find_longest_smoothing(
         known = np.isfinite(motion).all(axis=1)
         if (power := sum_power(rails)) is not None:
             stamp_ns, averaged = to_integers(mine, "stamp_ns")[known], any(rail.averaged for rail in rails)
-            found.append(find_smoothing(power, stamp_ns, motion[known], averaged=averaged, corrected_s=corrected_s))
-    return max(filter(None, found), key=lambda smoothing: smoothing.width_s, default=None)
+            fits.append(make_power_fit(power, stamp_ns, motion[known], averaged=averaged, margin_s=margin_s))
+    return [fit for fit in fits if fit is not None]
 
 
 _POWER = Subject("role", "power")
@@ -153,6 +161,17 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
             remedies=suggest("correct", {"read.time_offset_s": {"power": given_s - smoothing.late_s}}) if smoothing.late_s else (),
             width_s=smoothing.width_s, late_s=smoothing.late_s,
         )  # fmt: skip
+    delay_s, delay_std_s = facts.delay_s or (0.0, 0.0)
+    error_fraction = (label.energy_budget and label.energy_budget.delay) or 0.0
+    least_ratio, least_error = (
+        read_threshold("power-delayed", f"min_{name}") for name in ("std_ratio", "error_fraction")
+    )
+    if error_fraction > least_error and abs(delay_s) > least_ratio * delay_std_s:
+        yield make_finding(
+            "power-delayed", _POWER,
+            remedies=suggest("correct", {"read.time_offset_s": {"power": round(given_s - delay_s, 2)}}),
+            delay_s=delay_s, delay_2std_s=2.0 * delay_std_s, error_fraction=error_fraction,
+        )  # fmt: skip
     if facts.lost_signs:
         yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
 
@@ -172,14 +191,14 @@ def find_unpowered_motion(
     The power [W] that speed and slope of these segments need, of ``needed_watt``, shape (M,), exceeds the idle power clearly.
     """
     watt = to_floats(table, "power_watt")
-    idle_watt, residual_watt = physics.idle_watt, physics.residual_watt
-    if idle_watt is None or residual_watt is None or not table.num_rows:
+    idle_watt, fit = physics.idle_watt, physics.fit
+    if idle_watt is None or fit is None:
         return
     is_idle = np.abs(watt - idle_watt) < _IDLE_FRACTION * (np.nanmedian(watt) - idle_watt)
     is_idle &= np.isfinite(needed_watt)
     for first, last in find_runs(is_idle, to_integers(table, "clock_epoch")).tolist():
         missing_watt = float(np.mean((needed_watt - watt)[first : last + 1]))
-        if last + 1 - first < _FEWEST_UNPOWERED or missing_watt < _MISSING_RESIDUALS * residual_watt:
+        if last + 1 - first < _FEWEST_UNPOWERED or missing_watt < _MISSING_RESIDUALS * fit.residual_watt:
             continue
         begin_s, end_s = (
             (table[name][row].as_py() - start_ns) * 1e-9 for name, row in (("start_ns", first), ("end_ns", last))
