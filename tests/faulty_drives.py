@@ -57,7 +57,8 @@ def scale(drive: Drive, sensor: str, factor: float, *names: str) -> Drive:
 
 
 CODES = {
-    **{f"{sensor}_late": "time-offset" for sensor in ("gnss", "wheel", "imu", "visual", "power")},
+    **{f"{sensor}_late": "time-offset" for sensor in ("gnss", "wheel", "imu", "visual")},
+    "power_late": "power-delayed",
     "no_power": "no-power",
     "no_gnss": "no-gnss",
     "gyroscope_in_degrees": "imu-units",

@@ -167,7 +167,7 @@ def estimate_energy_budget(
 ) -> EnergyBudget | None:
     """Return the noise floor of E, shape (M,) [J], NaN without a label; None without energies.
 
-    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, of ``at_20_hz``, ``common`` and ``delay``.
+    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, and of other keys of the budget.
     """
     known = np.isfinite(energy_joule)
     mean_joule = float(np.abs(energy_joule[known]).mean()) if known.any() else 0.0

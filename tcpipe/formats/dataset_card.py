@@ -308,7 +308,7 @@ class DatasetCard:
     verdict: Verdict
     """By all findings of the dataset, its maps and the runs that have samples."""
     physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
-    """By robot, the physics model fitted on train: idle, drivetrain, rolling, grade and turning on each class; robots without a fit are omitted."""
+    """By robot, the physics fitted on train: idle, drivetrain, rolling, grade and turning by class; robots without a fit are omitted."""
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""

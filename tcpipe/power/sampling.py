@@ -188,6 +188,8 @@ _INSTANT_S = 0.1
 """Motion is averaged over so much about a sample."""
 _WIDTHS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 _DELAYS_S = np.linspace(-2.0, 2.0, 81)
+SMOOTHING_MARGIN_S, DELAY_MARGIN_S = _WIDTHS_S[-1], 2.0 + _INSTANT_S
+"""Motion that must be known before and after a power sample [s]."""
 _DELAY_GROUPS = 8
 """Parts of the run, each of which is left out once."""
 _MAX_ROWS = 20_000
@@ -221,7 +223,7 @@ class PowerFit:
 
 
 def make_power_fit(
-    power: Samples, motion_ns: Stamps, motion: Floats, *, averaged: bool, margin_s: float = _WIDTHS_S[-1]
+    power: Samples, motion_ns: Stamps, motion: Floats, *, averaged: bool, margin_s: float
 ) -> PowerFit | None:
     """Return the power samples that have known motion around them; None for fewer than 60.
 
@@ -245,7 +247,7 @@ def make_power_fit(
 
 
 def find_delay(fit: PowerFit) -> tuple[float, float] | None:
-    """Return the delay of power behind motion [s] and its standard deviation; None where motion explains too little of the power.
+    """Return the delay of power behind motion [s] and its standard deviation; None where motion does not determine it.
 
     The standard deviation is that of the delete-a-group jackknife over parts of the run.
     """
@@ -253,11 +255,11 @@ def find_delay(fit: PowerFit) -> tuple[float, float] | None:
     squares = np.array([np.bincount(part, fit.compute_squared_residuals(Smoothing(d, -d))) for d in _DELAYS_S])
     whole = squares.sum(axis=1)
     total = fit.power_watt.size * float(np.var(fit.power_watt))
-    found = np.array([_find_minimum(whole - left_out) for left_out in (0.0, *squares.T)])
-    if whole.min() > (1.0 - read_threshold("power-delayed", "min_explained_fraction")) * total or np.isnan(found).any():
-        return None
-    std_s = np.sqrt((_DELAY_GROUPS - 1) / _DELAY_GROUPS * np.square(found[1:] - found[1:].mean()).sum())
-    return float(found[0]), float(std_s)
+    explained = (total - whole.min()) / max(total, 1.0)  # 0 for constant power
+    delay_s, *others_s = (_find_minimum(whole - left_out) for left_out in (0.0, *squares.T))
+    std_s = float(np.sqrt((_DELAY_GROUPS - 1) * np.var(others_s)))
+    least, most_s = (read_threshold("power-delayed", name) for name in ("min_explained_fraction", "max_std_s"))
+    return (delay_s, std_s) if explained >= least and std_s <= most_s and np.isfinite(delay_s) else None
 
 
 def _find_minimum(squares: Floats) -> float:
@@ -274,7 +276,7 @@ def _find_minimum(squares: Floats) -> float:
 def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | None:
     """Return over how long power [W] is smoothed, by the motion that it follows; None where that is not sure.
 
-    A mean must explain clearly more than a delay alone, and than means about the stamp, which fit better where the motion is noisy.
+    A mean must explain more than a delay alone, and clearly more than means about the stamp, which fit better where the motion is noisy.
     ``corrected_s`` is what the recipe adds to the stamps [s]: a mean ends at the stamp before that.
     """
     after_s = max(-corrected_s, 0.0)
@@ -282,14 +284,14 @@ def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | No
     tried = [Smoothing(width_s - after_s, after_s) for width_s in _WIDTHS_S if after_s < width_s <= longest_s]
     if not tried:
         return None
-    rivals = [Smoothing(width_s / 2.0 - after_s, width_s / 2.0 + after_s) for width_s in _WIDTHS_S]
-    rivals += [Smoothing(delay_s, -delay_s) for delay_s in _DELAYS_S[::2]]
-    unexplained, least = (
-        [fit.compute_squared_residuals(smoothing).sum() for smoothing in each] for each in (tried, rivals)
+    about = [Smoothing(width_s / 2.0 - after_s, width_s / 2.0 + after_s) for width_s in _WIDTHS_S]
+    delayed = [Smoothing(delay_s, -delay_s) for delay_s in _DELAYS_S[::2]]
+    unexplained, least, by_delay = (
+        [fit.compute_squared_residuals(smoothing).sum() for smoothing in each]
+        for each in (tried, [Smoothing(0.0, 0.0), *about], delayed)
     )
-    if min(unexplained) > read_threshold("power-smoothed", "max_unexplained_fraction") * min(least):
-        return None
-    return tried[int(np.argmin(unexplained))]
+    limit = min(read_threshold("power-smoothed", "max_unexplained_fraction") * min(least), *by_delay)
+    return tried[int(np.argmin(unexplained))] if min(unexplained) <= limit else None
 
 
 def estimate_smoothing_variance(power: Samples, steady: NDArray[np.bool_], smoothing: Smoothing) -> float:

@@ -13,11 +13,10 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
-from tcpipe.fusion.checks.clock_offsets import POWER, PowerSignal, find_clock_offsets, find_middle_ns, shift_stamps
+from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, shift_stamps
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU
 from tcpipe.logs.clocks import LOG_CLOCK
-from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_findings import (
@@ -36,9 +35,8 @@ from tcpipe.stages.fuse_inputs import (
     prepare_pose,
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
-from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks
-from tcpipe.tables.findings import Action, Finding, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
@@ -154,7 +152,6 @@ def _exclude_misleading(role: str, inputs: FusionInputs, streams: Streams) -> Fu
     return exclude_sensors(inputs, [exclusion], streams)
 
 
-_MAX_GAP_NS = 300_000_000
 _FINE_S = 0.004
 _JUMP_NS = 500_000_000
 _DRIVES_MPS = 0.3
@@ -170,15 +167,11 @@ def correct_clocks(
     if not inputs.measurements:
         return inputs, StageReport((), None)
     epoch = find_longest_epoch(inputs)
-    found = find_clock_offsets(inputs.measurements[epoch], _make_power_signal(streams, epoch), clock_epoch=epoch)
+    found = find_clock_offsets(inputs.measurements[epoch], clock_epoch=epoch)
     found = replace(found, offsets={role: offset for role, offset in found.offsets.items() if role not in unsteady})
     middle_ns, span_s = find_middle_ns(inputs.measurements[epoch])
     off = {role: offset for role, offset in found.offsets.items() if offset.noted}
-    findings = [
-        _find_offset(found, role, offset, streams, span_s)
-        for role, offset in off.items()
-        if role != POWER or offset.drift_ppm  # labels include its delay, measured against the track
-    ]
+    findings = [_find_offset(found, role, offset, streams, span_s) for role, offset in off.items()]
     aligned = {
         number: m.replace_sensors(
             {
@@ -203,18 +196,17 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
         return make_finding(
             "clocks-differ", subject, names=names, offset_s=offset_s, offset_2std_s=offset_2std_s, drift_s=drift_s
         )
-    action: Action = "kept" if role == POWER else "corrected"
     if offset.drift_ppm:
         by_log = streams.sensors[role].time_source == "log"
         remedies = () if by_log else suggest("use_log_time", {"read.time_source": {role: "log"}})
-        return make_finding("clock-drift", subject, action=action, names=names, remedies=remedies, drift_s=drift_s)
+        return make_finding("clock-drift", subject, action="corrected", names=names, remedies=remedies, drift_s=drift_s)
     given_s = streams.report.facts.time_offset_s.get(name_pose(role, streams), 0.0)
     correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)
     return make_finding(
         "time-offset",
         subject,
         severity="note" if role == DOPPLER else None,
-        action=action,
+        action="corrected",
         names=names,
         remedies=suggest("correct", {"read.time_offset_s": {role: correction_s}}),
         offset_s=offset_s,
@@ -243,13 +235,3 @@ def find_clock_jumps(inputs: FusionInputs) -> Iterator[tuple[int, Finding]]:
                 span_s, names = (at_s, at_s), {"topics": "all topics"}
                 finding = make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)
                 yield int(ends_ns[1]), finding
-
-
-def _make_power_signal(streams: Streams, epoch: int) -> PowerSignal | None:
-    rails = make_rails(streams, epoch)
-    if not rails or any(rail.current.stamp_ns.size < 2 for rail in rails):
-        return None
-    stamp_ns = np.unique(np.concatenate([rail.current.stamp_ns for rail in rails]))
-    _, _, watt = compute_power_at(rails, stamp_ns, max_gap_ns=_MAX_GAP_NS)
-    known = np.isfinite(watt)
-    return PowerSignal(stamp_ns[known], watt[known], streams.power_averaged) if known.sum() > 1 else None

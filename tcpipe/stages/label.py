@@ -58,7 +58,7 @@ from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
-from tcpipe.tables.facts import PhysicsFacts, PowerSensorFacts, Smoothing
+from tcpipe.tables.facts import PhysicsFacts, PowerSensorFacts
 from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,
     MASKED_TRACK,
@@ -90,9 +90,7 @@ def label_segments(
     epochs: list[int] = np.unique(to_integers(masked.table, "clock_epoch")).tolist()
     rails_by_epoch = {epoch: make_rails(streams, epoch) for epoch in epochs}
     power = audit_power_sensor(masked.table, rails_by_epoch, masked.info, config)
-    standing = find_idle_power(
-        masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz, smoothing=power.smoothing or Smoothing(0.0, 0.0)
-    )
+    standing = find_idle_power(masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz, unsettled_s=power.unsettled_s)
     for epoch, rails in rails_by_epoch.items():
         rows, cut = (select_rows(table, "clock_epoch", epoch) for table in (masked.table, segments.table))
         joules.update(sum_energy_entries(rows, rails, rate_hz=masked.info.rate_hz, rule=rule))
@@ -134,10 +132,10 @@ def label_segments(
     table = pa.concat_tables(parts).combine_chunks()
     needed_watt, physics = fit_run_physics(table, standing.watt)
     start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
-    unpowered = list(find_unpowered_motion(table, needed_watt, physics, masked.info, start_ns))
-    quality = to_numbers(table["quality"]).copy()
-    for rows, _ in unpowered:
-        quality[rows] |= np.uint32(Quality.UNPOWERED)
+    quality, unpowered = to_numbers(table["quality"]).copy(), []
+    for segment_rows, finding in find_unpowered_motion(table, needed_watt, physics, masked.info, start_ns):
+        quality[segment_rows] |= np.uint32(Quality.UNPOWERED)
+        unpowered.append(finding)
     column = table.schema.get_field_index("quality")
     table = table.set_column(column, table.schema.field(column), pa.array(quality))
     distance_by_reason_m, velocity = segments.distance_by_reason_m, config.velocity
@@ -145,8 +143,7 @@ def label_segments(
         table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
     facts = replace(facts, power_sensor=None if facts.energy_joule is None else power)
-    findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns)]
-    findings += [finding for _, finding in unpowered]
+    findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns), *unpowered]
     findings += find_witnesses(table, replace(masked.info.report.facts, label=facts), robot)
     kind, rails = masked.info.report.facts.power, next(iter(rails_by_epoch.values()), [])
     findings += find_negative_idle(standing, facts.median_power_watt, kind, rails)
@@ -167,7 +164,7 @@ def compute_segment_costs(
     rule: Rule,
     standing: IdlePower,
     sensor: SensorError,
-    power: PowerSensorFacts | None = None,
+    power: PowerSensorFacts,
 ) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
     """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
@@ -175,13 +172,12 @@ def compute_segment_costs(
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, find_stationary_ns(rows, info.rate_hz)
-    smoothing = None if power is None else power.smoothing
-    noise = estimate_energy_noise(rails, *spans, smoothing=smoothing)
-    better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ, smoothing=smoothing)
+    noise = estimate_energy_noise(rails, *spans, smoothing=power.smoothing)
+    better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ, smoothing=power.smoothing)
     ground_mps = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
     end_watt, delay_j2 = compute_power_watt(rails, end_ns), np.zeros(cut.num_rows)
-    if power is not None and power.delay_s is not None and power.delay_std_s is not None:
-        delay_j2 = estimate_delay_variance(rails, start_ns, end_ns, power.delay_s, power.delay_std_s, rule=rule)
+    if power.delay_s is not None:
+        delay_j2 = estimate_delay_variance(rails, start_ns, end_ns, *power.delay_s, rule=rule)
     noise_joule = np.sqrt(noise.std_joule() ** 2 + delay_j2)
     scale_std = find_common_scale_std(info.report.facts.fuse, start_ns, to_integers(cut, "clock_epoch"))
     cost = compute_labels(
@@ -238,13 +234,13 @@ _EDGE_S = 0.3
 
 
 def find_idle_power(
-    rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float, smoothing: Smoothing
+    rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float, unsettled_s: tuple[float, float]
 ) -> IdlePower:
     """Return the idle power of all rows of a masked track, and its standard deviation; ``rails`` (by clock epoch) show the resolution."""
     piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
     halt = np.full(rows.num_rows, -1)
-    begin, end = (round((_EDGE_S + more_s) * rate_hz) for more_s in (smoothing.settles_s, smoothing.after_s))
+    begin, end = (round((_EDGE_S + more_s) * rate_hz) for more_s in unsettled_s)
     for number, (first, last) in enumerate(find_runs(standing, piece).tolist()):
         halt[first + begin : max(last + 1 - end, first + begin)] = number
     power_watt = to_floats(rows, "power_watt")
@@ -285,17 +281,5 @@ def fit_run_physics(table: pa.Table, idle_watt: float) -> tuple[NDArray[np.float
     metres = make_fit_samples(table)
     watt = idle_watt if np.isfinite(idle_watt) else None
     found = fit_physics(metres, idle_watt=watt)
-    if found is None or not found.is_plausible():
-        return np.full(table.num_rows, np.nan), PhysicsFacts(fitted=False, idle_watt=watt)
-    resistance, rolling, drive = found.rolling_resistance(), found.of("rolling"), found.of("grade")
-    return found.power_watt(metres), PhysicsFacts(
-        fitted=True,
-        idle_watt=watt,
-        weight_over_efficiency_newton=None if drive is None else drive[0],
-        rolling_newton=None if rolling is None else rolling[0],
-        rolling_resistance=None if resistance is None else resistance[0],
-        recovered_downhill=found.recovered,
-        residual_watt=found.residual_watt,
-        segments=found.segments,
-        fit=fit_and_validate_physics(metres, idle_watt=watt),
-    )
+    needed_watt = np.full(table.num_rows, np.nan) if found is None else found.power_watt(metres)
+    return needed_watt, PhysicsFacts(watt, fit_and_validate_physics(metres, idle_watt=watt))

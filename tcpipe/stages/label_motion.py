@@ -189,15 +189,12 @@ def _find_gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
 def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """Return whether a clock of the run stepped or has an offset, or motion or power has the recorder's time.
 
-    Commands mostly have no stamp of their own, and labels do not depend on it. An offset that is known is taken out; that of power is in σ
-    of w and E, but for its drift.
+    Commands mostly have no stamp of their own, and labels do not depend on it. An offset that is known is taken out; σ of w and E
+    contains the delay of power.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     clocks = info.report.facts.clock_offsets
-    off = clocks is not None and any(
-        offset.noted and (bool(offset.drift_ppm) if role == "power" else not offset.blamed)
-        for role, offset in clocks.offsets.items()
-    )
+    off = clocks is not None and any(offset.noted and not offset.blamed for offset in clocks.offsets.values())
     # A step of all clocks leaves them together.
     return recorder or off or any(step.topics for step in streams.report.facts.clock_steps)
 

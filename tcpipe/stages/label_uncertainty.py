@@ -23,7 +23,14 @@ from tcpipe.power.audit import (
     summarize_rest,
 )
 from tcpipe.power.rails import IdlePower, Rail, Rule, integrate_energy, sum_power
-from tcpipe.power.sampling import PowerFit, find_delay, find_smoothing, make_power_fit
+from tcpipe.power.sampling import (
+    DELAY_MARGIN_S,
+    SMOOTHING_MARGIN_S,
+    PowerFit,
+    find_delay,
+    find_smoothing,
+    make_power_fit,
+)
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
@@ -54,18 +61,17 @@ def audit_power_sensor(
     ``rows`` are those of the masked track.
     """
     power = info.report.facts.power
-    fits = _fit_power(rows, rails_by_epoch)
-    corrected_s = info.report.facts.time_offset_s.get("power", 0.0)
     sags = [measure_sag(rails) for rails in rails_by_epoch.values()]
     resistances_ohm = [ohm for sag in sags if (ohm := estimate_resistance_ohm(sag)) is not None]
     battery_ohm = float(np.median(resistances_ohm)) if resistances_ohm else None
-    found = [smoothing for fit in fits if (smoothing := find_smoothing(fit, corrected_s=corrected_s))]
-    smoothing = max(found, key=lambda of_epoch: of_epoch.width_s, default=None)
-    delays = [] if smoothing else [delay for fit in fits if (delay := find_delay(fit))]
-    delay_s, delay_std_s = min(delays, key=lambda delay: delay[1], default=(None, None))
-    facts = PowerSensorFacts(
-        *_find_prior(power), battery_ohm=battery_ohm, smoothing=smoothing, delay_s=delay_s, delay_std_s=delay_std_s
-    )
+    corrected_s = info.report.facts.time_offset_s.get("power", 0.0)
+    found = [
+        find_smoothing(fit, corrected_s=corrected_s) for fit in _fit_power(rows, rails_by_epoch, SMOOTHING_MARGIN_S)
+    ]
+    smoothing = max(filter(None, found), key=lambda of_epoch: of_epoch.width_s, default=None)
+    delays = [] if smoothing else [find_delay(fit) for fit in _fit_power(rows, rails_by_epoch, DELAY_MARGIN_S)]
+    delay_s = min(filter(None, delays), key=lambda delay_and_std: delay_and_std[1], default=None)
+    facts = PowerSensorFacts(*_find_prior(power), battery_ohm=battery_ohm, smoothing=smoothing, delay_s=delay_s)
     if config.power_gain_std_fraction is not None:
         facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
     else:
@@ -75,10 +81,10 @@ def audit_power_sensor(
     if power is None or power.rest_current_amp is None:
         return facts
     rest_amp: dict[str, list[Floats]] = {}
-    settling_s = np.array((smoothing.settles_s, -smoothing.after_s) if smoothing else (0.0, 0.0))
+    unsettled_s = np.array(facts.unsettled_s) * (1.0, -1.0)
     for epoch, rails in rails_by_epoch.items():
         still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz, but=DropReason.STUCK)
-        still_ns = still_ns + np.rint(1e9 * settling_s).astype(np.int64)
+        still_ns = still_ns + np.rint(1e9 * unsettled_s).astype(np.int64)
         for rail in rails:
             rest_amp.setdefault(rail.name, []).append(measure_rest_currents(rail, still_ns))
     joined = [current_amp for parts in rest_amp.values() if (current_amp := np.concatenate(parts)).size]
@@ -107,7 +113,7 @@ def _add_gain_change(facts: PowerSensorFacts, sags: Sequence[Sag | None]) -> Pow
     return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
 
 
-def _fit_power(rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]]) -> list[PowerFit]:
+def _fit_power(rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], margin_s: float) -> list[PowerFit]:
     """Return the power of each clock epoch beside the motion of the track, where both are known for long enough."""
     fits = []
     for epoch, rails in rails_by_epoch.items():
@@ -119,7 +125,7 @@ def _fit_power(rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]]) -> list
         known = np.isfinite(motion).all(axis=1)
         if (power := sum_power(rails)) is not None:
             stamp_ns, averaged = to_integers(mine, "stamp_ns")[known], any(rail.averaged for rail in rails)
-            fits.append(make_power_fit(power, stamp_ns, motion[known], averaged=averaged))
+            fits.append(make_power_fit(power, stamp_ns, motion[known], averaged=averaged, margin_s=margin_s))
     return [fit for fit in fits if fit is not None]
 
 
@@ -158,22 +164,17 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
             remedies=suggest("correct", {"read.time_offset_s": {"power": given_s - smoothing.late_s}}) if smoothing.late_s else (),
             width_s=smoothing.width_s, late_s=smoothing.late_s,
         )  # fmt: skip
-    error_fraction = label.energy_budget.delay if label.energy_budget else None
-    if (
-        facts.delay_s is not None
-        and facts.delay_std_s is not None
-        and error_fraction is not None
-        and abs(facts.delay_s) > read_threshold("power-delayed", "min_std_ratio") * facts.delay_std_s
-        and error_fraction > read_threshold("power-delayed", "min_error_fraction")
-    ):
+    delay_s, delay_std_s = facts.delay_s or (0.0, 0.0)
+    error_fraction = (label.energy_budget and label.energy_budget.delay) or 0.0
+    least_ratio, least_error = (
+        read_threshold("power-delayed", f"min_{name}") for name in ("std_ratio", "error_fraction")
+    )
+    if error_fraction > least_error and abs(delay_s) > least_ratio * delay_std_s:
         yield make_finding(
-            "power-delayed",
-            _POWER,
-            remedies=suggest("correct", {"read.time_offset_s": {"power": round(given_s - facts.delay_s, 2)}}),
-            delay_s=facts.delay_s,
-            delay_2std_s=2.0 * facts.delay_std_s,
-            error_fraction=error_fraction,
-        )
+            "power-delayed", _POWER,
+            remedies=suggest("correct", {"read.time_offset_s": {"power": round(given_s - delay_s, 2)}}),
+            delay_s=delay_s, delay_2std_s=2.0 * delay_std_s, error_fraction=error_fraction,
+        )  # fmt: skip
     if facts.lost_signs:
         yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
 
@@ -217,14 +218,14 @@ def find_unpowered_motion(
     The power [W] that speed and slope of these segments need, of ``needed_watt``, shape (M,), exceeds the idle power clearly.
     """
     watt = to_floats(table, "power_watt")
-    idle_watt, residual_watt = physics.idle_watt, physics.residual_watt
-    if idle_watt is None or residual_watt is None or not table.num_rows:
+    idle_watt, fit = physics.idle_watt, physics.fit
+    if idle_watt is None or fit is None:
         return
     is_idle = np.abs(watt - idle_watt) < _IDLE_FRACTION * (np.nanmedian(watt) - idle_watt)
     is_idle &= np.isfinite(needed_watt)
     for first, last in find_runs(is_idle, to_integers(table, "clock_epoch")).tolist():
         missing_watt = float(np.mean((needed_watt - watt)[first : last + 1]))
-        if last + 1 - first < _FEWEST_UNPOWERED or missing_watt < _MISSING_RESIDUALS * residual_watt:
+        if last + 1 - first < _FEWEST_UNPOWERED or missing_watt < _MISSING_RESIDUALS * fit.residual_watt:
             continue
         begin_s, end_s = (
             (table[name][row].as_py() - start_ns) * 1e-9 for name, row in (("start_ns", first), ("end_ns", last))

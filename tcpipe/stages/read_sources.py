@@ -133,8 +133,15 @@ def _join_topics(sources: Sequence[TopicReadings], config: ReadConfig, findings:
             if count := int(overlaps.sum()):
                 names = {"role": role, "used": before[0].topic}
                 remedies = suggest("use", {"read.topics": {role: [source.topic]}})
-                numbers = {"overlapping_count": count, "messages_count": source.messages}
-                findings.append(make_finding("topic-overlaps", subject, names=names, remedies=remedies, **numbers))
+                found = make_finding(
+                    "topic-overlaps",
+                    subject,
+                    names=names,
+                    remedies=remedies,
+                    overlapping_count=count,
+                    messages_count=source.messages,
+                )
+                findings.append(found)
             before.append(replace(source, readings=source.readings.select(~overlaps)))
     return [source for topics in joined.values() for source in topics]
 

@@ -364,16 +364,9 @@ class PhysicsFit:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsFacts:
-    """Physics model of a run (`tcpipe.cost.physics`); without a fit, the idle power."""
+    """Idle power and physics model of a run (`tcpipe.cost.physics`); None where they cannot be determined."""
 
-    fitted: bool
     idle_watt: float | None
-    weight_over_efficiency_newton: float | None = None
-    rolling_resistance: float | None = None
-    rolling_newton: float | None = field(default=None, metadata=LEFT_OUT)
-    recovered_downhill: float | None = field(default=None, metadata=LEFT_OUT)
-    residual_watt: float | None = field(default=None, metadata=LEFT_OUT)
-    segments: int | None = field(default=None, metadata=LEFT_OUT)
     fit: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
 
 
@@ -406,7 +399,7 @@ class PowerSensorFacts:
 
     ``rest_amp``: lowest and highest current of a rail in halts; ``battery_ohm``: resistance of the battery by its sag [ohm]; the gain
     changed by ``gain_ratio`` at ``gain_changed_ns``; ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None
-    if power is not smoothed; ``delay_s``: of power behind the motion, with its σ; None if motion explains too little of power.
+    if power is not smoothed; ``delay_s``: of power behind the motion, with its σ; None if motion does not determine it.
     """
 
     gain_std_fraction: float
@@ -417,8 +410,15 @@ class PowerSensorFacts:
     gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
     lost_signs: int = 0
     smoothing: Smoothing | None = field(default=None, metadata=LEFT_OUT)
-    delay_s: float | None = field(default=None, metadata=LEFT_OUT)
-    delay_std_s: float | None = field(default=None, metadata=LEFT_OUT)
+    delay_s: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+
+    @property
+    def unsettled_s(self) -> tuple[float, float]:
+        """How long after a stop, and before a start, values still contain the power of driving [s]."""
+        if self.smoothing is not None:
+            return self.smoothing.settles_s, self.smoothing.after_s
+        delay_s = self.delay_s[0] if self.delay_s else 0.0
+        return max(delay_s, 0.0), max(-delay_s, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,8 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import MASKED_TRACK, STREAMS
 
 NOISY = Faults.only("gnss_noise", "imu_noise", "wheel_noise", "visual_noise", "power_noise")
-CODES = {"current-offset", "current-gain-changes", "current-sign-lost", "power-smoothed", "motion-without-power"}
+CODES = {"current-offset", "current-gain-changes", "current-sign-lost", "power-smoothed", "power-delayed"}
+CODES |= {"motion-without-power"}
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +86,7 @@ FAULTS = {
     "gain - 10 %": (lambda amp, share: amp * np.where(share > 0.4, 0.9, 1.0), "current-gain-changes"),
     "mean of 2 s": (lambda amp, _: average(amp, 2), "power-smoothed"),
     "mean of 6 s": (lambda amp, _: average(amp, 6), "power-smoothed"),
-    "two means of 1 s": (lambda amp, _: average(average(amp, 1), 1), "power-smoothed"),
+    "two means of 1 s": (lambda amp, _: average(average(amp, 1), 1), "power-delayed"),
 }
 
 
@@ -96,6 +97,26 @@ def test_a_fault_is_named_and_labels_are_no_more_wrong_than_they_say(drive, faul
     assert set(find_codes(labelled)) == {code}
     for name in ("power_watt", "energy_joule"):
         assert np.mean(np.abs(normalized(drive, labelled, name)) < 2.0) >= 0.92, name
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.2, 0.36, 0.6])
+def test_the_delay_of_power_is_in_the_uncertainty(drive, delay_s):
+    stamp_ns = to_integers(drive[0].tables["power"], "stamp_ns")
+    share = delay_s / ((stamp_ns[-1] - stamp_ns[0]) * 1e-9)
+    labelled = label(drive, lambda amp, at: np.interp(at - share, at, amp))
+    found_s, std_s = labelled.info.report.facts.label.power_sensor.delay_s
+    assert abs(found_s - delay_s) < 3.0 * std_s < 0.15
+    for name in ("power_watt", "energy_joule"):
+        assert np.mean(np.abs(normalized(drive, labelled, name)) < 2.0) >= 0.92
+    error = labelled.info.report.facts.label.energy_budget.delay
+    assert error < 0.005 if delay_s == 0.0 else error == pytest.approx(0.14 * delay_s, rel=0.3)
+    assert not (to_integers(labelled.table, "quality") & int(Quality.CLOCK_DOUBTFUL)).any()
+    found = find_codes(labelled)
+    assert set(found) <= {"power-delayed"}
+    assert len(found) == 1 if delay_s > 0.3 else not found or delay_s > 0.1
+    for finding in found.values():
+        (remedy,) = finding.remedies
+        assert remedy.recipe["read.time_offset_s"]["power"] == pytest.approx(-delay_s, abs=0.06)
 
 
 def test_the_line_that_a_finding_suggests_removes_it_and_keeps_the_uncertainty(drive):

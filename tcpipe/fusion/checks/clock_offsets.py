@@ -1,11 +1,10 @@
 """Time offsets between the stamps of a run's sensors, by what they measure of the same motion.
 
-Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Before fusion, larger offsets are found, and that of
-power, which is not fused. Two signals of one motion are shifted against each other until one explains most of the other (`lags`): the yaw
-rate of an odometry and the gyroscope, speeds, changes of speed and the accelerometer, power and what speed and acceleration cost. They are
-compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller corrects, and
-that leads the body. The course of the fixes is not held against the gyroscope: an antenna that sits ahead of the turning point by l leads
-the body's course by l / v, 0.1 s for 10 cm.
+Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before fusion. Two signals of
+one motion are shifted against each other until one explains most of the other (`lags`): the yaw rate of an odometry and the gyroscope,
+speeds, changes of speed and the accelerometer. They are compared only where the robot turns or changes its speed: on a straight there is
+nothing to compare but what the controller corrects, and that leads the body. The course of the fixes is not held against the gyroscope: an
+antenna that sits ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
 
 The pairs together, in windows of ten minutes, give each sensor's offset and drift from the clock that most of them share. A sensor is
 blamed only where two others agree against it and no pair contradicts; else two differ, and nobody knows which is off.
@@ -14,7 +13,7 @@ blamed only where two others agree against it and no pair contradicts; else two 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +42,15 @@ from tcpipe.fusion.measurements import (
     Measurements,
     select_measurements,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds
+from tcpipe.fusion.signals import compute_seconds
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
 
-POWER = "power"
-ROLES = (IMU, WHEELS, VISUAL, GNSS, POWER)
+ROLES = (IMU, WHEELS, VISUAL, GNSS)
 """In the order in which a clock is taken for the right one where as many agree with either: a gyroscope has the least to compute."""
 
-_NOTED_S, _NOTED_POWER_S = 0.05, 0.08
+_NOTED_S = 0.05
 _SURE = 4.0  # standard deviations
-_MAX_STD_S, _MAX_POWER_STD_S = 0.02, 0.04
+_MAX_STD_S = 0.02
 # Standard deviations of an offset that is not known well: the mean of a clock that steps scatters by more.
 _CLEARLY = 10.0
 _MIN_EXPLAINED = 0.25
@@ -64,27 +62,16 @@ _LEAST_BY_FORCE_S = 0.02  # slopes act as accelerations: the accelerometer check
 _TURNS_RADPS = 0.1
 _CHANGES_MPS = 0.1
 _LIVELY_S = 2.0  # rows this near to a turn or a change of speed are compared
-_ODOMETRY_S, _ACCELERATION_S, _POWER_S = 0.1, 0.3, 0.2  # both sides are averaged over so much
+_ODOMETRY_S, _ACCELERATION_S = 0.1, 0.3  # both sides are averaged over so much
 _SLOW_S = 4.0  # what changes more slowly is also slip and terrain
-_STOPPED_MPS = 0.1
-_NEAR_STOP_S = 3.0
 
 YAW_RATE, SPEED, ACCELERATION = "yaw rate", "speed", "acceleration"
 
 Signals = tuple[str, str, str, Floats, Floats]
 
 
-@dataclass(frozen=True, slots=True)
-class PowerSignal:
-    """The robot's power: stamps [ns] and values [W], shape (N,); ``averaged`` over the period that ends at each stamp."""
-
-    stamp_ns: NDArray[np.int64]
-    power_watt: Floats
-    averaged: bool
-
-
-def find_clock_offsets(m: Measurements, power: PowerSignal | None, *, clock_epoch: int = 0) -> ClockFacts:
-    """Return the offsets between the stamps of a clock epoch's sensors; ``power`` is the sum over the drive rails.
+def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
+    """Return the offsets between the stamps of a clock epoch's sensors.
 
     Extrinsics need not be right, since a yaw rate is compared with all three axes of a gyroscope.
     """
@@ -92,7 +79,7 @@ def find_clock_offsets(m: Measurements, power: PowerSignal | None, *, clock_epoc
     evidence: dict[tuple[str, str, str], list[tuple[float, Floats]]] = {}
     for at_ns in iterate_windows_ns(m, _WINDOW_NS):
         inside = select_measurements(m, int(at_ns[0]) - _MARGIN_NS, int(at_ns[-1]) + _MARGIN_NS)
-        for late, against, by, target, regressors in _iterate_signals(inside, power, at_ns):
+        for late, against, by, target, regressors in _iterate_signals(inside, at_ns):
             products = compute_lag_products(target, regressors)
             if products is not None:
                 at_s = (0.5 * float(at_ns[-1] - at_ns[0]) + float(at_ns[0] - middle_ns)) * 1e-9
@@ -128,8 +115,8 @@ def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float,
 
 def make_pair(late: str, against: str, by: str, lag: Lag, from_middle_s: float = 0.0) -> ClockPair:
     """Return two sensors compared; a lag is determined where its error is small or it is surely not zero."""
-    limit_s = _MAX_POWER_STD_S if late == POWER else _MAX_STD_S
-    known = lag.std_s <= limit_s or (lag.std_s <= 3 * limit_s and abs(lag.offset_s) > _CLEARLY * lag.std_s)
+    is_clear = lag.std_s <= 3 * _MAX_STD_S and abs(lag.offset_s) > _CLEARLY * lag.std_s
+    known = lag.std_s <= _MAX_STD_S or is_clear
     return ClockPair(
         late,
         against,
@@ -142,7 +129,7 @@ def make_pair(late: str, against: str, by: str, lag: Lag, from_middle_s: float =
     )
 
 
-def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterator[Signals]:
+def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[Signals]:
     """Yield what can be compared: whose stamps against whose, by what, target and regressors on the grid."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:
@@ -165,9 +152,6 @@ def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[
             own = compute_moving_mean(compute_moving_mean(of_receiver, FIXES_S), FIXES_S)
             yield DOPPLER, GNSS, "velocity east", own[:, 0], velocity.real[:, None]
             yield DOPPLER, GNSS, "velocity north", own[:, 1], velocity.imag[:, None]
-    if power is not None and twists:
-        role, twist = next(iter(twists.items()))
-        yield POWER, role, "power of speed, acceleration and turning", *_prepare_power(power, twist, at_ns)
 
 
 def _compare_with_imu(
@@ -195,9 +179,9 @@ def _find_speed_changes(speed: Floats) -> NDArray[np.bool_]:
     return _find_rows_near(np.abs(_remove_slow_parts(speed)[:, 0]) > _CHANGES_MPS)
 
 
-def _find_rows_near(lively: NDArray[np.bool_], width_s: float = 2 * _LIVELY_S) -> NDArray[np.bool_]:
+def _find_rows_near(lively: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return what lies near something lively, shape (M,)."""
-    beside: NDArray[np.bool_] = compute_moving_mean(lively.astype(np.float64)[:, None], width_s)[:, 0] > 0
+    beside: NDArray[np.bool_] = compute_moving_mean(lively.astype(np.float64)[:, None], 2 * _LIVELY_S)[:, 0] > 0
     return beside
 
 
@@ -211,20 +195,6 @@ def _compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float
     forward, yaw_rate = twist.T
     speed: Floats = np.hypot(forward - yaw_rate * lever_arm_m[1], yaw_rate * lever_arm_m[0])
     return speed[:, None]
-
-
-def _prepare_power(power: PowerSignal, twist: Floats, at_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Return power, and what it may depend on, without their slow parts."""
-    stamp_ns = power.stamp_ns
-    if power.averaged:
-        stamp_ns = stamp_ns - compute_median_period_ns(stamp_ns) // 2
-    drawn = resample_signal(stamp_ns, power.power_watt[:, None], at_ns)
-    speed, turning = np.abs(twist).T
-    causes = compute_moving_mean(np.column_stack((drawn, speed, turning, turning * speed, speed**2)), _POWER_S)
-    # Speed times acceleration, as half the slope of the squared speed: smoothed like the power itself.
-    causes[:, -1] = np.gradient(causes[:, -1], GRID_S) / 2
-    fast = _remove_slow_parts(causes)
-    return np.where(_find_rows_near(speed < _STOPPED_MPS, _NEAR_STOP_S), fast[:, 0], np.nan), fast[:, 1:]
 
 
 def solve_offsets(pairs: Sequence[ClockPair], clock_epoch: int = 0, span_s: float = 0.0) -> ClockFacts:
@@ -244,10 +214,6 @@ def solve_offsets(pairs: Sequence[ClockPair], clock_epoch: int = 0, span_s: floa
     blamed = {role: role == DOPPLER or _is_blamed(role, agreeing[reference], offsets, known) for role in offsets}
     decided = {role: replace(offset, blamed=blamed[role]) for role, offset in solved[reference].items()}
     return ClockFacts(clock_epoch, reference, tuple(pairs), decided)
-
-
-def _find_limit_s(role: str) -> float:
-    return _NOTED_POWER_S if role == POWER else _NOTED_S
 
 
 def _get_std_s(pair: ClockPair) -> float:
@@ -273,8 +239,8 @@ def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) ->
     for role, (offset_s, rate), (std_s, rate_std) in zip(
         free, found.reshape(2, -1).T.tolist(), stds.reshape(2, -1).T.tolist(), strict=True
     ):
-        drifts = abs(rate) > max(_SURE * np.sqrt(birge) * rate_std, _find_limit_s(role) / max(span_s, 1.0))
-        noted = bool(drifts or abs(offset_s) > max(_find_limit_s(role), _SURE * std_s))
+        drifts = abs(rate) > max(_SURE * np.sqrt(birge) * rate_std, _NOTED_S / max(span_s, 1.0))
+        noted = bool(drifts or abs(offset_s) > max(_NOTED_S, _SURE * std_s))
         offsets[role] = ClockOffset(offset_s, std_s, noted, drift_ppm=1e6 * rate if drifts else 0.0)
     return offsets
 
@@ -289,9 +255,7 @@ def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
 
 def _find_agreeing(offsets: Mapping[str, ClockOffset]) -> set[str]:
     """Return the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
-    near = {
-        role for role, offset in offsets.items() if abs(offset.offset_s) <= _find_limit_s(role) and not offset.drift_ppm
-    }
+    near = {role for role, offset in offsets.items() if abs(offset.offset_s) <= _NOTED_S and not offset.drift_ppm}
     return near - {DOPPLER}
 
 

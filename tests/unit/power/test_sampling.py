@@ -8,7 +8,10 @@ from scipy.signal import lfilter
 
 from tcpipe.power.rails import make_samples
 from tcpipe.power.sampling import (
+    DELAY_MARGIN_S,
+    SMOOTHING_MARGIN_S,
     estimate_smoothing_variance,
+    find_delay,
     find_readings,
     find_smoothing,
     is_stated_averaged,
@@ -156,7 +159,7 @@ def average_before(values, seconds):
 def test_smoothing_is_found_with_its_width_and_what_it_hides(seed, seconds):
     motion, power = drive_by_formula(seed)
     smooth = make_samples(AT_NS, average_before(power, seconds))
-    found = find_smoothing(make_power_fit(smooth, AT_NS, motion, averaged=False))
+    found = find_smoothing(make_power_fit(smooth, AT_NS, motion, averaged=False, margin_s=SMOOTHING_MARGIN_S))
     assert found.width_s == pytest.approx(seconds, rel=0.3)
     assert found.after_s == 0.0
     hidden = power - smooth.value
@@ -170,7 +173,9 @@ def test_a_delay_that_the_recipe_corrects_leaves_a_mean_about_the_stamp(seconds)
     motion, power = drive_by_formula(4)
     corrected_s = -seconds / 2
     moved = make_samples(AT_NS + round(1e9 * corrected_s), average_before(power, seconds))
-    found = find_smoothing(make_power_fit(moved, AT_NS, motion, averaged=False), corrected_s=corrected_s)
+    found = find_smoothing(
+        make_power_fit(moved, AT_NS, motion, averaged=False, margin_s=SMOOTHING_MARGIN_S), corrected_s=corrected_s
+    )
     assert found.before_s == pytest.approx(found.after_s, rel=0.5)
     hidden = np.mean((moved.value[20 * seconds :] - power[10 * seconds : -10 * seconds]) ** 2)
     assert estimate_smoothing_variance(moved, np.ones(COUNT, bool), found) == pytest.approx(hidden, rel=0.6)
@@ -182,10 +187,17 @@ def test_power_as_it_is_and_noisy_motion_are_no_smoothing(seed, noise):
     motion, power = drive_by_formula(seed)
     motion = motion + noise * motion.std(0) * np.random.default_rng(seed).standard_normal(motion.shape)
     for averaged in (False, True):
-        assert find_smoothing(make_power_fit(make_samples(AT_NS, power), AT_NS, motion, averaged=averaged)) is None
+        assert (
+            find_smoothing(
+                make_power_fit(
+                    make_samples(AT_NS, power), AT_NS, motion, averaged=averaged, margin_s=SMOOTHING_MARGIN_S
+                )
+            )
+            is None
+        )
     slow = slice(None, None, 20)  # a mean of a second, as the source states
     mean = make_samples(AT_NS[slow], average_before(power, 1)[slow])
-    assert find_smoothing(make_power_fit(mean, AT_NS, motion, averaged=True)) is None
+    assert find_smoothing(make_power_fit(mean, AT_NS, motion, averaged=True, margin_s=SMOOTHING_MARGIN_S)) is None
 
 
 @pytest.mark.parametrize("seed", [4, 6, 7, 11, 13])
@@ -193,12 +205,40 @@ def test_power_that_wanders_slowly_in_a_short_record_is_no_smoothing(seed):
     motion, at_ns = drive_by_formula(seed)[0][:1800], AT_NS[:1800]
     ground = 60.0 * wandering(COUNT, 200, np.random.default_rng(seed + 100))[:1800]
     power = make_samples(at_ns, 90.0 * motion[:, 0] + ground)
-    assert find_smoothing(make_power_fit(power, at_ns, motion, averaged=False)) is None
+    assert find_smoothing(make_power_fit(power, at_ns, motion, averaged=False, margin_s=SMOOTHING_MARGIN_S)) is None
 
 
 def test_a_correction_of_more_than_every_width_is_no_smoothing():
     motion, power = drive_by_formula(0)
     assert (
-        find_smoothing(make_power_fit(make_samples(AT_NS, power), AT_NS, motion, averaged=False), corrected_s=-30.0)
+        find_smoothing(
+            make_power_fit(make_samples(AT_NS, power), AT_NS, motion, averaged=False, margin_s=SMOOTHING_MARGIN_S),
+            corrected_s=-30.0,
+        )
         is None
     )
+
+
+def find_delay_of(power, motion, delay_s, *, rate_hz=20.0):
+    rows = slice(None, None, round(20.0 / rate_hz))
+    late = make_samples(AT_NS[rows] + round(1e9 * delay_s), power[rows])
+    return find_delay(make_power_fit(late, AT_NS, motion, averaged=False, margin_s=DELAY_MARGIN_S))
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize("delay_s", [-0.3, 0.0, 0.1, 0.36, 1.0])
+def test_a_delay_is_found_within_its_uncertainty(delay_s, rate_hz):
+    for seed in range(3):
+        motion, power = drive_by_formula(seed)
+        found_s, std_s = find_delay_of(power, motion, delay_s, rate_hz=rate_hz)
+        assert abs(found_s - delay_s) < max(3.0 * std_s, 0.01)
+        assert std_s < 0.15
+
+
+def test_power_that_the_motion_does_not_explain_has_no_delay():
+    motion, power = drive_by_formula(1)
+    other = 40.0 + 15.0 * wandering(COUNT, 40, np.random.default_rng(9))
+    assert find_delay_of(other, motion, 0.36) is None
+    assert find_delay_of(power, motion[:, [0, 1, 1]] * [1, 1, 0], 0.36) is None  # hills whose slopes are unknown
+    assert find_delay_of(np.full(COUNT, 40.0), motion, 0.36) is None
+    assert find_delay_of(power, 0.0 * motion, 0.36) is None

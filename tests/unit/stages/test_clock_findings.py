@@ -15,8 +15,8 @@ from tcpipe.stages.fuse import correct_clocks, find_clock_jumps
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.tables.findings import Subject
 
-LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
-WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020, "power": 0.050}
+LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20}
+WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020}
 FAULTS = {role: f"{role.split('_')[0]}_clock_offset" for role in LATE_S}
 
 
@@ -46,7 +46,7 @@ def test_clean_drives_give_no_warning(drive_log, index):
     assert {"imu", "wheel_odometry", "visual_odometry"} <= {found.facts.reference, *found.facts.offsets}
 
 
-@pytest.mark.parametrize("late", [("wheel_odometry",), ("imu",), ("visual_odometry",), ("gnss", "power")])
+@pytest.mark.parametrize("late", [("wheel_odometry",), ("imu",), ("visual_odometry",), ("gnss",)])
 def test_the_sensor_that_is_late_is_found_and_by_how_much(drive_log, late):
     found = doctor(drive_log(1, 42, *late))
     noted = {name: offset for name, offset in found.facts.offsets.items() if offset.noted}
@@ -57,14 +57,14 @@ def test_the_sensor_that_is_late_is_found_and_by_how_much(drive_log, late):
     for finding in found.findings:
         role = finding.subject.name
         assert noted[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
-        assert finding.action == ("kept" if role == "power" else "corrected")
+        assert finding.action == "corrected"
         assert finding.numbers["offset_s"] == noted[role].offset_s
         said = proposed(finding)["read"]["time_offset_s"]
         assert said == {role: pytest.approx(-LATE_S[role], abs=WITHIN_S[role] + 0.005)}
 
 
 def test_the_remedy_corrects_it(drive_log):
-    log = drive_log(1, 42, "gnss", "power")
+    log = drive_log(1, 42, "gnss")
     offsets_s: dict[str, float] = {}
     for finding in doctor(log).findings:
         offsets_s |= proposed(finding)["read"]["time_offset_s"]

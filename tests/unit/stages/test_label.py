@@ -24,6 +24,7 @@ from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.facts import PowerSensorFacts
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -270,12 +271,12 @@ def stages(tmp_path_factory):
 def test_the_fit_is_the_robot(stages):
     facts = stages[2].info.report.facts.label.physics
     assert facts.idle_watt == pytest.approx(ROBOT.idle_watt, rel=0.02)
-    assert facts.weight_over_efficiency_newton == pytest.approx(
-        ROBOT.mass_kg * GRAVITY_MPS2 / ROBOT.drive_efficiency, rel=0.05
-    )
-    assert 0.115 < facts.rolling_resistance < 0.22  # of all classes together
-    assert facts.recovered_downhill == pytest.approx(ROBOT.drive_efficiency * ROBOT.regeneration_efficiency, abs=0.15)
     values = {of.term: of for of in facts.fit.terms}
+    assert values["grade"].value == pytest.approx(ROBOT.mass_kg * GRAVITY_MPS2 / ROBOT.drive_efficiency, rel=0.05)
+    assert 0.115 < facts.fit.rolling_resistance["all"][0] < 0.22  # of all classes together
+    assert facts.fit.recovered_downhill == pytest.approx(
+        ROBOT.drive_efficiency * ROBOT.regeneration_efficiency, abs=0.15
+    )
     torque = ROBOT.scrub_torque_nm / ROBOT.drive_efficiency
     assert abs(values["turning"].value - torque) < max(0.05 * torque, 2.0 * values["turning"].std)
     assert values["turning"].std < 0.1 * torque
@@ -301,7 +302,7 @@ def test_ground_that_costs_more_is_not_flagged():
 def test_without_power_there_is_no_fit(stages):
     dark = with_columns(stages[2].table, power_watt=np.full(stages[2].table.num_rows, np.nan))
     predicted, facts = fit_run_physics(dark, np.nan)
-    assert facts.fitted is False
+    assert facts.fit is None
     assert np.isnan(predicted).all()
 
 
@@ -325,7 +326,14 @@ def test_the_track_has_the_power_that_the_label_takes_at_a_segments_end(averaged
     rule = "averaged" if averaged else "exact"
     unknown, rails = IdlePower(np.nan, np.nan), make_rails(streams, 0)
     cost, _, causes = compute_segment_costs(
-        cut, masked.table, rails, masked.info, rule=rule, standing=unknown, sensor=SensorError()
+        cut,
+        masked.table,
+        rails,
+        masked.info,
+        rule=rule,
+        standing=unknown,
+        sensor=SensorError(),
+        power=PowerSensorFacts(0.0, 0.0),
     )
     label_watt = np.sqrt(causes["position"]) / cost.duration_std_s
     assert cut.num_rows > 40

@@ -177,7 +177,6 @@ def test_a_clock_is_doubtful_that_is_off_unless_it_was_corrected():
     assert not is_clock_doubtful(good, clocks("imu"))
     assert is_clock_doubtful(good, clocks("imu", noted=True))
     assert not is_clock_doubtful(good, clocks("imu", noted=True, blamed=True))
-    assert is_clock_doubtful(good, clocks("power", noted=True, blamed=True))
 
 
 T = np.arange(0, 30, 0.05)

@@ -60,7 +60,7 @@ def test_what_lies_is_named(truth, sensors, change, code, said):
 def test_stamps_that_are_not_of_the_fixes_time_are_corrected(truth, sensors):
     """On this drive the speed changes too slowly for the wheels to tell a lag; the course does not."""
     late = with_velocity(sensors, truth, late_ns=300_000_000)
-    offset = find_clock_offsets(replace(late, imu=None), None).offsets["gnss_velocity"]
+    offset = find_clock_offsets(replace(late, imu=None)).offsets["gnss_velocity"]
     assert offset.noted
     assert offset.offset_s == pytest.approx(0.3, abs=0.02)
 

@@ -131,6 +131,8 @@ def test_a_tag_is_held_out_whole(store, tmp_path):
         row["sample_id"]: row["split"] for row in read_samples(tmp_path / "other").to_pylist()
     }
     assert result.card.splits["test"] in {20, 40}
+    # A fit to 20 segments and more; that of the card must not know the labels that are held out.
+    assert {fit.segments for fit in result.card.physics.values()} == {result.card.splits["train"]}
 
 
 def test_a_holdout_wants_a_tag_that_all_runs_carry(store, tmp_path):
