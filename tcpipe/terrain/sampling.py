@@ -135,11 +135,8 @@ def sample_patches(
         known = np.isfinite(found[name]).mean(axis=(1, 2, 3)) if chord_m.size else stats[:, 3]
         stats[:, 3] = np.minimum(stats[:, 3], known)
     height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity = stats.T
-    height_m, terrain_class, profile_m = (
-        height_m + level.height_reference_m,
-        terrain_class.astype(np.uint8),
-        _compute_profile(out.relative),
-    )
+    height_m, terrain_class = height_m + level.height_reference_m, terrain_class.astype(np.uint8)
+    profile_m = _compute_profile(out.relative)
     return Patches(found, height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity, profile_m)
 
 

@@ -241,7 +241,7 @@ class Plateau:
         """Return whether such a share of pixels has the value, in areas, with large steps at most of their borders."""
         pixels, steps, large_steps = self.counts.tolist()
         is_steep = large_steps >= read_threshold(_ISOLATED, "min_large_step_fraction") * steps
-        return is_steep and 0 < steps < pixels and pixels >= min_fraction * self.total
+        return bool(is_steep and 0 < steps < pixels and pixels >= min_fraction * self.total)
 
 
 @dataclass(slots=True)
