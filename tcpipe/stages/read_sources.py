@@ -126,21 +126,12 @@ def _join_topics(sources: Sequence[TopicReadings], config: ReadConfig, findings:
         else:
             at_ns = source.readings.log_time_ns
             overlaps = np.zeros(len(at_ns), np.bool_)
-            for first_ns, last_ns in (
-                other.readings.log_time_ns[[0, -1]] for other in before if len(other.readings.row)
-            ):
-                overlaps |= (at_ns >= first_ns) & (at_ns <= last_ns)
+            for used_ns in [other.readings.log_time_ns for other in before if len(other.readings.row)]:
+                overlaps |= (used_ns[0] <= at_ns) & (at_ns <= used_ns[-1])
             if count := int(overlaps.sum()):
                 names = {"role": role, "used": before[0].topic}
                 remedies = suggest("use", {"read.topics": {role: [source.topic]}})
-                found = make_finding(
-                    "topic-overlaps",
-                    subject,
-                    names=names,
-                    remedies=remedies,
-                    overlapping_count=count,
-                    messages_count=source.messages,
-                )
+                found = make_finding("topic-overlaps", subject, names=names, remedies=remedies, overlapping_count=count)
                 findings.append(found)
             before.append(replace(source, readings=source.readings.select(~overlaps)))
     return [source for topics in joined.values() for source in topics]

@@ -361,10 +361,8 @@ def _find_overlap(run: RunDirectory, other: RunDirectory, shared: int, logs: Map
         Remedy("two_robots", command=f"tcpipe ingest {own} --tag robot={run.run_id}"),
         Remedy("one_drive", command=f"tcpipe ingest {others} {own} --tag robot={other.run_id}"),
     )
-    subject, names, count = Subject("run", run.run_id), {"other": other.run_id}, run.facts.segments
-    return make_finding(
-        "drives-overlap", subject, names=names, remedies=remedies, overlapping_count=shared, segment_count=count
-    )
+    subject, names = Subject("run", run.run_id), {"other": other.run_id}
+    return make_finding("drives-overlap", subject, names=names, remedies=remedies, overlapping_count=shared)
 
 
 _COMPARED_ROLES = ("gnss", "pose", "wheel_odometry", "visual_odometry", "imu")
