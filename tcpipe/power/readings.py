@@ -341,7 +341,7 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
         excluded |= isolated
         live = np.flatnonzero((np.isfinite(volt) | np.isfinite(amp)) & ~excluded)
         inner = excluded[live.min(initial=len(volt)) : live.max(initial=0)]
-        count = max(np.count_nonzero(inner), rail.unmeasured_count)
+        count = max(int(np.count_nonzero(inner)), rail.unmeasured_count)
         if is_rejected:
             findings.append(reject_power(topic, "isolated-values", names=names))
         elif count:
@@ -352,7 +352,9 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
     return kept, findings
 
 
-def _undo_overflows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Rails, list[Finding]]:
+def _undo_overflows(
+    rails: Rails, log_times: Mapping[str, Floats]
+) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
     """Return the rails without overflows of signed currents, and findings; power is rejected where the voltage does not confirm them."""
     whole: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
     findings, are_clear = [], True
@@ -360,17 +362,17 @@ def _undo_overflows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Rail
         current_amp, span_amp, is_clear = undo_overflow(rail.current_amp)
         whole[topic].append(replace(rail, current_amp=current_amp))
         if span_amp and not rail.counter:
-            count = np.count_nonzero(np.abs(current_amp - rail.current_amp) > span_amp / 2)
+            count = int(np.count_nonzero(np.abs(current_amp - rail.current_amp) > span_amp / 2))
             names, are_clear = {"rail": rail.name}, are_clear and is_clear
             findings.append(make_finding(_WRAPPED, _POWER, names=names, currents_count=count, wraps_amp=span_amp))
     if not findings:
-        return rails, []
+        return whole, []
     before, after = (_correlate_voltage(each, log_times) for each in (rails, whole))
     least = read_threshold(_WRAPPED, "min_correlation")
     if before >= max(after, least):
-        return rails, []
+        return dict(rails), []
     if not are_clear or after < least:
-        return rails, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
+        return whole, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
     return whole, findings
 
 
