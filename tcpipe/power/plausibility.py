@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 EXCLUDED, REJECTED = "power-values-excluded", "power-rejected"
-_FEWEST_VALUES, _MARKS = 20, 2
+_FEWEST_VALUES, _MARKS, _MOST_REPEATS = 20, 2, 5
 _SHORTEST_DRIVE_S = 1.0
 """No robot starts and stops within this."""
 _JUMP, _ASYMMETRY, _FEWEST_JUMPS = 0.6, 0.02, 4
@@ -43,7 +43,7 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
 
     One or two values in a row are isolated if they are far from the median of five, by the largest usual value, or by half of it where
     other values are near their medians. An exact value that may mean "not measured" is isolated if it is farther from both neighbours than
-    usual steps, and repeated no longer than other values.
+    usual steps, and not repeated much longer than other values.
     """
     rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), np.bool_)
     new = np.diff(values[rows], prepend=np.nan) != 0.0
@@ -55,7 +55,8 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     after = np.clip(np.searchsorted(rest, np.arange(value.size)), 1, rest.size - 1)
     distance = np.minimum(*(np.abs(value - value[rest[at]]) for at in (after - 1, after)))
     steps, repeats = np.abs(np.diff(value[rest])), np.bincount(np.cumsum(new) - 1)
-    isolated = marked & (distance > _compute_usual(steps)) & (repeats <= 2 * np.median(repeats[rest]))
+    isolated = marked & (distance > _compute_usual(steps)) & (repeats <= _MOST_REPEATS * np.median(repeats[rest]))
+    rest = np.flatnonzero(~isolated)
     by_most, deviation = _compare_with_median(value[rest], 5, 0.9)
     relative, _ = _compare_with_median(value[rest], 5, 0.99)
     limit, low_limit, times = (

@@ -488,13 +488,13 @@ def _undo_overflows(
             names, are_clear = {"rail": rail.name}, are_clear and is_clear
             findings.append(make_finding(_WRAPPED, _POWER, names=names, currents_count=count, wraps_amp=span_amp))
     if not findings:
-        return rails, []
+        return whole, []
     before, after = (_correlate_voltage(each, log_times) for each in (rails, whole))
     least = read_threshold(_WRAPPED, "min_correlation")
     if before >= max(after, least):
-        return rails, []
+        return dict(rails), []
     if not are_clear or after < least:
-        return rails, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
+        return whole, [reject_power(next(iter(rails)), "current-overflow", names=findings[0].names)]
     return whole, findings
 
 

@@ -45,7 +45,7 @@ TABLE_POWER = "tcpipe/msg/TablePower"
 
 UNMEASURED_AMP = {
     "battery_status": (-1.0,),
-    "": (1.0, 1e-3, *(limit / 10**digits for limit in (32767, 32768, 65535) for digits in range(4))),
+    "": (0.0, 1.0, 1e-3, *(limit / 10**digits for limit in (32767, 32768, 65535) for digits in range(4))),
 }
 """Currents [A] that mean "not measured", by message: PX4 defines -1. In all others (""), -1 and the limits of 16-bit registers, of either
 sign, may be real: they count only where both neighbours are far. NaN, and a voltage of 0 V or less, are never a measurement."""

@@ -22,7 +22,7 @@ from tcpipe.power.audit import (
     measure_sag,
     summarize_rest,
 )
-from tcpipe.power.rails import IdlePower, Rail, Rule, integrate_energy, sum_power
+from tcpipe.power.rails import IdlePower, Rail, Rule, integrate_energy, is_power_only, sum_power
 from tcpipe.power.sampling import (
     DELAY_MARGIN_S,
     SMOOTHING_MARGIN_S,
@@ -78,23 +78,20 @@ def audit_power_sensor(
         facts = _add_gain_change(facts, sags)
     if config.power_offset_std_amp is not None:
         return replace(facts, offset_std_amp=config.power_offset_std_amp)
-    if power is None or power.rest_current_amp is None:
-        return facts
+    range_amp = None if power is None else power.rest_current_amp
     rest_amp: dict[str, list[Floats]] = {}
     unsettled_s = np.array(facts.unsettled_s) * (1.0, -1.0)
     for epoch, rails in rails_by_epoch.items():
         still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz, but=DropReason.STUCK)
         still_ns = still_ns + np.rint(1e9 * unsettled_s).astype(np.int64)
-        for rail in rails:
+        for rail in (rail for rail in rails if not is_power_only(rail.voltage.value)):
             rest_amp.setdefault(rail.name, []).append(measure_rest_currents(rail, still_ns))
     joined = [current_amp for parts in rest_amp.values() if (current_amp := np.concatenate(parts)).size]
     if not joined:
         return facts
-    std_amp = max(
-        estimate_offset_std(current_amp, power.rest_current_amp, facts.offset_std_amp) for current_amp in joined
-    )
+    std_amp = max(estimate_offset_std(current_amp, range_amp, facts.offset_std_amp) for current_amp in joined)
     low, high = zip(*map(summarize_rest, joined), strict=True)
-    return replace(facts, offset_std_amp=std_amp, rest_amp=(min(low), max(high)))
+    return replace(facts, offset_std_amp=std_amp, rest_amp=(min(low), max(high)) if range_amp else None)
 
 
 def _find_prior(power: PowerSign | None) -> tuple[float, float]:

@@ -200,3 +200,8 @@ def test_a_constant_current_with_marks_has_no_steps():
     columns = {"log_time_ns": TIME_NS, "v": VOLT, "i": np.where(ROW % 3 == 0, 32.767, 5.0)}
     (rail,) = readings.read_power({"/b": ("my_msgs/msg/Battery", columns)}, known).rails["/b"]
     assert np.nanmax(rail.current_amp) == 5.0
+
+
+def test_a_fifth_of_the_currents_may_be_at_a_limit_of_the_register():
+    rows = np.random.default_rng(9).random(COUNT) < 0.2
+    assert compute_energy(read(amp=change(AMP, rows, -327.67))) == pytest.approx(RIGHT, rel=0.005)

@@ -607,3 +607,12 @@ def test_reading_takes_room_for_little_more_than_its_tables() -> None:
 
     (short, of_short), (long, of_long) = peak_and_tables(10_000), peak_and_tables(20_000)
     assert long - short <= 2.5 * (of_long - of_short)
+
+
+@pytest.mark.parametrize("sign", ["drawn_positive", "drawn_negative"])
+def test_the_zero_of_a_current_is_subtracted_as_drawn(sign: str) -> None:
+    right, found = (read(husky(), current_sign=sign, current_offset_amp=zero) for zero in (0.0, -1.5))
+    for name, change in (("voltage_volt", 0.0), ("current_amp", 1.5)):
+        before, after = (of.tables["power"][name].to_numpy() for of in (right, found))
+        np.testing.assert_allclose(after - before, change, atol=1e-12)
+    assert found.report.facts.power.zero_amp == -1.5
