@@ -299,8 +299,12 @@ def _find_blocked(groups: Sequence[Group], source: MapFile) -> list[Finding]:
     driven_m, least = sum(group.driven_m for group in groups), read_threshold(_BLOCKED, "min_driven_fraction")
     findings = []
     for group in (group for group in groups if group.name in closed and group.driven_m > least * driven_m):
-        values = ", ".join(str(value) for value, number in source.id_by_value.items() if number == closed[group.name])
-        subject, names, share = Subject("class", group.name), {"values": values}, group.driven_m / driven_m
+        values = [str(value) for value, number in source.id_by_value.items() if number == closed[group.name]]
+        subject, names, share = (
+            Subject("class", group.name),
+            {"values": ", ".join(values[:3])},
+            group.driven_m / driven_m,
+        )
         findings.append(make_finding(_BLOCKED, subject, names=names, driven_m=group.driven_m, driven_fraction=share))
     return findings
 
