@@ -178,13 +178,13 @@ def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
     file = "FILE" if "…" in file else shlex.quote(file)
     mended = f"rio edit-info {file} --bidx 1 --units {unit}"
     if not unit:
-        mended = (
-            f"rio calc \"(* {scale.value:.3g} (read 1 1 'float64'))\" {file} scaled.tif --dtype float32 --co nodata=nan"
-        )
+        files = f"{file} scaled.tif --dtype float32 --co nodata=nan"
+        mended = f"rio calc \"(* {scale.value:.3g} (read 1 1 'float64'))\" {files}"
     kind = {"": "scaled", "m": "metres, converted by mistake", "ft": "in feet"}.get(unit, f"in {unit}")
     return (
-        f"map {source.name}: where run {run_id} rises by 1 m, it rises by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}): "
-        f"its heights are {kind}; correct the raster ({mended}) and add it again: tcpipe add-map {source.name} --height FILE ... --force"
+        f"map {source.name}: it rises by {1 / scale.value:.3g} m (± {100.0 * scale.std / scale.value:.2g} %) where run {run_id} "
+        f"rises by 1 m: its heights are {kind}; correct the raster ({mended}) and add it again: "
+        f"tcpipe add-map {source.name} --height FILE ... --force"
     )
 
 
