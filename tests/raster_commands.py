@@ -16,6 +16,6 @@ def run_rio(message: str, directory: Path, **placeholders: str) -> None:
     words = [
         name
         for word in words
-        for name in (sorted(path.name for path in directory.glob(word)) if "*" in word else [word])
+        for name in (sorted(path.name for path in directory.glob(word)) if word == "*.tif" else [word])
     ]
     subprocess.run([program, *words], cwd=directory, check=True, capture_output=True)
