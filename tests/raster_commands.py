@@ -13,4 +13,9 @@ def run_rio(message: str, directory: Path, **placeholders: str) -> None:
     words = shlex.split(re.split(r"[;,] ", command)[0].rstrip(". "))
     program = Path(sys.executable).with_name("rio")
     words = [placeholders.get(word.replace(".", "_"), word) for word in words[1:]]
+    words = [
+        name
+        for word in words
+        for name in (sorted(path.name for path in directory.glob(word)) if word == "*.tif" else [word])
+    ]
     subprocess.run([program, *words], cwd=directory, check=True, capture_output=True)

@@ -70,13 +70,12 @@ def read_regions(path: Path) -> Regions:
 
 @dataclass(frozen=True, slots=True)
 class PolygonFeature:
-    """A feature: where it stands (file and number), its properties, and its polygons in WGS84 lon/lat [deg]."""
+    """A feature: file and number, properties, polygons in WGS84 lon/lat [deg], and how many of these were repaired."""
 
     where: str
     properties: Mapping[str, Json]
     polygons: tuple[BaseGeometry, ...]
     repaired: int = 0
-    """Polygons that crossed or touched themselves."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -247,9 +247,8 @@ def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
         except (MapError, StoreError):
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue
-        classes_from = found.facts.classes_from
-        if classes_from == "file" or ("terrain" in found.layers and classes_from != "default"):
-            own = classes_from == "names"  # those values are of that raster alone
+        if found.facts.classes_from == "file" or ("terrain" in found.layers and found.facts.classes_from != "default"):
+            own = found.facts.classes_from == "names"  # those values are of that raster alone
             values = {entry.id: entry.id for entry in found.classes.classes} if own else found.id_by_value
             return ClassScheme(found.classes, values)
     return None

@@ -30,7 +30,6 @@ MAX_SCALE_ERROR = 0.01
 """A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
 
 _EARTH_RADIUS_M = 6_371_000.0
-_WGS84 = CRS.from_epsg(4326)
 
 
 def parse_crs(text: str, *, where: str) -> CRS:
@@ -70,7 +69,7 @@ def _bind_shift(crs: CRS, bound: CRS, where: str) -> CRS:
             "transform the raster: rio warp in.tif out.tif --dst-crs EPSG:n"
         )
     is_zero = bool(shift.towgs84) and not any(shift.towgs84)
-    if grids or (is_zero and np.allclose(_read_ellipsoid(crs), _read_ellipsoid(_WGS84), rtol=1e-8)):
+    if grids or (is_zero and np.allclose(_read_ellipsoid(crs), _read_ellipsoid(CRS.from_epsg(4326)), rtol=1e-8)):
         return crs
     return BoundCRS(crs, CRS(bound.target_crs).to_2d(), shift)
 

@@ -371,7 +371,7 @@ def _refuse_unplaced(dataset: Any, path: Path) -> None:
         )
     if dataset.transform.is_identity:
         raise MapError(
-            f"{path}: has no georeference; give it one (rio edit-info FILE --crs EPSG:n --transform '[pixel, 0, x_min, 0, -pixel, y_max]')"
+            f"{path}: has no georeference; give it one (rio edit-info FILE --crs EPSG:n --transform '[pixel,0,x_min,0,-pixel,y_max]')"
         )
     if dataset.transform.is_degenerate:
         raise MapError(f"{path}: its georeference has pixels without area")

@@ -168,7 +168,8 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files do not lie on the pixels of the rest "
             f"({got}, the rest {wanted}): {', '.join(shorten_problems([str(tile.path) for tile in odd]))}; "
-            "put all on one grid: rio merge --resampling bilinear *.tif joined.tif"
+            f"put all on one grid: rio merge --resampling {'nearest' if tiles[0].use == 'classes' else 'bilinear'} "
+            f"--nodata {-9999 if tiles[0].use == 'metres' else 0} *.tif joined.tif"
         )
     a, b, x, d, e, y = tiles[base].affine
     col, row = at.min(axis=0).tolist()
@@ -279,8 +280,7 @@ class Tally:
     def _describe_range(self, label: str) -> str:
         """Return the problem that heights are no dry land, with the command that makes them no data."""
         wrong, sign, limit = (self.low, "<", _DEEPEST_M) if self.low < _DEEPEST_M else (self.high, ">", _HIGHEST_M)
-        is_tagged = math.isfinite(self.nodata)
-        tag, more = (self.nodata, "") if is_tagged else (-9999.0, " --dtype float32 --co nodata=-9999")
+        tag, more = (self.nodata, "") if math.isfinite(self.nodata) else (-9999.0, " --dtype float32 --co nodata=-9999")
         return (
             f"{label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; if {wrong:.6g} is no data: rio calc "
             f'--not-masked "(where ({sign} (read 1 1) {limit:g}) {tag:.9g} (read 1 1))" in.tif out.tif{more}; '

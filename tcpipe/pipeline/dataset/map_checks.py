@@ -182,13 +182,13 @@ def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
     file = "FILE" if "…" in file else shlex.quote(file)
     mended = f"rio edit-info {file} --bidx 1 --units {unit}"
     if not unit:
-        mended = (
-            f"rio calc \"(* {scale.value:.3g} (read 1 1 'float64'))\" {file} scaled.tif --dtype float32 --co nodata=nan"
-        )
+        files = f"{file} scaled.tif --dtype float32 --co nodata=nan"
+        mended = f"rio calc \"(* {scale.value:.3g} (read 1 1 'float64'))\" {files}"
     kind = {"": "scaled", "m": "metres, converted by mistake", "ft": "in feet"}.get(unit, f"in {unit}")
     return (
-        f"map {source.name}: where run {run_id} rises by 1 m, it rises by {1 / scale.value:.3g} m (± {scale.std / scale.value:.0%}): "
-        f"its heights are {kind}; correct the raster ({mended}) and add it again: tcpipe add-map {source.name} --height FILE ... --force"
+        f"map {source.name}: it rises by {1 / scale.value:.3g} m (± {100.0 * scale.std / scale.value:.2g} %) where run {run_id} "
+        f"rises by 1 m: its heights are {kind}; correct the raster ({mended}) and add it again: "
+        f"tcpipe add-map {source.name} --height FILE ... --force"
     )
 
 
@@ -371,8 +371,12 @@ def _find_blocked(groups: Sequence[Group], source: MapFile) -> list[Finding]:
     driven_m, least = sum(group.driven_m for group in groups), read_threshold(_BLOCKED, "min_driven_fraction")
     findings = []
     for group in (group for group in groups if group.name in closed and group.driven_m > least * driven_m):
-        values = ", ".join(str(value) for value, number in source.id_by_value.items() if number == closed[group.name])
-        subject, names, share = Subject("class", group.name), {"values": values}, group.driven_m / driven_m
+        values = [str(value) for value, number in source.id_by_value.items() if number == closed[group.name]]
+        subject, names, share = (
+            Subject("class", group.name),
+            {"values": ", ".join(values[:3])},
+            group.driven_m / driven_m,
+        )
         findings.append(make_finding(_BLOCKED, subject, names=names, driven_m=group.driven_m, driven_fraction=share))
     return findings
 

@@ -12,6 +12,7 @@ import rasterio
 from map_worlds import World, write_tif
 from raster_commands import run_rio
 from rasterio import Affine
+from rasterio.control import GroundControlPoint
 from rasterio.features import shapes
 from rasterio.warp import transform_geom
 from shared_data import shared_data
@@ -251,6 +252,51 @@ def test_reported_files_are_read(tmp_path, name, options):
         **options,
     )
     assert source.facts.class_share
+
+
+def test_a_raster_of_control_points_is_rectified(tmp_path):
+    corners = [(0, 0), (0, 50), (50, 0), (50, 50)]
+    points = [GroundControlPoint(row, col, WORLD.x_m + 0.2 * col, WORLD.y_m - 0.2 * row) for row, col in corners]
+    options = {"driver": "GTiff", "height": 50, "width": 50, "count": 1, "dtype": "float32"}
+    with rasterio.open(tmp_path / "gcps.tif", "w", gcps=points, crs=WORLD.crs, **options) as dataset:
+        dataset.write(np.full((1, 50, 50), 300.0, np.float32))
+    run_rio(refuse(tmp_path, height=tmp_path / "gcps.tif"), tmp_path, in_tif="gcps.tif", **{"EPSG:n": WORLD.crs})
+    source = build(tmp_path, height=tmp_path / "out.tif")
+    assert source.grid.bounds_m == pytest.approx((WORLD.x_m, WORLD.y_m - 10.0, WORLD.x_m + 10.0, WORLD.y_m), abs=0.2)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_raster_without_a_place_gets_one(tmp_path):
+    write_tif(tmp_path / "FILE", np.full((1, 50, 50), 300.0, np.float32), None, Affine.identity())
+    problem = refuse(tmp_path, height=tmp_path / "FILE").replace("EPSG:n", WORLD.crs)
+    for word, value in (("x_min", WORLD.x_m), ("y_max", WORLD.y_m), ("pixel", 0.2)):
+        problem = problem.replace(word, str(value))
+    run_rio(problem, tmp_path)
+    assert build(tmp_path, height=tmp_path / "FILE").grid.x_min_m == WORLD.x_m
+
+
+@pytest.mark.parametrize("what", ["CRS", "type", "pixels"])
+def test_tiles_that_differ_are_made_alike(tmp_path, what):
+    affines = [TOP_LEFT, Affine(0.2, 0.0, WORLD.x_m, 0.0, -0.2, WORLD.y_m + 10.0), TOP_LEFT]
+    affines[2] = Affine(0.2, 0.0, WORLD.x_m - 10.0, 0.0, -0.2, WORLD.y_m)
+    options = [{"crs": WORLD.crs, "dtype": "float32"}] * 3
+    if what == "CRS":
+        options[2] = {"crs": "EPSG:25833", "dtype": "float32"}
+    elif what == "type":
+        options[2] = {"crs": WORLD.crs, "dtype": "int16"}
+    else:
+        affines[2] = Affine(0.2, 0.0, WORLD.x_m - 9.93, 0.0, -0.2, WORLD.y_m)
+    folder = tmp_path / "tiles"
+    folder.mkdir()
+    for name, affine, option in zip("abc", affines, options, strict=True):
+        write_tif(folder / f"{name}.tif", np.full((1, 50, 50), 300, option["dtype"]), option["crs"], affine)
+    tiles = sorted(folder.glob("*.tif"))
+    problem = refuse(tmp_path, height=tiles)
+    run_rio(problem, folder, in_tif="c.tif", **{"EPSG:n": WORLD.crs, "T": "float32"})
+    made = folder / ("joined.tif" if what == "pixels" else "out.tif")
+    found = read_heights(build(tmp_path, height=[made] if what == "pixels" else [*tiles[:2], made]))
+    assert np.unique(found[np.isfinite(found)]).tolist() == [300.0]
+    assert 0.2 < np.isnan(found).mean() < 0.3
 
 
 def test_a_virtual_raster_is_rewritten_by_the_command(tmp_path, site):
