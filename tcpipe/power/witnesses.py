@@ -170,11 +170,20 @@ def compare_meters(drive_watt: Floats, pack_watt: Floats) -> tuple[float, float]
     return product / float(drive @ drive), product / float(np.sqrt((drive @ drive) * (pack @ pack)))
 
 
+_MAX_HALF_SHARE = 0.36
+"""Half a side that is not measured leaves a share of a third."""
+
+
+def estimate_missing_std_fraction(side_share: float | None) -> float:
+    """Return σ of the gain for what one side may lack: half a side cannot be told, because sound robots have shares of 0.13 to 0.50."""
+    share = 0.5 if side_share is None else min(side_share, 1.0 - side_share)
+    return (1.0 - 2.0 * share) / 3.0**0.5 if share < _MAX_HALF_SHARE else 0.0
+
+
 def compute_side_share(first_amp: Floats, second_amp: Floats, is_straight: NDArray[np.bool_]) -> float | None:
     """Return the share of the first of two sides in their current in straight driving [1]; None for fewer than 30 rows.
 
-    The currents [A], shape (N,), are positive when drawn. A share below 0.05 or above 0.95 shows that one whole side is not measured;
-    half a side cannot be told: sound robots have shares of 0.13 to 0.50.
+    The currents [A], shape (N,), are positive when drawn. A share below 0.05 or above 0.95 shows that one whole side is not measured.
     """
     used = is_straight & np.isfinite(first_amp + second_amp)
     total = float((first_amp + second_amp)[used].sum())

@@ -31,6 +31,7 @@ from tcpipe.power.sampling import (
     find_smoothing,
     make_power_fit,
 )
+from tcpipe.power.witnesses import estimate_missing_std_fraction
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
@@ -71,7 +72,9 @@ def audit_power_sensor(
     smoothing = max(filter(None, found), key=lambda of_epoch: of_epoch.width_s, default=None)
     delays = [] if smoothing else [find_delay(fit) for fit in _fit_power(rows, rails_by_epoch, DELAY_MARGIN_S)]
     delay_s = min(filter(None, delays), key=lambda delay_and_std: delay_and_std[1], default=None)
-    facts = PowerSensorFacts(*_find_prior(power), battery_ohm=battery_ohm, smoothing=smoothing, delay_s=delay_s)
+    gain_std, offset_std_amp = _find_prior(power)
+    gain_std = float(np.hypot(gain_std, estimate_missing_std_fraction(power.side_share if power else None)))
+    facts = PowerSensorFacts(gain_std, offset_std_amp, battery_ohm=battery_ohm, smoothing=smoothing, delay_s=delay_s)
     if config.power_gain_std_fraction is not None:
         facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
     else:
