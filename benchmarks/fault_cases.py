@@ -152,7 +152,6 @@ CASES = (
     Case("a directory", _directory("dataset", one="1")),
     Case("a directory over another", _directory("dataset", one="1", two="2"), (_directory("dataset", one="0"),)),
     Case("init", command("init")),
-    Case("schemas", command("schemas", "schemas")),
     Case("simulate", command("simulate", "site", "--scenario", "tiny"), wants=_LOG),
     Case("export", command("export", LOG, "table"), wants=_LOG),
     Case("ingest", _RUN, wants=_LOG),

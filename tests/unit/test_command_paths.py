@@ -148,7 +148,7 @@ def test_a_bad_path_is_exit_code_2(here, call):
 
 def test_every_command_that_reads_or_writes_a_path_is_tried():
     tried = {call.split()[0] for call in CALLS}
-    assert {name for name, _ in PLACES} - tried == {"init", "schemas"}
+    assert {name for name, _ in PLACES} - tried == {"init"}
 
 
 FUNCTIONS = {
