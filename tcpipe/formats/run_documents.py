@@ -236,7 +236,7 @@ MARK = "store.json"
 """Is written first where a store is new."""
 COPY_MARK = f"copy it from any store of data model {DATA_MODEL_VERSION}: it is the same in all of them"
 SPOOL = "spool"
-"""Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store, and claims; they go in the end."""
+"""Where pixels wait until a dataset is written, in its directory, and claims, in the store; they go in the end."""
 
 
 def is_unmarked_store(place: Place) -> bool:

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
-from tcpipe.execution import Executor, run_all
+from tcpipe.execution import run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here
 from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State, Superseded
@@ -246,7 +246,7 @@ def _iterate_finished(log: LogWriter, steps: Mapping[int, Step]) -> Iterator[tup
 
 
 def _iterate_results(
-    log: LogWriter, queue: LogQueue, *, jobs: int, cluster: str | Executor | None
+    log: LogWriter, queue: LogQueue, *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
     keep_state_here(log.store.place, log.state)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.tables.options import (
-    CLUSTER,
     DRY_RUN,
     MESSAGE_DEFINITIONS,
     RECIPE,
@@ -23,7 +22,6 @@ from tcpipe.tables.options import (
 )
 
 if TYPE_CHECKING:
-    from tcpipe.execution import Executor
     from tcpipe.formats.dataset_files import FileFormat
     from tcpipe.pipeline.plan import IngestResult
     from tcpipe.recipe import Recipe
@@ -48,11 +46,15 @@ class IngestOptions:
     )
     tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
-    cluster: str | Executor | None = option(None, CLUSTER)
-    """Or, in Python, any executor: a `concurrent.futures.Executor`, Dask's (`Client.get_executor`), submitit's for Slurm.
-
-    Workers see logs and store under the same absolute paths.
-    """
+    cluster: str | None = option(
+        None,
+        Option(
+            "Dask scheduler whose workers ingest the logs, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
+            metavar="ADDRESS",
+            envvar="TCPIPE_CLUSTER",
+        ),
+    )
+    """Workers see logs and store under the same absolute paths."""
     as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
     message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
@@ -175,8 +177,6 @@ class BuildDatasetOptions:
     store: str | Path = option("tcpipe-store", STORE)
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
-    cluster: str | Executor | None = option(None, CLUSTER)
-    """Its workers see the store under the same absolute path or URL."""
     file_format: FileFormat = option("zarr", Option(flags=("--format",), kind=("zarr", "parquet")))
     holdout: str | None = option(
         None,

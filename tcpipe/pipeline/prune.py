@@ -271,7 +271,7 @@ _Unnamed = tuple[str, Place, list[Entry], str | None]
 
 
 def _iterate_spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
-    """Yield what was shared by builds on a cluster and tasks of an array that were killed, if it is old enough."""
+    """Yield what was shared by tasks of an array that were killed, if it is old enough."""
     before_ns = time.time_ns() - int(min_age_s * 1e9)
     for name in store.place.folders(SPOOL):
         place = store.place.below(f"{SPOOL}/{name}")
