@@ -105,7 +105,6 @@ _ANSWERS = {
     "reproduction": "experiment.reproduction.ReproductionSummary",
     "acknowledge.answer": "pipeline.problems.Acknowledged",
     "add-map.answer": "pipeline.maps.AddedMap",
-    "add-map-plan.answer": "pipeline.maps.MapPlan",
     "audit.answer": "pipeline.audit.Audit",
     "build-dataset.answer": "pipeline.dataset.build.BuildResult",
     "cost-map.answer": "planning.cost_map.CostMapResult",

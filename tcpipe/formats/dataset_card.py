@@ -10,7 +10,7 @@ from tcpipe.balance.correlation import Correlation, Floor
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
-from tcpipe.formats.maps.map_facts import Description, MapInputs, RasterOrigin
+from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
@@ -174,8 +174,6 @@ class MapSource:
     """By layer, of a user's own categorical ones."""
     classes_from: str | None = None
     inputs: MapInputs | None = None
-    origins: tuple[RasterOrigin, ...] = field(default=(), metadata=LEFT_OUT)
-    """Of rasters that were taken from open data; of a redacted dataset layers and licences alone."""
     findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
     """Of building it."""
     registration: tuple[MapRegistration, ...] = ()
@@ -249,7 +247,7 @@ class Redacted:
     )
     not_hidden: str = (
         "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
-        "power, names of classes and layers, licences of open data, tags and covariates as they were given (their columns begin with "
+        "power, names of classes and layers, tags and covariates as they were given (their columns begin with "
         "the table's name), codes, roles and the numbers of findings that the catalogue calls public, the sha256 of each log, and what "
         "name, description and creator say"
     )
@@ -319,14 +317,6 @@ class DatasetCard:
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""
-
-    @property
-    def attributions(self) -> tuple[str, ...]:
-        """The licences of open data in its maps, each with the layers that contain such data."""
-        layers: dict[str, dict[str, None]] = {}
-        for origin in (raster for source in self.maps for raster in source.origins):
-            layers.setdefault(origin.licence, {})[origin.layer] = None
-        return tuple(f"{', '.join(names)}: {licence}" for licence, names in layers.items())
 
     @property
     def findings_by_run(self) -> dict[str, tuple[Finding, ...]]:

@@ -100,7 +100,7 @@ class AddMapOptions:
 
     name: str = required(Option(is_argument=True))
     _: KW_ONLY
-    height: Files | None = option(None, _raster("Height raster, metres; required unless --stac gives one."))
+    height: Files | None = option(None, _raster("Height raster, metres; required."))
     ortho: Files | None = option(None, _raster("Orthophoto, grey or RGB."))
     terrain: Files | None = option(
         None, _raster("Terrain classes: one integer band, or GeoJSON polygons with a property 'class'.")
@@ -132,21 +132,6 @@ class AddMapOptions:
     ortho_bands: Literal["grey", "rgb"] = option(
         "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
     )
-    stac: str | None = option(
-        None,
-        Option(
-            "Catalogue of open data to take rasters from: swisstopo, or a TOML file that describes one.",
-            metavar="NAME|FILE",
-        ),
-    )
-    collections: Sequence[str] = option(
-        (),
-        Option("Collection of the catalogue (default: all); repeatable.", metavar="ID", repeatable=True),
-    )
-    around: Sequence[str] = option(
-        (), Option("Run whose track --stac is to cover; repeatable.", (), "run", "RUN", repeatable=True)
-    )
-    margin_m: float = option(50.0, Option("Ground around the track [m].", ("--margin",), Range(1.0, 5000.0), "M"))
     crs: str | None = option(
         None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
     )

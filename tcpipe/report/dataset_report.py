@@ -297,7 +297,6 @@ def _make_provenance_section(card: DatasetCard) -> Section:
         *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs),
         *(("excluded", str(exclusion)) for exclusion in card.exclusions),
         ("licence", card.licence or "none given"),
-        *(("licence of open data", line) for line in card.attributions),
         ("creator", card.creator or "none given"),
     ]
     text = "The same inputs give the same dataset; dataset.json contains its recipe and the checksum of every file."

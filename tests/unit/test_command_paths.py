@@ -18,8 +18,8 @@ from tcpipe.store import open_store
 
 TEXTS = {
     "name", "robot", "cluster", "map_name", "tags", "sample_id", "scenario", "names", "topics", "crs",
-    "start", "goal", "holdout", "strays", "shard", "min_age_s", "keep", "forget", "drives", "stac",
-    "collections", "around", "adapt", "budget_joule", "layers", "predictor", "reason",
+    "start", "goal", "holdout", "strays", "shard", "min_age_s", "keep", "forget", "drives",
+    "adapt", "budget_joule", "layers", "predictor", "reason",
 }  # fmt: skip
 """Parameters of commands that are text and no path."""
 
