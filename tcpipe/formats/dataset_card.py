@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NotRequired, TypedDict
 
-from tcpipe.balance.correlation import Correlation, Floor
+from tcpipe.cost.repeatability import Floor
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
@@ -193,36 +192,6 @@ class Removal:
     by_slope: tuple[Group, ...] = ()
 
 
-CellRow = TypedDict(  # a dataclass has no field called class
-    "CellRow",
-    {
-        "class": str | None,
-        "class_id": int,
-        "slope": str,
-        "samples": Mapping[str, int],
-        "effective": float | None,
-        "effective_train": float | None,
-        "rare": bool,
-        "offered_m2": NotRequired[float],
-        "speed_mps": NotRequired[str],
-    },
-)
-"""Samples of one class and range of slope, by split, and how many independent ones they are worth; over all speeds what the maps offer."""
-
-
-@dataclass(frozen=True, slots=True)
-class Balance:
-    """What the samples cover, how far neighbours are alike, and how well each label repeats itself."""
-
-    slope_edges_deg: tuple[float, ...]
-    speed_edges_mps: tuple[float, ...]
-    enough_effective: float
-    correlation: Mapping[str, Correlation | None]
-    by_class_and_slope: tuple[CellRow, ...]
-    cells: tuple[CellRow, ...]
-    repeatability: Mapping[str, Floor | None]
-
-
 @dataclass(frozen=True, slots=True)
 class Shard:
     """A Parquet file of patches: where it lies in the dataset, its split and rows."""
@@ -294,7 +263,8 @@ class DatasetCard:
     distance_by_reason_m: Mapping[str, float]
     """Distance breakdown of the runs [m]."""
     removal: Removal
-    balance: Balance
+    repeatability: Mapping[str, Floor | None]
+    """How well each label repeats itself; None where no place was driven twice."""
     runs: tuple[RunSource, ...]
     run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
     """The tags that a run had to carry; None in cards of redacted datasets."""

@@ -4,7 +4,6 @@
 
     dataset.json  croissant.json  README.md  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
-    drive-next.geojson                                       where to drive for what is thin
     excluded.csv                                             ids that a user excluded, why, and whether they were samples
     report-patches/                                          pictures of all patches, after `tcpipe report --patches`
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
@@ -53,7 +52,6 @@ REPORT = "report.html"
 OVERVIEW = "overview.png"
 RELIEF = "relief.png"
 CLASSES = "classes.png"
-DRIVE_NEXT = "drive-next.geojson"
 EXCLUDED = "excluded.csv"
 
 CHUNK_ROWS = 256

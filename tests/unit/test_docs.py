@@ -157,8 +157,8 @@ def _problem(line: str) -> str | None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_and_options_exist(page: Path) -> None:
-    if page.name == "cli.md":
-        pytest.skip("generated from the commands themselves")
+    if page.name in {"cli.md", "CHANGELOG.md"}:
+        pytest.skip("generated from the commands themselves, or of commands of their time")
     assert not [problem for line in _command_lines(page) if (problem := _problem(line))]
 
 

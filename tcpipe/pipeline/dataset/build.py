@@ -24,7 +24,6 @@ from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
     CROISSANT,
-    DRIVE_NEXT,
     EXCLUDED,
     HUB_CARD,
     OVERVIEW,
@@ -39,7 +38,6 @@ from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
-from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import map_table, return_freed_memory, write_parquet_rows, write_pieces
@@ -56,15 +54,20 @@ from tcpipe.pipeline.calls import (
     open_log,
     start_stopwatch,
 )
-from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, make_dataset_card
+from tcpipe.pipeline.dataset.card import (
+    CARD_COLUMNS,
+    PHYSICS_COLUMNS,
+    REPEATABILITY_COLUMNS,
+    VELOCITY_COLUMN,
+    make_dataset_card,
+    measure_repeatability,
+)
 from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     make_redaction,
     redact_card,
     redact_content,
-    redact_features,
     redact_inputs,
 )
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
@@ -337,19 +340,15 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) ->
     ids, compression = figures.column("sample_id"), recipe.dataset.compression
     shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
     _write_overviews(directory, content.sources)
-    balance, drive_next = measure_balance(
-        figures.select(BALANCE_COLUMNS),
+    repeatability = measure_repeatability(
+        figures,
         content.samples.centres_xy_m(),
-        content.sources,
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
-        regions=options.regions,
-        buffer_m=content.split.buffer_m,
     )
-    write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redact_features(drive_next, redaction))
     if content.excluded.num_rows and redaction is None:
         write_csv(content.excluded, directory / EXCLUDED)
-    card = make_dataset_card(figures, options, inputs, content, balance=balance, shards=shards)
+    card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
     card = card if redaction is None else redact_card(card, redaction)
     shutil.rmtree(waiting)
     write_text(directory / HUB_CARD, format_hub_card(card))
@@ -363,7 +362,7 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) ->
 
 def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     """Write the samples; return the columns that card and page are made from, mapped from another file."""
-    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *BALANCE_COLUMNS, *SAMPLE_COLUMNS)))
+    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS)))
 
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces():

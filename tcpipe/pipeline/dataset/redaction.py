@@ -16,7 +16,7 @@ from pyproj import Transformer
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, Redacted, judge_dataset
-from tcpipe.formats.geojson import FeatureCollection, PolygonGeometry
+from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
@@ -254,15 +254,6 @@ def _redact_map(source: MapSource, redaction: Redaction) -> MapSource:
 def _move_polygon(polygon: PolygonGeometry, redaction: Redaction) -> PolygonGeometry:
     move = replace(redaction, gnss_crs="EPSG:4326").placed
     return replace(polygon, coordinates=move_coordinates(polygon.coordinates, move))
-
-
-def redact_features(collection: FeatureCollection, redaction: Redaction) -> FeatureCollection:
-    """Return polygons (WGS84) at public places: whole cells of the maps' plane, since a scale would reveal itself."""
-    redaction = replace(redaction, scale=1.0)
-    features = (
-        replace(feature, geometry=_move_polygon(feature.geometry, redaction)) for feature in collection.features
-    )
-    return replace(collection, features=tuple(features))
 
 
 def move_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any:
