@@ -158,14 +158,13 @@ def _print(exported: Exported, log: str, out: str) -> None:
 @store_option
 @json_option
 @quiet_option
-def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
-    """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map tiles and recipe, and compute it again: exit code 1 if it differs."""
+def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> None:
+    """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map tiles and recipe."""
     from tcpipe.pipeline.explain import explain as run
 
     with show_progress("explain", quiet=quiet):
         found = run(sample_id, dataset=dataset, store=store)
     print_result(found, as_json=as_json)
-    return 1 if found.differences else 0
 
 
 @click.command()
