@@ -60,7 +60,7 @@ class IngestOptions:
     shard: tuple[int, int] | None = option(
         None,
         Option(
-            "Be task I of N of an array job: ingest every N-th log, then those that no other task has begun.",
+            "Be task I of N of an array job: ingest every N-th log.",
             (),
             "shard",
             "I/N",
@@ -77,9 +77,7 @@ class IngestOptions:
         ),
     )
     retry_failed: bool = option(False, Option("Try logs again that failed before."))
-    force: bool = option(
-        False, Option("Ingest all logs again, also those that failed before; with --shard those of its own share.")
-    )
+    force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
     on_found: Callable[[Mapping[str, int]], None] | None = None
     """Called once with the size [byte] of every log by its name."""
     on_result: Callable[[IngestResult], None] | None = None

@@ -43,7 +43,6 @@ from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import map_table, return_freed_memory, write_parquet_rows, write_pieces
 from tcpipe.formats.place import open_place
 from tcpipe.formats.recipe_toml import resolve_recipe
-from tcpipe.formats.run_documents import SPOOL
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import (
     BUILD,
@@ -329,7 +328,7 @@ def _name_remedy(place: Path | str) -> Iterator[None]:
 
 def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
-    waiting, recipe = directory / SPOOL, options.recipe
+    waiting, recipe = directory / "spool", options.recipe
     waiting.mkdir()
     content = gather_content(waiting, inputs, options, jobs)
     redaction = make_redaction(content, inputs, recipe) if options.redact else None
