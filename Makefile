@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock schemas docs pictures release clean
+.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock docs pictures release clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -122,9 +122,6 @@ lock:
 	$(UV_LOCK) pyproject.toml --extra build --extra dev --extra tables --extra cluster --constraint requirements.lock --output-file requirements-dev.lock
 	printf '%s\n' filelock fsspec jinja2 networkx setuptools sympy typing-extensions | \
 	  $(UV_LOCK) - --constraint requirements-dev.lock --output-file requirements-train.lock
-
-schemas: .venv/installed
-	$(BIN)/tcpipe schemas schemas
 
 # The reference from the code, then the site, whose tools have an environment of their own.
 .venv-docs/installed: Makefile

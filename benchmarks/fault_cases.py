@@ -111,48 +111,12 @@ _AT_ONCE = ("--min-age", "0")
 _ARRAY_TASK, _OTHER_TASK = (command("ingest", f"{INPUTS}/logs", *_THERE, "--shard", f"{n}/2") for n in (1, 2))
 
 
-def _copy(store: str, to: str) -> Run:
-    """Return a command that copies the files of a store to a directory or URL."""
-
-    def copy() -> None:
-        from tcpipe.formats.place import open_place
-
-        for file in sorted(path for path in Path(store).rglob("*") if path.is_file()):
-            open_place(to).put(file.relative_to(store).as_posix(), file.read_bytes())
-
-    return _as_command(copy)
-
-
-def _by_submitit(options: Callable[[], dict[str, object]], function: str) -> Run:
-    """Return a command that ingests or builds by jobs of submitit, each a process of its own."""
-
-    def run() -> None:
-        import submitit
-
-        import tcpipe
-
-        executor = submitit.LocalExecutor("../jobs")
-        result = getattr(tcpipe, function)(**options(), cluster=executor)
-        if result.exit_code:
-            raise SystemExit(result.exit_code)
-
-    return _as_command(run)
-
-
-_STORE_THERE = _copy(f"{INPUTS}/store", f"{URL}/store")
-_BUILD_ALL_THERE = command("build-dataset", f"{URL}/dataset", *_THERE, "--split", f"{INPUTS}/region.geojson")
-_INGEST_BY_JOBS = _by_submitit(lambda: {"logs": [LOG], "store": f"{URL}/store"}, "ingest")
-_BUILD_BY_JOBS = _by_submitit(
-    lambda: {"out": f"{URL}/dataset", "store": f"{URL}/store", "split": f"{INPUTS}/region.geojson"}, "build_dataset"
-)
-
 CASES = (
     Case("a file", _file("one", "1")),
     Case("a file over another", _file("one", "1"), (_file("one", "0"),)),
     Case("a directory", _directory("dataset", one="1")),
     Case("a directory over another", _directory("dataset", one="1", two="2"), (_directory("dataset", one="0"),)),
     Case("init", command("init")),
-    Case("schemas", command("schemas", "schemas")),
     Case("simulate", command("simulate", "site", "--scenario", "tiny"), wants=_LOG),
     Case("export", command("export", LOG, "table"), wants=_LOG),
     Case("ingest", _RUN, wants=_LOG),
@@ -170,11 +134,7 @@ CASES = (
     Case("prune there", command(*_PRUNE_THERE, *_AT_ONCE), (_OTHER_THERE, _RUN_THERE), _LOG, URL),
     Case("ingest --shard 1/2 there", _ARRAY_TASK, wants=_LOG, url=URL, extra_features=_OTHER_TASK, partner=_OTHER_TASK),
     Case("ingest on a cluster", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL),
-    Case("build-dataset on a cluster", _BUILD_THERE, wants=_WORLD | _CLUSTER, url=URL),
     Case("ingest on Dask workers", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL, has_workers=True),
-    Case("build-dataset on Dask workers", _BUILD_ALL_THERE, (_STORE_THERE,), _WORLD | _CLUSTER, URL, has_workers=True),
-    Case("ingest by jobs", _INGEST_BY_JOBS, wants=_LOG, url=URL, has_workers=True),
-    Case("build-dataset by jobs", _BUILD_BY_JOBS, (_STORE_THERE,), _WORLD, URL, has_workers=True),
     Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
     Case("ingest --jobs 2", command("ingest", f"{INPUTS}/logs", "--jobs", "2", "--quiet"), wants=_LOG),
     Case("acknowledge", command("acknowledge", CUT), (command("ingest", CUT, "--quiet"),), _LOG),

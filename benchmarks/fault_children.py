@@ -48,7 +48,6 @@ UNFINISHED = (
     ".*.partial",
     "*.checkpoint",
     "tmp/tcpipe-*",
-    "there/*/spool",
 )
 """What a killed call may leave for the next one: temporaries, where a cost map and a training stand."""
 

@@ -1,4 +1,4 @@
-"""Independent tasks side by side, in this process, local processes or an executor; a worker that dies costs only its own task.
+"""Independent tasks side by side, in this process, local processes or on a cluster; a worker that dies costs only its own task.
 
 This process logs what its workers log. Local workers end with it, and at once when it is interrupted; a cluster's finish their tasks.
 The home of dask.
@@ -14,14 +14,14 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, field
 from itertools import chain, islice
 from multiprocessing.connection import Connection
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar, cast
 
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, UsageError, clean_line
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
 
 logger = logging.getLogger("tcpipe")
 
@@ -41,26 +40,6 @@ Said: TypeAlias = tuple[Any, ...]
 
 _LONGEST_SAYING_BYTES = 3000
 """Less than what a pipe takes in one piece: nothing is cut or mixed, whoever dies."""
-
-
-class Job(Protocol[R_co]):
-    """What an executor was handed: a `concurrent.futures.Future`, or a job of submitit."""
-
-    def done(self) -> bool:
-        """Return whether it has ended."""
-
-    def result(self) -> R_co:
-        """Return its result when it has ended."""
-
-    def cancel(self) -> bool | None:
-        """Let it not begin."""
-
-
-class Executor(Protocol):
-    """Every `concurrent.futures.Executor`, Dask's (`Client.get_executor`) among them, and submitit's for Slurm."""
-
-    def submit(self, fn: Callable[..., R], /, *args: Any) -> Job[R]:
-        """Let a worker call a function; both are pickled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,16 +61,15 @@ def unwrap_result(outcome: Outcome[R | TcpipeError]) -> R:
 
 
 def run_all(
-    function: Callable[[T], R], tasks: Iterable[T], *, jobs: int, cluster: str | Executor | None = None
+    function: Callable[[T], R], tasks: Iterable[T], *, jobs: int, cluster: str | None = None
 ) -> Generator[Outcome[R]]:
     """Yield the outcome of ``function(task)`` for every task, as each ends; a task is asked for when a worker can have it.
 
     ``function`` and tasks are picklable (workers are spawned); ``function`` returns its errors rather than raising them.
     Use it within ``contextlib.closing``: workers end when the iterator is closed.
 
-    With ``cluster``, the address of a Dask scheduler or an executor, its workers do it instead of ``jobs`` processes. They see the same
-    files under the same names. `UsageError`: there is no such scheduler, it has no workers, or one of them has several
-    threads or another tcpipe.
+    With ``cluster``, the address of a Dask scheduler, its workers do it instead of ``jobs`` processes. They see the same files under the
+    same names. `UsageError`: there is no such scheduler, it has no workers, or one of them has several threads or another tcpipe.
     """
     todo = enumerate(tasks)
     first = list(islice(todo, 1 + (jobs > 1)))
@@ -213,85 +191,61 @@ _ALONE_S = 300
 _ADDRESS = re.compile(r"(tcp|tls)://[^/@]+:\d+")
 _AHEAD = 2
 """Tasks that a worker is handed at once: the next waits beside it."""
-_MOST_SUBMITTED = 256
-"""Tasks that an executor of unknown size has at once."""
-_POLL_S = 0.5
 
 
 @dataclass(slots=True)
 class _Workers:
-    """An executor, what it is called, and how many tasks it is handed at once; ``client``: of Dask, which waits without workers."""
+    """The workers of a Dask scheduler, its address, and how many tasks they are handed at once."""
 
-    executor: Executor
-    name: str
-    at_once: int = _MOST_SUBMITTED
-    client: Client | None = None
+    client: Client
+    address: str
+    at_once: int
     alone_s: float = 0.0
 
-    def submit(self, function: Callable[[T], R], task: T, caller: _Caller) -> Job[_Answer[R]]:
-        """Hand a task to the executor; `TcpipeError` where it takes none."""
-        try:
-            return self.executor.submit(_run_on_worker, function, task, caller)
-        except BrokenExecutor as error:  # as of the tasks that it has
-            job = Future[_Answer[R]]()
-            job.set_exception(error)
-            return job
-        except RuntimeError as error:
-            raise TcpipeError(f"{self.name}: takes no tasks ({error})") from None
+    def wait_for_first(self, running: Iterable[Future[R]]) -> set[Future[R]]:
+        """Return the tasks that have ended, when the first has; `TcpipeError` where all workers stay away."""
+        while not (ended := wait(running, timeout=_ANSWER_S, return_when=FIRST_COMPLETED).done):
+            self._check_workers()
+        return ended
 
-    def wait_for_first(self, running: Iterable[Job[R]]) -> list[Job[R]]:
-        """Return the tasks that have ended, when the first has; `TcpipeError` where all workers of a cluster stay away."""
-        futures = [job for job in running if isinstance(job, Future)]
-        while True:
-            if futures:
-                ended: list[Job[R]] = [*wait(futures, timeout=_ANSWER_S, return_when=FIRST_COMPLETED).done]
-            else:
-                time.sleep(_POLL_S)
-                ended = [job for job in running if job.done()]
-            if ended:
-                return ended
-            if self.client is not None:
-                self._check_workers(self.client)
-
-    def _check_workers(self, client: Client) -> None:
-        if client.nthreads():
+    def _check_workers(self) -> None:
+        if self.client.nthreads():
             self.alone_s = 0.0
         elif self.alone_s >= _ALONE_S:
             raise TcpipeError(
-                f"{self.name}: had no workers for {_ALONE_S} s; start workers and run the same command again"
+                f"{self.address}: had no workers for {_ALONE_S} s; start workers and run the same command again"
             )
         else:
             if not self.alone_s:
                 logger.warning(
-                    "%s: lost all its workers; waiting for one (dask worker ADDRESS --nthreads 1)", self.name
+                    "%s: lost all its workers; waiting for one (dask worker ADDRESS --nthreads 1)", self.address
                 )
             self.alone_s += _ANSWER_S
 
 
-def _run_elsewhere(
-    function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: str | Executor
-) -> Generator[Outcome[R]]:
-    """Run tasks by an executor; Dask's runs that of a killed worker again on another, three times."""
-    running = dict[Job[_Answer[R]], int]()
-    with _open_workers(cluster) as workers:
-        caller = _Caller((os.uname().nodename, os.getpid()), logger.getEffectiveLevel(), __version__)
+def _run_elsewhere(function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: str) -> Generator[Outcome[R]]:
+    """Run tasks on a cluster, which runs that of a killed worker again on another, three times."""
+    running = dict[Future[_Answer[R]], int]()
+    with _connect_client(cluster) as client:
+        workers, executor = _Workers(client, cluster, _AHEAD * _count_workers(client, cluster)), client.get_executor()
+        level = logger.getEffectiveLevel()
         try:
             while True:
                 for index, task in islice(todo, workers.at_once - len(running)):
-                    running[workers.submit(function, task, caller)] = index
+                    running[executor.submit(_run_on_worker, function, task, level, __version__)] = index
                 if not running:
                     return
-                for job in workers.wait_for_first(running):
-                    yield _get_outcome(job, running.pop(job), workers.name)
+                for future in workers.wait_for_first(running):
+                    yield _get_outcome(future, running.pop(future), cluster)
         finally:
-            for job in running:  # what has not begun does not begin any more
-                job.cancel()
+            for future in running:  # what has not begun does not begin any more
+                future.cancel()
 
 
-def _get_outcome(job: Job[_Answer[R]], index: int, name: str) -> Outcome[R]:
+def _get_outcome(future: Future[_Answer[R]], index: int, name: str) -> Outcome[R]:
     """Return what became of a task, after saying what it logged; `UsageError` where workers are not as they have to be."""
     try:
-        answer = job.result()
+        answer = future.result()
     except (TcpipeError, CancelledError):
         raise
     except ModuleNotFoundError as error:
@@ -306,21 +260,6 @@ def _get_outcome(job: Job[_Answer[R]], index: int, name: str) -> Outcome[R]:
         logger.log(*said)
     _spent["cpu_s"] += answer.cpu_s
     return Outcome(index, answer.result)
-
-
-@contextmanager
-def _open_workers(cluster: str | Executor) -> Iterator[_Workers]:
-    """Yield the workers of a scheduler's address or of an executor, which is left open; what is wrong with them is one line."""
-    if isinstance(cluster, str):
-        with _connect_client(cluster) as client:
-            yield _Workers(client.get_executor(), cluster, _AHEAD * _count_workers(client, cluster), client)
-        return
-    name, client = f"executor {type(cluster).__name__}", getattr(cluster, "_client", None)
-    if client is not None:  # Dask's
-        name = client.scheduler.address
-    with _convert_stop(name):
-        at_once = _MOST_SUBMITTED if client is None else _AHEAD * _count_workers(client, name)
-        yield _Workers(cluster, name, at_once, client)
 
 
 @contextmanager
@@ -386,15 +325,6 @@ def _make_cluster_error(worker: str, version: str, *, wanted: str) -> UsageError
 
 
 @dataclass(frozen=True, slots=True)
-class _Caller:
-    """Whose task it is: its process and version, and from which level on it forwards what is logged."""
-
-    process: tuple[str, int]
-    level: int
-    version: str
-
-
-@dataclass(frozen=True, slots=True)
 class _Answer(Generic[R]):
     """What a task gave, the CPU seconds that it took, and what it logged."""
 
@@ -403,15 +333,13 @@ class _Answer(Generic[R]):
     said: list[Said] = field(default_factory=list)
 
 
-def _run_on_worker(function: Callable[[T], R], task: T, caller: _Caller) -> _Answer[R]:
-    """Run a task on a worker, and forward what it logs; a thread of the caller's process logs there itself."""
-    if caller.version != __version__:
-        raise _make_cluster_error(os.uname().nodename, __version__, wanted=caller.version)
-    if caller.process == (os.uname().nodename, os.getpid()):
-        return _Answer(function(task))
+def _run_on_worker(function: Callable[[T], R], task: T, level: int, version: str) -> _Answer[R]:
+    """Run a task on a worker, which has to be of the caller's version, and forward what it logs from a level on."""
+    if version != __version__:
+        raise _make_cluster_error(os.uname().nodename, __version__, wanted=version)
     said, began_s, before = list[Said](), time.process_time(), (logger.handlers, logger.level)
-    logger.handlers = [_LogForwarder(said.append)]  # a forked process has the caller's
-    logger.setLevel(caller.level)
+    logger.handlers = [_LogForwarder(said.append)]
+    logger.setLevel(level)
     try:
         result = function(task)
     finally:

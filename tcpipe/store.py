@@ -12,7 +12,6 @@
       runs/<run_id>/streams/<digest>/<role>.parquet
       runs/<run_id>/<recipe_id>/manifest-<n>.json   what became of it; files and checksums of the tables
       runs/<run_id>/<recipe_id>/<digest>/           track.parquet, segments.parquet, rejections.parquet
-      spool/                                        what calls that run share: pixels on their way into a dataset, claims on logs
       index/                                        runs.parquet: all runs as a table for other tools, made again at will
 
 Of numbered documents the highest holds. A ``<digest>`` names the content of what lies in it.

@@ -52,10 +52,9 @@ _COMMANDS = {
     "report": ("dataset_commands", "Write the HTML page of a run, dataset or store"),
     "overlay": ("log_commands", "Write a run as MCAP, to view with its log"),
     "export": ("dataset_commands", "Export topics as Parquet"),
-    "explain": ("dataset_commands", "Trace a sample to its log and compute it again"),
+    "explain": ("dataset_commands", "Trace a sample to its log"),
     "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
     "diff": ("dataset_commands", "List the differences of two datasets, by cause"),
-    "schemas": ("site_commands", "Write the JSON Schemas of tables and documents"),
     "simulate": ("site_commands", "Write a simulated site with its true values"),
 }
 """The module and the purpose of each command, in the order a user meets them; the command NAME-X is the function NAME_X there."""

@@ -14,7 +14,6 @@ from tcpipe.cli.options import (
     SEALED,
     add_options,
     add_path_or_store,
-    dry_run_option,
     json_option,
     msgdef_option,
     quiet_option,
@@ -38,23 +37,20 @@ if TYPE_CHECKING:
 @click.command("add-map")
 @add_options(AddMapOptions)
 @click.argument("strays", nargs=-1, metavar="")
-@dry_run_option
 @json_option
 @quiet_option
-def add_map(options: AddMapOptions, *, strays: tuple[str, ...], dry_run: bool, as_json: bool, quiet: bool) -> None:
+def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, quiet: bool) -> None:
     """Put rasters on one common grid and add them to the store as map NAME; their grids, resolutions and CRS may differ.
 
     A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. For a raster of many tiles, give a pattern in quotes, --height 'dem/*.tif', or
     repeat the option; where tiles overlap, tcpipe uses the last one.
-
-    With --stac tcpipe takes the newest rasters of a catalogue of open data around tracks; --dry-run lists them, with licence and bytes.
     """
-    from tcpipe.pipeline.maps import plan_open_data, run_add_map
+    from tcpipe.pipeline.maps import run_add_map
 
     if strays:
         raise UsageError(f"{strays[0]}: belongs to no option; quote patterns, as in --height 'dem/*.tif'")
     with show_progress(f"map {options.name}", quiet=quiet):
-        added = plan_open_data(options) if dry_run else run_add_map(options)
+        added = run_add_map(options)
     print_result(added, as_json=as_json)
 
 
@@ -162,14 +158,13 @@ def _print(exported: Exported, log: str, out: str) -> None:
 @store_option
 @json_option
 @quiet_option
-def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
-    """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map tiles and recipe, and compute it again: exit code 1 if it differs."""
+def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> None:
+    """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map tiles and recipe."""
     from tcpipe.pipeline.explain import explain as run
 
     with show_progress("explain", quiet=quiet):
         found = run(sample_id, dataset=dataset, store=store)
     print_result(found, as_json=as_json)
-    return 1 if found.differences else 0
 
 
 @click.command()

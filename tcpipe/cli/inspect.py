@@ -135,8 +135,6 @@ def _print_clocks(log: InspectedLog) -> None:
 
 
 def _print_map(found: InspectedMap) -> None:
-    from tcpipe.formats.maps.map_facts import origin_lines
-
     size = " x ".join(f"{pixels * found.pixel_size_m:.1f} m" for pixels in (found.cols, found.rows))
     print_line(f"{found.path}: {size} at {found.pixel_size_m:g} m a pixel in {found.crs}")
     print_line("")
@@ -144,8 +142,6 @@ def _print_map(found: InspectedMap) -> None:
     _print_table(["layer", "made from", "covered"], rows)
     print_line("")
     print_line(f"height: {found.height_min_m:.1f} m to {found.height_max_m:.1f} m")
-    for line in origin_lines(found.origins):
-        print_line(line)
     share = found.class_share
     classes = [
         [str(entry.id), entry.name, "yes" if entry.traversable else "no", f"{share.get(entry.name, 0.0):.1%}"]

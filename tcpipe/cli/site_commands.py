@@ -1,4 +1,4 @@
-"""Commands that need no data: the demo, simulated sites, a recipe, the schemas."""
+"""Commands that need no data: the demo, simulated sites, a recipe."""
 
 from __future__ import annotations
 
@@ -96,23 +96,6 @@ def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) 
             print_line(f"nothing to do: {out} already contains the site")
 
 
-@click.command()
-@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
-def schemas(out: str) -> None:
-    """Write the JSON Schema of every table, document and --json answer, and of the recipe, one file each, to OUT."""
-    from tcpipe.formats.atomic import clear, write_text
-    from tcpipe.formats.contracts import make_contracts
-
-    clear(Path(out))
-    wanted = {Path(out) / name: text for name, text in make_contracts(json_output_types()).items()}
-    missing = {path: text for path, text in wanted.items() if not path.is_file() or path.read_bytes() != text.encode()}
-    for path, text in missing.items():
-        write_text(path, text)
-    print_line(
-        f"wrote {len(missing)} schemas to {out}" if missing else f"nothing to do: {len(wanted)} schemas are in {out}"
-    )
-
-
 _ANSWERS = {
     "model": "learning.model_card.ModelCard",
     "cost-map": "planning.cost_map.CostMapCard",
@@ -122,7 +105,6 @@ _ANSWERS = {
     "reproduction": "experiment.reproduction.ReproductionSummary",
     "acknowledge.answer": "pipeline.problems.Acknowledged",
     "add-map.answer": "pipeline.maps.AddedMap",
-    "add-map-plan.answer": "pipeline.maps.MapPlan",
     "audit.answer": "pipeline.audit.Audit",
     "build-dataset.answer": "pipeline.dataset.build.BuildResult",
     "cost-map.answer": "planning.cost_map.CostMapResult",

@@ -1,4 +1,4 @@
-"""The contracts of tables and recipe as JSON Schema texts: what ``tcpipe schemas`` writes and schemas/ holds."""
+"""The contracts of tables and recipe as JSON Schema texts: what schemas/ holds."""
 
 from __future__ import annotations
 

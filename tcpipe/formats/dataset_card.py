@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NotRequired, TypedDict
 
-from tcpipe.balance.correlation import Correlation, Floor
+from tcpipe.cost.repeatability import Floor
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
-from tcpipe.formats.maps.map_facts import Description, MapInputs, RasterOrigin
+from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
@@ -174,8 +173,6 @@ class MapSource:
     """By layer, of a user's own categorical ones."""
     classes_from: str | None = None
     inputs: MapInputs | None = None
-    origins: tuple[RasterOrigin, ...] = field(default=(), metadata=LEFT_OUT)
-    """Of rasters that were taken from open data; of a redacted dataset layers and licences alone."""
     findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
     """Of building it."""
     registration: tuple[MapRegistration, ...] = ()
@@ -193,36 +190,6 @@ class Removal:
 
     by_class: tuple[Group, ...] = ()
     by_slope: tuple[Group, ...] = ()
-
-
-CellRow = TypedDict(  # a dataclass has no field called class
-    "CellRow",
-    {
-        "class": str | None,
-        "class_id": int,
-        "slope": str,
-        "samples": Mapping[str, int],
-        "effective": float | None,
-        "effective_train": float | None,
-        "rare": bool,
-        "offered_m2": NotRequired[float],
-        "speed_mps": NotRequired[str],
-    },
-)
-"""Samples of one class and range of slope, by split, and how many independent ones they are worth; over all speeds what the maps offer."""
-
-
-@dataclass(frozen=True, slots=True)
-class Balance:
-    """What the samples cover, how far neighbours are alike, and how well each label repeats itself."""
-
-    slope_edges_deg: tuple[float, ...]
-    speed_edges_mps: tuple[float, ...]
-    enough_effective: float
-    correlation: Mapping[str, Correlation | None]
-    by_class_and_slope: tuple[CellRow, ...]
-    cells: tuple[CellRow, ...]
-    repeatability: Mapping[str, Floor | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +216,7 @@ class Redacted:
     )
     not_hidden: str = (
         "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
-        "power, names of classes and layers, licences of open data, tags and covariates as they were given (their columns begin with "
+        "power, names of classes and layers, tags and covariates as they were given (their columns begin with "
         "the table's name), codes, roles and the numbers of findings that the catalogue calls public, the sha256 of each log, and what "
         "name, description and creator say"
     )
@@ -296,7 +263,8 @@ class DatasetCard:
     distance_by_reason_m: Mapping[str, float]
     """Distance breakdown of the runs [m]."""
     removal: Removal
-    balance: Balance
+    repeatability: Mapping[str, Floor | None]
+    """How well each label repeats itself; None where no place was driven twice."""
     runs: tuple[RunSource, ...]
     run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
     """The tags that a run had to carry; None in cards of redacted datasets."""
@@ -319,14 +287,6 @@ class DatasetCard:
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""
-
-    @property
-    def attributions(self) -> tuple[str, ...]:
-        """The licences of open data in its maps, each with the layers that contain such data."""
-        layers: dict[str, dict[str, None]] = {}
-        for origin in (raster for source in self.maps for raster in source.origins):
-            layers.setdefault(origin.licence, {})[origin.layer] = None
-        return tuple(f"{', '.join(names)}: {licence}" for licence, names in layers.items())
 
     @property
     def findings_by_run(self) -> dict[str, tuple[Finding, ...]]:

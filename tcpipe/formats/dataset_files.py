@@ -4,7 +4,6 @@
 
     dataset.json  croissant.json  README.md  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
-    drive-next.geojson                                       where to drive for what is thin
     excluded.csv                                             ids that a user excluded, why, and whether they were samples
     report-patches/                                          pictures of all patches, after `tcpipe report --patches`
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
@@ -53,7 +52,6 @@ REPORT = "report.html"
 OVERVIEW = "overview.png"
 RELIEF = "relief.png"
 CLASSES = "classes.png"
-DRIVE_NEXT = "drive-next.geojson"
 EXCLUDED = "excluded.csv"
 
 CHUNK_ROWS = 256
@@ -104,7 +102,7 @@ class Pixels:
 
 @dataclass(frozen=True, slots=True)
 class ZarrShardWriter:
-    """A shard of every layer, to be written by whoever sees where the patches wait, and ``out``."""
+    """A shard of every layer."""
 
     out: Place
     pixels: Pixels
@@ -113,30 +111,29 @@ class ZarrShardWriter:
     threads: int
 
     def write(self) -> None:
-        """Write what is not there yet."""
+        """Write it."""
         for layer, array in self.arrays.items():
             name = f"{PATCHES}/{layer}/{array.shard_name((self.number, *(0 for _ in array.shape[1:])))}"
-            if self.out.size(name) is None:
-                patches = self.pixels.read(layer, self.pixels.slots)
-                self.out.put(name, array.encoded_shard(patches, threads=self.threads))
+            patches = self.pixels.read(layer, self.pixels.slots)
+            self.out.put(name, array.encoded_shard(patches, threads=self.threads))
 
 
 @dataclass(frozen=True, slots=True)
 class ParquetShardWriter:
-    """A Parquet shard, as `ZarrShardWriter`; ``rows`` gives its rows of the samples table."""
+    """A Parquet shard of some rows; ``samples`` gives rows of the samples table."""
 
     out: Place
     pixels: Pixels
-    rows: Callable[[], pa.Table]
+    samples: Callable[[NDArray[np.int64]], pa.Table]
+    rows: NDArray[np.int64]
     shard: Shard
 
     def write(self) -> None:
-        """Write it, unless it is there."""
-        if self.out.size(self.shard.path) is None:
-            table = self.rows()
-            for layer in self.pixels.layers.values():
-                table = table.append_column(*_list_column(layer, self.pixels.read(layer.name, self.pixels.slots)))
-            self.out.put(self.shard.path, write_parquet_bytes(table, rows_per_group=GROUP_ROWS))
+        """Write it."""
+        table = self.samples(self.rows)
+        for layer in self.pixels.layers.values():
+            table = table.append_column(*_list_column(layer, self.pixels.read(layer.name, self.pixels.slots)))
+        self.out.put(self.shard.path, write_parquet_bytes(table, rows_per_group=GROUP_ROWS))
 
 
 Drawer = ZarrShardWriter | ParquetShardWriter
@@ -144,14 +141,13 @@ Drawer = ZarrShardWriter | ParquetShardWriter
 
 def make_zarr_writers(
     directory: Path,
-    out: Place,
     pixels: Pixels,
     sample_ids: pa.ChunkedArray,
     *,
     compression: Compression,
     threads: int,
 ) -> list[Drawer]:
-    """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written to ``out``.
+    """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written.
 
     ``threads`` does not change the bytes.
     """
@@ -192,7 +188,9 @@ def make_zarr_writers(
     consolidate_metadata(group)
     arrays = {name: _open_layer_array(directory, layer, n, px) for name, layer in pixels.layers.items()}
     rows = (slice(first, first + shard) for first in range(0, n, shard))
-    return [ZarrShardWriter(out, pixels.of(part), arrays, number, threads) for number, part in enumerate(rows)]
+    return [
+        ZarrShardWriter(Place(directory), pixels.of(part), arrays, number, threads) for number, part in enumerate(rows)
+    ]
 
 
 def _choose_shard_rows(samples: int) -> int:
@@ -217,11 +215,11 @@ def _open_layer_array(
 
 
 def make_parquet_writers(
-    out: Place, pixels: Pixels, samples: Callable[[NDArray[np.int64]], Callable[[], pa.Table]], split: NDArray[np.str_]
+    out: Place, pixels: Pixels, samples: Callable[[NDArray[np.int64]], pa.Table], split: NDArray[np.str_]
 ) -> list[Drawer]:
     """Return ``data/<split>-*.parquet``, to be written to ``out``: the columns of the samples and each layer as a plain fixed-size list.
 
-    ``samples`` gives, for some rows, what gives these rows of the samples table.
+    ``samples`` gives rows of the samples table.
     """
     drawers = list[Drawer]()
     for name in SPLITS:
@@ -230,7 +228,7 @@ def make_parquet_writers(
         for number in range(count):
             part = here[number * SHARD_ROWS : (number + 1) * SHARD_ROWS]
             shard = Shard(f"{SHARDS}/{name}-{number:05d}-of-{count:05d}.parquet", name, len(part))
-            drawers.append(ParquetShardWriter(out, pixels.of(part), samples(part), shard))
+            drawers.append(ParquetShardWriter(out, pixels.of(part), samples, part, shard))
     return drawers
 
 

@@ -105,7 +105,6 @@ def _iterate_lines(card: DatasetCard) -> Iterator[str]:
         "",
         f"Licence: {_escape_markdown(card.licence) or 'not stated; ask before you use it'}.",
         "",
-        *(f"Open data in the layers {_escape_markdown(line)}\n" for line in card.attributions),
     )
     yield from ("```bibtex", *_format_bibtex(card), "```", "")
     yield f"Made with tcpipe {card.tcpipe_version}, data model {card.data_model_version}. `tcpipe verify` checks every file."
@@ -197,7 +196,6 @@ def format_croissant(card: DatasetCard, samples: pa.Schema, files: Mapping[str, 
         "description": card.description,
         "license": card.licence,
         "creator": {"@type": "sc:Person", "name": card.creator} if card.creator else None,
-        "creditText": "; ".join(card.attributions),
         "version": _format_version(card),
         "distribution": [*(_describe_file_object(path, files[path]) for path in sorted(files)), *sets],
         "recordSet": records,

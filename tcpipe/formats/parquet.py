@@ -347,17 +347,3 @@ def return_freed_memory() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
         library.malloc_trim(0)
-
-
-def write_table_bytes(table: pa.Table) -> bytes:
-    """Return a table as bytes, schema and all; `read_table_bytes` is the way back."""
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, table.schema) as writer:
-        writer.write_table(table)
-    return bytes(sink.getvalue())
-
-
-def read_table_bytes(data: bytes) -> pa.Table:
-    """Return the table in bytes of `write_table_bytes`."""
-    with pa.ipc.open_stream(data) as reader:
-        return reader.read_all()

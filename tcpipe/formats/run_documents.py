@@ -235,8 +235,6 @@ def name_folder(checksums: Mapping[str, Checksum]) -> str:
 MARK = "store.json"
 """Is written first where a store is new."""
 COPY_MARK = f"copy it from any store of data model {DATA_MODEL_VERSION}: it is the same in all of them"
-SPOOL = "spool"
-"""Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store, and claims; they go in the end."""
 
 
 def is_unmarked_store(place: Place) -> bool:
@@ -275,7 +273,7 @@ def mark_store(place: Place, *, found: bool = False) -> None:
 
 @contextmanager
 def remove_if_empty(place: str | Path) -> Iterator[None]:
-    """Remove what was made for a store on this machine when no run or map came into it and no other task is at it, failures too."""
+    """Remove what was made for a store on this machine when no run or map came into it, failures too."""
     if is_url(place):
         yield
         return
@@ -284,9 +282,7 @@ def remove_if_empty(place: str | Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if made and not any(
-            path for pattern in ("runs/*", "maps/*-*.json", f"{SPOOL}/*/*") for path in store.glob(pattern)
-        ):
+        if made and not any(path for pattern in ("runs/*", "maps/*-*.json") for path in store.glob(pattern)):
             for own in ("log", "index"):
                 shutil.rmtree(store / own, ignore_errors=True)
             (store / MARK).unlink(missing_ok=True)

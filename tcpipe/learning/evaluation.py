@@ -12,8 +12,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.balance.correlation import Floor
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
+from tcpipe.cost.repeatability import Floor
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
@@ -159,7 +159,7 @@ def evaluate(
 def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:
     """Return how well each label repeats itself where ground was driven twice, as the dataset's card has it; None where it was not."""
     columns = {"w": energy.power, "v": card.label.columns[1], "T": "duration_s", "E": energy.energy}
-    found = card.balance.repeatability
+    found = card.repeatability
     return {quantity: found.get(column) for quantity, column in columns.items()}
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias
 
-from tcpipe.balance.correlation import Floor
 from tcpipe.cost.coverage import Coverage
+from tcpipe.cost.repeatability import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors, Ratio

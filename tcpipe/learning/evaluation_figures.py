@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.balance.cells import SLOPE_NAMES, find_slope_ranges
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.batches import Pixels
 from tcpipe.formats.json_files import Json
@@ -37,6 +36,12 @@ _MOST_SHOWN = 20_000
 """Samples of a split that can be clicked: the first ones, in random order."""
 _WORST = 30
 """Of each split, with their patches."""
+_SLOPE_EDGES_DEG = (-15.0, -10.0, -5.0, -2.0, 2.0, 5.0, 10.0, 15.0)
+"""Between the ranges of slope along travel [deg]; the paper's robot climbs 22.5°."""
+_SLOPE_NAMES = (
+    *("below -15°", "-15° to -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°"),
+    *("2° to 5°", "5° to 10°", "10° to 15°", "above 15°"),
+)
 _WHOLE_JOULE = 10.0
 """Error of E from which whole joules suffice, so that nine ranges of slope fit."""
 
@@ -153,7 +158,8 @@ def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any
 def make_slope_section(table: pa.Table) -> Section:
     """Return the RMSE of E by split, class and range of slope, as a heat map."""
     part = table.filter(pc.is_valid(table.column("slope_rad")))
-    off, ranges = compute_errors_joule(part), find_slope_ranges(to_floats(part, "slope_rad"))
+    off = compute_errors_joule(part)
+    ranges = np.searchsorted(np.radians(_SLOPE_EDGES_DEG), to_floats(part, "slope_rad"), side="right")
     energy, low, high = (
         to_floats(part, make_column_name("E", kind)) for kind in ("", "predicted_low", "predicted_high")
     )
@@ -184,7 +190,7 @@ def make_slope_section(table: pa.Table) -> Section:
         "RMSE of E [J], in brackets the number of segments; darker is worse. * and a dashed border: "
         f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them."
     )
-    header = ["split", "class", *(SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]
+    header = ["split", "class", *(_SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]
     rows = [[*line, *(shade((*line, at)) for at in columns)] for line in sorted(lines)]
     return Section("Error by class and slope", text, header=header, rows=rows)
 

@@ -1,4 +1,4 @@
-"""Where a sample came from, down to log, stamps and message ranges; and whether it comes out the same when it is made again."""
+"""Where a sample came from, down to log, stamps and message ranges."""
 
 from __future__ import annotations
 
@@ -11,18 +11,14 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, TcpipeError, clean_lines
+from tcpipe.errors import DatasetError, StoreError, clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard, list_shifts
 from tcpipe.formats.dataset_files import (
     SAMPLES,
-    PatchFiles,
-    find_places_in_files,
     is_shard,
-    open_patches,
     read_exclusion_reason,
     read_intact_card,
     read_samples,
@@ -34,14 +30,12 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_table
 from tcpipe.formats.run_documents import Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.levels import GEOMETRY, PLACED_SEGMENTS, Streams
-from tcpipe.terrain.sampling import Patches
 
 _NEARBY_NS = 5_000_000_000
 """Gates and refusals this long before and after a segment are told [ns]."""
@@ -135,41 +129,33 @@ class History:
     recipe_differs_in: Mapping[str, Setting]
     """The recipe's keys that are not at their default."""
     versions: Versions
-    made_from: Literal["segments", "streams"]
-    """What it was made again from."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A sample's whole history, and what differs when it is made again; ``str`` of it is what the command prints."""
+    """A sample's whole history; ``str`` of it is what the command prints."""
 
     sample_id: str
     facts: History
-    differences: tuple[str, ...]
-    """Empty: the sample was made again bit for bit."""
 
     def __str__(self) -> str:
         """Return the history as plain lines."""
-        return clean_lines(tuple(_iterate_lines(self.sample_id, self.facts, self.differences)))
+        return clean_lines(tuple(_iterate_lines(self.sample_id, self.facts)))
 
 
 def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
-    """Tell where a sample of a dataset came from, and make it again from the store.
+    """Tell where a sample of a dataset came from.
 
     Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data model, or the store no
     longer holds the sample's run.
     """
     opened = open_store(store)
-    directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)
+    directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     card, sample = read_intact_card(directory), _read_sample(directory, sample_id)
     run = _run(opened, directory, card, sample)
     streams = opened.read_streams(run.run_id, key=run.streams_key)
     source = open_map(*opened.map_files(sample["map"]))
-    made = _sample_again(sample, run, streams, source, card)
-    differences = tuple(_iterate_differences(open_patches(directory, card, fetched), card, sample, made))
-    if differences:
-        differences += tuple(_iterate_reasons(card, sample, run, source))
-    return Explained(sample_id, _read_history(opened, card, sample, run, streams=streams, source=source), differences)
+    return Explained(sample_id, _read_history(opened, card, sample, run, streams=streams, source=source))
 
 
 def _read_history(
@@ -190,7 +176,6 @@ def _read_history(
             key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
         },
         versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
-        made_from="segments" if streams is None else "streams",
     )
 
 
@@ -306,80 +291,6 @@ def _sample_segment(segment: Mapping[str, Value], source: MapFile, card: Dataset
     return sample_segments(table, source, card.recipe.sample, gnss_crs=card.recipe.read.gnss_crs, shifts=shifts)
 
 
-def _sample_again(
-    sample: Row, run: RunDirectory, streams: Streams | None, source: MapFile, card: DatasetCard
-) -> tuple[Mapping[str, Value], Patches] | str:
-    """Return the segment and its patch as they come out now, or why they do not.
-
-    From the streams where the store has them: fused, masked, cut and labelled anew; else from the stored segments.
-    """
-    if streams is None:
-        segments = run.segments()
-    else:
-        try:
-            segments = run_stages(streams, card.recipe.ingest, run_id=run.run_id)[2].table
-        except TcpipeError as error:
-            return "; ".join(error.problems)
-    row = pc.index(segments.column("segment_id"), sample["sample_id"]).as_py()
-    if row < 0:
-        away_s = (
-            np.abs(to_integers(segments, "start_ns") - sample["start_ns"]).min(initial=np.iinfo(np.int64).max) / 1e9
-        )
-        near = f"; the nearest begins {away_s:.3f} s away" if segments.num_rows else "; it has none now"
-        return f"no segment of run {run.run_id} begins at this stamp now{near}"
-    segment = segments.slice(row, 1).to_pylist()[0]
-    sampled = _sample_segment(segment, source, card)
-    if len(sampled.kept) == 0:
-        return f"map {source.name} no longer gives a patch for it"
-    return {**segment, "position_std_m": sampled.position_std_m.item()}, sampled.patches
-
-
-def _iterate_differences(
-    files: PatchFiles, card: DatasetCard, sample: Row, made: tuple[Mapping[str, Value], Patches] | str
-) -> Iterator[str]:
-    """Yield a line for each value and each layer that is not, bit for bit, what the dataset holds."""
-    if isinstance(made, str):
-        yield made
-        return
-    segment, patches = made
-    of_segment = {**sample, "quality": sample["quality"] & ~Quality.MAP_CONTRADICTS_TRACK}
-    for name, value in segment.items():
-        if name in of_segment and of_segment[name] != value:
-            yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
-    for name, values in ((name, values) for name, values in patches.columns().items() if name in sample):
-        now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
-        if now != sample[name]:
-            yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"
-    for layer, stored in _read_stored_layers(files, card, sample["row"]).items():
-        pixels = patches.pixels.get(layer)
-        if pixels is None:
-            yield f"{layer}: map {sample['map']} no longer has this layer"
-        elif not np.array_equal(pixels[0], stored, equal_nan=pixels.dtype.kind == "f"):
-            yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
-
-
-def _iterate_reasons(card: DatasetCard, sample: Row, run: RunDirectory, source: MapFile) -> Iterator[str]:
-    """Yield what is not as it was when the dataset was built, which may be why."""
-    versions = {card.tcpipe_version, run.manifest.tcpipe_version, __version__}
-    if len(versions) > 1:
-        yield f"made by tcpipe {', '.join(sorted(versions - {__version__}))}, this is {__version__}"
-    for entry in card.maps:
-        if entry.name == sample["map"] and entry.inputs != source.facts.inputs:
-            yield f"map {source.name} was added again later, from other files"
-    for made_from in card.runs:
-        now = run.checksum("segments.parquet").sha256
-        if made_from.run_id == run.run_id and made_from.segments_sha256 != now:
-            yield f"run {run.run_id} was ingested again later, with other segments"
-
-
-def _read_stored_layers(files: PatchFiles, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
-    """Return the stored layers of the sample in a row of samples.parquet, each of shape (px, px)."""
-    split = read_samples(files.directory, ["split"]).column("split").to_numpy()
-    place = int(find_places_in_files(card, split)[row])
-    piece = int(np.searchsorted(files.starts, place, side="right")) - 1
-    return {name: pixels[place - files.starts[piece]] for name, pixels in files.read(piece, files.layers).items()}
-
-
 def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
     """Return a recipe's values by dotted key; a table whose keys are the user's own is one value."""
     flat: dict[str, Setting] = {}
@@ -391,7 +302,7 @@ def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
 _DEFAULTS = flatten_recipe(Recipe())
 
 
-def _iterate_lines(sample_id: str, facts: History, differences: Sequence[str]) -> Iterator[str]:
+def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
     sample, labels, run, ground = facts.sample, facts.labels, facts.run, facts.map
     fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
     yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"
@@ -422,8 +333,3 @@ def _iterate_lines(sample_id: str, facts: History, differences: Sequence[str]) -
     yield f"recipe   {run.recipe_id}: {changed}"
     versions = facts.versions
     yield f"versions dataset {versions.dataset}, run {run.tcpipe_version}, here {versions.here}; data model {versions.data_model}"
-    if differences:
-        yield f"computed again from the {facts.made_from}: it differs"
-        yield from (f"  {line}" for line in differences)
-    else:
-        yield f"computed again from the {facts.made_from}: identical"

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
-from tcpipe.execution import Executor, run_all
+from tcpipe.execution import run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here
 from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State, Superseded
@@ -37,7 +37,7 @@ from tcpipe.pipeline.calls import (
     stored_bytes,
 )
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_queue import Item, LogQueue, hold_claims, make_tasks
+from tcpipe.pipeline.log_queue import Item, LogQueue, make_tasks
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -101,7 +101,8 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := load_profiles(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with make_scratch_directory() as staging, remove_if_empty(options.store):
+    undo = nullcontext() if shard is not None else remove_if_empty(options.store)  # another task may be at it
+    with make_scratch_directory() as staging, undo:
         found = find_sources(logs := list(options.logs), as_one=options.as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
@@ -109,10 +110,10 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
         log = open_log(opened)
         before = log.state
         given = tuple(make_absolute(path) for path in logs if not is_presigned(path))  # signed URLs are not stored
-        tasks = make_tasks(found.sources, options, opened.root, ruling)
-        own = range(len(tasks)) if shard is None else select_shard(found.sources, shard)
+        own = found.sources if shard is None else [found.sources[at] for at in select_shard(found.sources, shard)]
+        tasks = make_tasks(own, options, opened.root, ruling)
         if options.on_found:
-            sizes = {tasks[at].source.name: tasks[at].source.size_bytes for at in own}
+            sizes = {source.name: source.size_bytes for source in own}
             options.on_found({**dict.fromkeys(map(clean_line, found.problems), 0), **sizes})
         results: dict[int, IngestResult] = {}
 
@@ -124,21 +125,18 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
             return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
         begin = (INGEST, given, (ingest_key(ruling), robot))
-        with nullcontext() if shard is None else hold_claims(opened.place) as claims:
-            broken = find_broken(opened, log.state, [found.sources[at] for at in own])
-            queue = LogQueue(log, tasks, own, broken, claims)
-            summary = tell(chain(_iterate_missing(found), _iterate_finished(log, queue.steps)))
-            if queue.is_done:
-                log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
-            else:
-                opened.check_writable()
-                with commit_call(log, *begin[:2], options=begin[2]) as call:
-                    tell(_iterate_results(log, queue, jobs=options.jobs, cluster=options.cluster))
-                    summary = tell(_iterate_left(log, queue.plan(at for at in own if at not in results)))
-                    call.is_whole = queue.is_done
-                    record = _make_call_record(opened, summary, given, tasks, options.jobs)
-                    call.end = Entries(calls=(measure(record),))
-            queue.remove_expired_claims()
+        queue = LogQueue(log, tasks, find_broken(opened, log.state, own))
+        summary = tell(chain(_iterate_missing(found), _iterate_finished(log, queue.steps)))
+        if queue.is_done:
+            log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
+        else:
+            opened.check_writable()
+            with commit_call(log, *begin[:2], options=begin[2]) as call:
+                tell(_iterate_results(log, queue, jobs=options.jobs, cluster=options.cluster))
+                summary = tell(_iterate_left(log, queue.plan(at for at in range(len(tasks)) if at not in results)))
+                call.is_whole = shard is None
+                record = _make_call_record(opened, summary, given, tasks, options.jobs)
+                call.end = Entries(calls=(measure(record),))
         if log.state.number != before.number and log.state.runs:
             opened.write_index(log.state)
         _warn_of_unmatched_windows(ruling.mask.windows, log.state)
@@ -205,7 +203,7 @@ def _iterate_missing(found: FoundLogs) -> Iterator[tuple[int, IngestResult]]:
 
 
 def _iterate_left(log: LogWriter, steps: Mapping[int, Step]) -> Iterator[tuple[int, IngestResult]]:
-    """Yield the result of each log of this share that another task has ingested or works on."""
+    """Yield the result of each log that another call has ingested meanwhile or works on."""
     yield from _iterate_finished(log, steps)
     for index, step in steps.items():
         if step.is_todo:
@@ -244,7 +242,7 @@ def _iterate_finished(log: LogWriter, steps: Mapping[int, Step]) -> Iterator[tup
 
 
 def _iterate_results(
-    log: LogWriter, queue: LogQueue, *, jobs: int, cluster: str | Executor | None
+    log: LogWriter, queue: LogQueue, *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
     keep_state_here(log.store.place, log.state)
@@ -256,9 +254,9 @@ def _iterate_results(
                 index, task = taken[outcome.index]
                 waiting.append((index, task, outcome.result or Ingested(task.source, make_died_result(task.source))))
                 if time.monotonic() - last_s >= _TOGETHER_S:
-                    yield from _commit(log, queue, waiting, begun)
+                    yield from _commit(log, waiting, begun)
                     waiting, last_s = [], time.monotonic()
-        yield from _commit(log, queue, waiting, begun)
+        yield from _commit(log, waiting, begun)
 
 
 def _take_tasks(turn: Iterable[Item], taken: list[Item]) -> Iterator[IngestTask]:
@@ -268,7 +266,7 @@ def _take_tasks(turn: Iterable[Item], taken: list[Item]) -> Iterator[IngestTask]
 
 
 def _commit(
-    log: LogWriter, queue: LogQueue, ended: Sequence[tuple[int, IngestTask, Ingested]], begun: int
+    log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]], begun: int
 ) -> Iterator[tuple[int, IngestResult]]:
     """Commit what became of logs, and yield it with what the log says of it; a run that cannot be committed has failed for now.
 
@@ -310,7 +308,6 @@ def _commit(
             result = _adopt_committed_run(log.state.runs.get((by, result.run.recipe_id)), by, result, ingested.source)
         elif result.run and ingested.rows and (result.run.run_id, result.run.recipe_id) in pruned:
             result = _fail_for_now(result, f"'tcpipe prune' removed run {result.run.run_id} at the same time")
-        queue.release_claim(index, result)
         yield index, _judge_result(log.state, result, ingested.source, before=before)
 
 

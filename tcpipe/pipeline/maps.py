@@ -1,39 +1,28 @@
-"""Add a map to the store: rasters of one site on one common grid.
-
-Or of a catalogue of open data: the newest rasters that cover the tracks of runs, and only that part of them.
-"""
+"""Add a map to the store: rasters of one site on one common grid."""
 
 from __future__ import annotations
 
 import glob
 import logging
 import os
-import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tcpipe.errors import MapError, StoreError, UsageError, clean_lines, hide_secrets
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import list_raster_files
-from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, RasterOrigin, map_lines, origin_lines
+from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.maps.open_data import Catalogue, choose_newest, find_catalogue, find_items, make_area
-from tcpipe.formats.maps.remote_geotiff import open_window
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.run_documents import remove_if_empty
 from tcpipe.pipeline.options import AddMapOptions, Files
 from tcpipe.report.pictures import draw_quick_look, write_overview
 from tcpipe.store import Store, open_store
-from tcpipe.tables.columns import to_floats
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function
 from tcpipe.terrain.classes import ClassScheme
@@ -74,21 +63,15 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
     store is as it was.
     """
     name, layers, categorical = options.name, options.layers or {}, options.categorical or {}
-    _refuse_layers(layers, categorical, ortho=bool(options.ortho or options.stac), ortho_bands=options.ortho_bands)
+    _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
     given = {role: getattr(options, role) for role in _ROLES}
     tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
     files = _find_files({role: value for role, value in {**given, **layers, **tables}.items() if value})
     bands = None if options.ortho_bands == "grey" else options.ortho_bands
-    with remove_if_empty(options.store), make_scratch_directory() as scratch:
+    if "height" not in files:
+        raise UsageError(f"map {name}: no height raster; give --height FILE")
+    with remove_if_empty(options.store):
         opened = open_store(options.store, create=True)
-        origins: tuple[RasterOrigin, ...] = ()
-        if options.stac is not None:
-            plan, fetched = fetch_open_data(options, opened, scratch)
-            origins, files = plan.origins, {**files, **fetched}
-        if "height" not in files:
-            raise UsageError(
-                f"map {name}: no height raster; give --height FILE, or --stac with a collection of heights"
-            )
         before = opened.map_number(name)
         inputs = MapInputs(_compute_checksums(files), options.crs, tuple(sorted(categorical)), bands)
         more = MoreLayers(
@@ -112,7 +95,6 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
                     agreed=_agree_classes(opened, name),
                     crs=options.crs,
                     inputs=inputs,
-                    origins=origins,
                 )
                 write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
         except StoreError:
@@ -252,109 +234,3 @@ def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
             values = {entry.id: entry.id for entry in found.classes.classes} if own else found.id_by_value
             return ClassScheme(found.classes, values)
     return None
-
-
-_WHOLE_FRACTION = 0.9995
-
-
-@dataclass(frozen=True, slots=True)
-class MapPlan:
-    """What a catalogue of open data gives for a map; ``str`` of it is what ``--dry-run`` prints."""
-
-    kind: Literal["plan"]
-    name: str
-    origins: tuple[RasterOrigin, ...]
-
-    def __str__(self) -> str:
-        """Return the rasters, their licence and what is to be read, as plain lines."""
-        read = sum(origin.to_read_bytes for origin in self.origins) / 1e6
-        return clean_lines((*origin_lines(self.origins), f"{read:.2f} MB to read, less what is in the cache"))
-
-
-def plan_open_data(options: AddMapOptions) -> MapPlan:
-    """Return what `tcpipe.add_map` with these options would take from its catalogue; only heads of rasters are read.
-
-    Raises `UsageError`, `MapError`, `StoreError`: there is no catalogue, no run or no raster, or what there is cannot be used.
-    """
-    if options.stac is None:
-        raise UsageError("--dry-run: says what --stac would take; give --stac, too")
-    return fetch_open_data(options, open_store(options.store), None)[0]
-
-
-def fetch_open_data(
-    options: AddMapOptions, store: Store, directory: Path | None
-) -> tuple[MapPlan, dict[str, list[Path]]]:
-    """Write the windows of the rasters into a directory, if there is one; return what they are, and each layer's files, newest last."""
-    catalogue = find_catalogue(str(options.stac))
-    layers = _choose_collections(options, catalogue)
-    area = make_area([_read_track(store, run_id) for run_id in _list_runs(options)], options.margin_m)
-    client = catalogue.connect()
-    origins: list[RasterOrigin] = []
-    files: dict[str, list[Path]] = {layer: [] for layer in layers}
-    for layer, collection in layers.items():
-        items, covered = choose_newest(find_items(client, catalogue, collection, area), area)
-        if covered < _WHOLE_FRACTION:
-            logger.warning("%s covers %.1f %% of the ground around the tracks", collection, 100.0 * covered)
-        for item in items:
-            with open_window(client, item.url, area, crs=item.crs) as window:
-                if window is None:
-                    continue
-                origins.append(
-                    RasterOrigin(
-                        layer=layer,
-                        url=hide_secrets(item.url),
-                        item=item.id,
-                        date=item.date,
-                        resolution=window.resolution,
-                        vertical_datum=catalogue.collections[collection].vertical_datum,
-                        licence=catalogue.licence,
-                        to_read_bytes=window.to_read_bytes,
-                        version=window.version,
-                        checksum=item.checksum,
-                    )
-                )
-                if directory is not None:
-                    files[layer].append(
-                        directory / f"{len(origins):04d}-{re.sub('[^A-Za-z0-9_.-]', '_', item.id)[:80]}.tif"
-                    )
-                    window.copy(files[layer][-1])
-        if layer not in {origin.layer for origin in origins}:
-            raise MapError(
-                f"{collection}: no raster has a pixel around the tracks, but the catalogue says {len(items)} do"
-            )
-    return MapPlan("plan", options.name, tuple(origins)), files
-
-
-def _choose_collections(options: AddMapOptions, catalogue: Catalogue) -> dict[str, str]:
-    """Return the collection of each layer; `UsageError` where one is unknown, or a layer would come twice."""
-    layers: dict[str, str] = {}
-    for name in options.collections or catalogue.collections:
-        if name not in catalogue.collections:
-            raise UsageError(f"--collections {name}: not in the catalogue's entry ({', '.join(catalogue.collections)})")
-        layer = catalogue.collections[name].layer
-        if layer in layers or getattr(options, layer):
-            other = layers.get(layer, f"--{layer}")
-            raise UsageError(f"--collections: {other} and {name} both give {layer}; name the others with --collections")
-        layers[layer] = name
-    return layers
-
-
-def _list_runs(options: AddMapOptions) -> list[str]:
-    if not options.around:
-        raise UsageError("--stac: name the runs that the map is to cover: --around RUN (tcpipe inspect lists them)")
-    return [options.around] if isinstance(options.around, str) else list(options.around)
-
-
-def _read_track(store: Store, run_id: str) -> NDArray[np.float64]:
-    """Return the positions of a run, shape (N, 2): longitude and latitude [deg]."""
-    runs = store.recipes_of(run_id)
-    if not runs:
-        raise UsageError(
-            f"--around {run_id}: no finished run of that name in {store.root} (tcpipe inspect {store.root} lists them)"
-        )
-    table = runs[-1].table("track", ["lon_deg", "lat_deg"])
-    lonlat = np.stack([to_floats(table, name) for name in ("lon_deg", "lat_deg")], axis=-1)
-    lonlat = lonlat[np.isfinite(lonlat).all(axis=-1)]
-    if not len(lonlat):
-        raise MapError(f"--around {run_id}: its track has no geographic position (no GNSS)")
-    return lonlat

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.tables.options import (
-    CLUSTER,
     DRY_RUN,
     MESSAGE_DEFINITIONS,
     RECIPE,
@@ -23,7 +22,6 @@ from tcpipe.tables.options import (
 )
 
 if TYPE_CHECKING:
-    from tcpipe.execution import Executor
     from tcpipe.formats.dataset_files import FileFormat
     from tcpipe.pipeline.plan import IngestResult
     from tcpipe.recipe import Recipe
@@ -48,17 +46,21 @@ class IngestOptions:
     )
     tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
-    cluster: str | Executor | None = option(None, CLUSTER)
-    """Or, in Python, any executor: a `concurrent.futures.Executor`, Dask's (`Client.get_executor`), submitit's for Slurm.
-
-    Workers see logs and store under the same absolute paths.
-    """
+    cluster: str | None = option(
+        None,
+        Option(
+            "Dask scheduler whose workers ingest the logs, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
+            metavar="ADDRESS",
+            envvar="TCPIPE_CLUSTER",
+        ),
+    )
+    """Workers see logs and store under the same absolute paths."""
     as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
     message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
         None,
         Option(
-            "Be task I of N of an array job: ingest every N-th log, then those that no other task has begun.",
+            "Be task I of N of an array job: ingest every N-th log.",
             (),
             "shard",
             "I/N",
@@ -75,9 +77,7 @@ class IngestOptions:
         ),
     )
     retry_failed: bool = option(False, Option("Try logs again that failed before."))
-    force: bool = option(
-        False, Option("Ingest all logs again, also those that failed before; with --shard those of its own share.")
-    )
+    force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
     on_found: Callable[[Mapping[str, int]], None] | None = None
     """Called once with the size [byte] of every log by its name."""
     on_result: Callable[[IngestResult], None] | None = None
@@ -98,7 +98,7 @@ class AddMapOptions:
 
     name: str = required(Option(is_argument=True))
     _: KW_ONLY
-    height: Files | None = option(None, _raster("Height raster, metres; required unless --stac gives one."))
+    height: Files | None = option(None, _raster("Height raster, metres; required."))
     ortho: Files | None = option(None, _raster("Orthophoto, grey or RGB."))
     terrain: Files | None = option(
         None, _raster("Terrain classes: one integer band, or GeoJSON polygons with a property 'class'.")
@@ -130,21 +130,6 @@ class AddMapOptions:
     ortho_bands: Literal["grey", "rgb"] = option(
         "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
     )
-    stac: str | None = option(
-        None,
-        Option(
-            "Catalogue of open data to take rasters from: swisstopo, or a TOML file that describes one.",
-            metavar="NAME|FILE",
-        ),
-    )
-    collections: Sequence[str] = option(
-        (),
-        Option("Collection of the catalogue (default: all); repeatable.", metavar="ID", repeatable=True),
-    )
-    around: Sequence[str] = option(
-        (), Option("Run whose track --stac is to cover; repeatable.", (), "run", "RUN", repeatable=True)
-    )
-    margin_m: float = option(50.0, Option("Ground around the track [m].", ("--margin",), Range(1.0, 5000.0), "M"))
     crs: str | None = option(
         None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
     )
@@ -175,8 +160,6 @@ class BuildDatasetOptions:
     store: str | Path = option("tcpipe-store", STORE)
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
-    cluster: str | Executor | None = option(None, CLUSTER)
-    """Its workers see the store under the same absolute path or URL."""
     file_format: FileFormat = option("zarr", Option(flags=("--format",), kind=("zarr", "parquet")))
     holdout: str | None = option(
         None,

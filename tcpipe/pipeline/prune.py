@@ -18,7 +18,7 @@ from tcpipe.formats.dataset_files import CARD, REPORT, read_card
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.run_documents import SPOOL, find_highest_numbers, read_sealed_at, split_number
+from tcpipe.formats.run_documents import find_highest_numbers, read_sealed_at, split_number
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.calls import LogWriter, format_bytes
 from tcpipe.recipe import Recipe
@@ -105,10 +105,7 @@ def prune(
     removed += left
     if left and not dry_run:
         clear(Path(opened.root))
-    for what, place, entries, why in (
-        *_iterate_spooled(opened, min_age_s),
-        *_iterate_replaced(opened, log.state, min_age_s, unread, decided),
-    ):
+    for what, place, entries, why in (*_iterate_replaced(opened, log.state, min_age_s, unread, decided),):
         (removed if why is None else kept).extend(
             Leftover(what, place.where(entry.name), entry.size_bytes, why) for entry in entries
         )
@@ -268,16 +265,6 @@ def _iterate_temporaries(store: Store, min_age_s: float) -> Iterator[Path]:
 
 _Unnamed = tuple[str, Place, list[Entry], str | None]
 """Files that no document names: what they are, where they lie, and why they stay, if they do."""
-
-
-def _iterate_spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
-    """Yield what was shared by builds on a cluster and tasks of an array that were killed, if it is old enough."""
-    before_ns = time.time_ns() - int(min_age_s * 1e9)
-    for name in store.place.folders(SPOOL):
-        place = store.place.below(f"{SPOOL}/{name}")
-        entries = place.entries()
-        if all(entry.modified_ns < before_ns for entry in entries):
-            yield "left by a killed call", place, entries, None
 
 
 def _iterate_replaced(

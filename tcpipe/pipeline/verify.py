@@ -24,7 +24,6 @@ from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import (
     COPY_MARK,
     MARK,
-    SPOOL,
     Manifest,
     MapDocument,
     RunJson,
@@ -180,9 +179,7 @@ def _verify_store(store: Store) -> Iterator[CheckResult]:
         elif name != MARK:
             yield _describe_stranger(place, name)
     for name in place.folders():
-        if name == SPOOL:
-            yield f"{place.where(name)}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones"
-        elif name not in (LOG, "maps", "runs", _INDEX) and place.entries(name):
+        if name not in (LOG, "maps", "runs", _INDEX) and place.entries(name):
             yield _describe_stranger(place, name)
     yield from _verify_log(place)
     yield from _verify_maps(store)

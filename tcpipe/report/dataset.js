@@ -50,17 +50,13 @@ page.start(async () => {
   fillKinds("up", ["power", "energy", "velocity"]);
   fillKinds("quantity", numeric);
   page.chooseGround(facts.ground);
-  for (const [id, name] of [["next", "drive next"], ["leaks", "leaks"]]) {
-    const drawn = page.model(name);
-    at(id).onchange = () => {
-      if (name === "leaks") {
-        const held = Array.from(c.nearest.keys()).filter((i) => c.nearest[i] !== i), near = held.map((i) => c.nearest[i]);
-        drawn.data_source.data = { x0: held.map((i) => c.x[i]), y0: held.map((i) => c.y[i]), x1: near.map((i) => c.x[i]), y1: near.map((i) => c.y[i]) };
-      }
-      drawn.visible = at(id).checked;
-    };
-    at(id).disabled = drawn === null || (name === "leaks" && !c.nearest?.some((j, i) => i !== j));
-  }
+  const leaks = page.model("leaks");
+  at("leaks").onchange = () => {
+    const held = Array.from(c.nearest.keys()).filter((i) => c.nearest[i] !== i), near = held.map((i) => c.nearest[i]);
+    leaks.data_source.data = { x0: held.map((i) => c.x[i]), y0: held.map((i) => c.y[i]), x1: near.map((i) => c.x[i]), y1: near.map((i) => c.y[i]) };
+    leaks.visible = at("leaks").checked;
+  };
+  at("leaks").disabled = leaks === null || !c.nearest?.some((j, i) => i !== j);
   const brush = page.model("brush");
   const plotted = () => ({ across: Float64Array.from(c[at("across").value]), up: Float64Array.from(c[at("up").value]) });
   source.data = { x: c.x, y: c.y, fill: coloured("split"), ...plotted() };

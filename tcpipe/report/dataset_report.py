@@ -1,4 +1,4 @@
-"""The page of a dataset: its samples on the map, labels, losses, balance, leakage, and where to drive next."""
+"""The page of a dataset: its samples on the map, labels, losses, repeatability, leakage."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
     find_distinguishing_bits,
-    make_balance_sections,
     make_budget_sections,
     make_physics_sections,
     make_quality_section,
+    make_repeatability_section,
 )
 from tcpipe.report.maps import draw_dataset_map
 from tcpipe.report.page import (
@@ -88,7 +88,6 @@ def render_dataset_report(
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
-    balance, repeatability = make_balance_sections(card.balance)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
     return render_page(
         title=f"Dataset {card.name}",
@@ -114,7 +113,7 @@ def render_dataset_report(
                 plots=[waterfall],
                 parts=_make_removal_sections(card),
             ),
-            replace(balance, parts=[*_make_class_sections(card), repeatability]),
+            replace(make_repeatability_section(card.repeatability), parts=_make_class_sections(card)),
             _make_audit_section(card),
             _make_run_section(card, hrefs),
             _make_provenance_section(card),
@@ -297,7 +296,6 @@ def _make_provenance_section(card: DatasetCard) -> Section:
         *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs),
         *(("excluded", str(exclusion)) for exclusion in card.exclusions),
         ("licence", card.licence or "none given"),
-        *(("licence of open data", line) for line in card.attributions),
         ("creator", card.creator or "none given"),
     ]
     text = "The same inputs give the same dataset; dataset.json contains its recipe and the checksum of every file."

@@ -1,4 +1,4 @@
-"""Sections on labels: losses, quality bits, error budget, physics of the robot, and balance over class and slope."""
+"""Sections on labels: losses, quality bits, error budget, physics of the robot, repeatability."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.balance.cells import SLOPE_NAMES
 from tcpipe.cost.labels import format_budget
-from tcpipe.formats.dataset_card import Balance, CellRow
+from tcpipe.cost.repeatability import Floor
 from tcpipe.formats.finding_lines import advise_on_loss
 from tcpipe.motion.distance_breakdown import find_largest_losses
-from tcpipe.report.page import Section, Shaded
+from tcpipe.report.page import Section
 from tcpipe.report.plots import draw_waterfall
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit, PhysicsTerm
@@ -149,43 +148,10 @@ def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[Section]:
 _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
 
-def make_balance_sections(balance: Balance) -> list[Section]:
-    """Return how samples are spread over class and slope, and how well labels repeat themselves."""
-    cells = balance.by_class_and_slope
-    text = (
-        f"Samples, in brackets the effective (independent) number: neighbours are correlated ({_format_correlation(balance)}). "
-        f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells have fewer than {balance.enough_effective:g}, "
-        "marked with * and a dashed border; – is ground of the map without samples. drive-next.geojson proposes where to drive."
-    )
-    names = {cell["slope"] for cell in cells}
-    slopes = [slope for slope in SLOPE_NAMES if slope in names]
-    most = max((sum(cell["samples"].values()) for cell in cells), default=0)
-    texts = {(cell["class"] or "any", cell["slope"]): _shade_cell(cell, most) for cell in cells}
-    classes = dict.fromkeys(name for name, _ in texts)
-    rows = [[name, *(texts.get((name, slope), "") for slope in slopes)] for name in classes]
-    section = Section("Balance of class and slope", text, header=["class", *slopes], rows=rows)
-    return [section, _make_repeatability_section(balance)]
-
-
-def _shade_cell(cell: CellRow, most: int) -> Shaded:
-    count = sum(cell["samples"].values())
-    worth = "" if cell["effective"] is None else f" ({cell['effective']:.0f})"
-    text = f"{count}{worth}{'*' if cell['rare'] else ''}" if count else "–"
-    return Shaded(text, (count / max(most, 1)) ** 0.5, alarm=cell["rare"])
-
-
-def _format_correlation(balance: Balance) -> str:
-    found = [
-        f"{_name(label)} over {entry.length_m:.1f} m, {100 * entry.share:.0f} % of its variance"
-        for label, entry in balance.correlation.items()
-        if entry is not None
-    ]
-    return "; ".join(found) or "range unknown, too few samples"
-
-
-def _make_repeatability_section(balance: Balance) -> Section:
+def make_repeatability_section(repeatability: Mapping[str, Floor | None]) -> Section:
+    """Return how well labels repeat themselves."""
     rows = []
-    for label, entry in balance.repeatability.items():
+    for label, entry in repeatability.items():
         unit = _UNITS[label.rsplit("_", 1)[1]]
         if entry is not None:
             ends = (entry.std_low, entry.std_high)

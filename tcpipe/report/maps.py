@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import shapely
 from numpy.typing import NDArray
 from pyproj import Transformer
 
 from tcpipe.errors import TcpipeError, clean_line
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import CLASSES, DRIVE_NEXT, OVERVIEW, RELIEF
-from tcpipe.formats.geojson import PolygonGeometry, read_polygons
+from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
+from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import CURSOR, FAINT, SPLIT_COLOURS
@@ -36,8 +35,6 @@ Floats = NDArray[np.float64]
 Pictures = MutableMapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
 
-_MOST_PLACES = 200
-"""Places to drive next that are drawn, the most wanted first."""
 _LEAST_SHARE = 0.5
 """Smallest share of the track on a map that becomes its background."""
 
@@ -53,7 +50,6 @@ def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> t
         tools=f"pan,wheel_zoom,{tools},reset,save",
     )
     lost = _lay_dataset_pictures(plot, directory, card, bounds)
-    lost += _draw_places(plot, directory, card)
     figure = plot.figure
     ends = {end: np.empty(0) for end in ("x0", "y0", "x1", "y1")}
     leaks = figure.segment(source=ends, color=CURSOR, line_width=1.5, name="leaks", visible=False)
@@ -139,39 +135,6 @@ def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds
             continue
         lay_picture(plot, name.strip(), make_picture_uri(pixels, exact=file == CLASSES), bounds, visible=number == 0)
     return lost
-
-
-def _draw_places(plot: Plot, directory: Path, card: DatasetCard) -> list[str]:
-    """Draw where to drive next, hidden at first; return why that is not possible."""
-    if DRIVE_NEXT not in card.checksums:
-        return []
-    try:
-        features, problems = read_polygons(directory / DRIVE_NEXT)
-    except TcpipeError as error:
-        return [f"where to drive next cannot be shown: {error.problems[0]}"]
-    to_map = Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True)
-    rings, texts = [], []
-    for feature in features[:_MOST_PLACES]:
-        fields = feature.properties
-        text = (
-            f"{fields.get('rank')}: {fields.get('class') or 'any ground'}, {fields.get('slope')}, "
-            f"drive {fields.get('drive_towards')}"
-        )
-        for polygon in feature.polygons:
-            rings.append(np.column_stack(to_map.transform(*shapely.get_coordinates(polygon.exterior).T)))
-            texts.append(text)
-    plot.figure.patches(
-        "xs",
-        "ys",
-        source={"xs": [ring[:, 0] for ring in rings], "ys": [ring[:, 1] for ring in rings], "text": texts},
-        fill_color="#00e5ff",
-        fill_alpha=0.25,
-        line_color="#00e5ff",
-        line_width=2,
-        name="drive next",
-        visible=False,
-    )
-    return list(problems)
 
 
 def _project_rings(region: Mapping[str, PolygonGeometry] | None, to_map: Transformer) -> list[Floats]:

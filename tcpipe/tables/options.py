@@ -48,11 +48,6 @@ STORE = Option("Where runs and maps are kept (or TCPIPE_STORE).", (), "published
 RECIPE = Option(
     "Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).", (), "input_file", "FILE"
 )
-CLUSTER = Option(
-    "Dask scheduler whose workers compute it, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
-    metavar="ADDRESS",
-    envvar="TCPIPE_CLUSTER",
-)
 MESSAGE_DEFINITIONS = Option(
     "Directory of package/msg/Name.msg (or .idl) files for types the log does not define.", ("--msgdef",), "input_directory", "DIR"
 )  # fmt: skip

@@ -301,7 +301,7 @@ def test_what_is_suggested_for_a_recipe_is_made_where_it_is_checked():
 
 
 def test_nouns_know_of_the_recipe_what_they_suggest_alone():
-    nouns = ("logs/", "fusion/", "motion/", "path.py", "cost/", "terrain/", "splits/", "balance/", "power/")
+    nouns = ("logs/", "fusion/", "motion/", "path.py", "cost/", "terrain/", "splits/", "power/")
     known = {name for path, nodes in read_nodes().items() if path.startswith(nouns) for name in _imported(nodes)}
     assert {name for name in known if name.startswith("tcpipe.recipe") and ".suggestions." not in name} == set()
 

@@ -182,7 +182,6 @@ def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: P
         (["export", "LOG", "LOG/below"], "is a file, expected a directory", 2),
         (["simulate", "out", "--scenario", "nosuch"], "scenario 'nosuch' is unknown", 2),
         (["simulate", ".."], "is not this simulated site", 2),
-        (["schemas", "LOG"], "is a file, expected a directory", 2),
         (["init", "LOG"], "is a file, expected a directory", 2),
         (["add-map", "m", "--height", "LOG"], "not a raster", 1),
     ],
@@ -408,7 +407,6 @@ def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
         ["report", "tcpipe-store", "--no-runs"],
         ["report", "tcpipe-store"],
         ["init"],
-        ["schemas", "schemas"],
         ["simulate", "site", "--scenario", "tiny", "--quiet"],
     ]
     for command in commands:

@@ -68,16 +68,14 @@ def test_verify_names_what_is_wrong_one_line_each_and_fails(work):
     assert "dataset/mine.txt: is no file of this dataset" in problems
 
 
-def test_a_sample_is_traced_to_its_log_and_made_again_bit_for_bit(work, ids):
+def test_a_sample_is_traced_to_its_log(work, ids):
     done = tcpipe("explain", ids[0], "--dataset", "dataset", "--store", "tcpipe-store", "--quiet", cwd=work)
     assert done.returncode == 0, done.stdout
     lines = done.stdout.splitlines()
-    assert lines[-1] == "computed again from the streams: identical"
     assert {"labels", "log", "stamps", "messages", "map", "recipe", "versions"} <= {
-        line.split()[0] for line in lines[1:-1]
+        line.split()[0] for line in lines[1:]
     }
     found = json.loads(tcpipe("explain", ids[-1], "--json", "--quiet", cwd=work).stdout)
-    assert found["differences"] == []
     facts, gnss = found["facts"], found["facts"]["messages"]["gnss"]
     assert facts["sample"]["start_ns"] <= gnss["first_ns"] <= gnss["last_ns"] < facts["sample"]["end_ns"]
     assert facts["source"]["paths"][0].endswith(".mcap")

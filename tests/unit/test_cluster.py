@@ -1,30 +1,22 @@
 """Tasks on a real Dask cluster: the same outcomes as here, a killed worker costs its task only, and what is in the way is one line."""
 
 import importlib
-import logging
-import multiprocessing
 import os
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import closing, nullcontext
-from pathlib import Path
+from contextlib import closing
 
 import pytest
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
 from dask_cluster import DaskCluster, dask_cluster, die, die_once, spend, wants_more, where
-from distributed import Client
-from wheel_drives import drive_at
 
 import tcpipe
 from tcpipe import execution
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.execution import read_cluster_cpu_s, run_all
-from tcpipe.pipeline.ingest import ingest
 from tcpipe.progress import STEP, Step, step_of
-from tcpipe.recipe import Recipe
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +43,11 @@ def test_the_task_of_a_killed_worker_runs_again_and_costs_no_other(cluster, tmp_
     )
     assert sorted(outcome.index for outcome in outcomes) == [0, 1, 2]
     assert not any(outcome.died for outcome in outcomes)
+
+
+def test_a_task_that_kills_its_workers_is_named(cluster, caplog):
+    assert [outcome.died for outcome in run_all(die, [1], jobs=1, cluster=cluster.address)] == [True]
+    assert "a task ended without a result (KilledWorker: " in caplog.text
 
 
 def test_a_closed_iterator_leaves_no_task_waiting(cluster):
@@ -109,14 +106,13 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
 
 def test_a_scheduler_without_workers_and_a_worker_of_many_threads_are_one_line(tmp_path, monkeypatch):
     assert execution._ANSWER_S <= 10, "with what Python takes to start, a report after 15 s"
-    with dask_cluster(tmp_path, workers=0) as lonely, Client(lonely.address, set_as_default=False) as client:
+    with dask_cluster(tmp_path, workers=0) as lonely:
         with monkeypatch.context() as patch:
             patch.setattr(execution, "_ANSWER_S", 1)
-            for cluster in (lonely.address, client.get_executor()):
-                with pytest.raises(
-                    UsageError, match=r"no workers after 1 s; start one: dask worker tcp://\S+ --nthreads 1"
-                ):
-                    list(run_all(where, [1], jobs=1, cluster=cluster))
+            with pytest.raises(
+                UsageError, match=r"no workers after 1 s; start one: dask worker tcp://\S+ --nthreads 1"
+            ):
+                list(run_all(where, [1], jobs=1, cluster=lonely.address))
         lonely.start_worker(threads=2)
         with pytest.raises(UsageError, match="has 2 threads; expected one a worker"):
             list(run_all(where, [1], jobs=1, cluster=lonely.address))
@@ -139,73 +135,3 @@ def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path,
             brief.scheduler.kill()
             with pytest.raises(TcpipeError, match="the scheduler stopped; start it and run the same command again"):
                 next(outcomes)
-
-
-def submitit_executor(folder):
-    submitit = pytest.importorskip("submitit", reason="submitit is not installed")
-    return nullcontext(submitit.LocalExecutor(folder / "submitit"))
-
-
-EXECUTORS = {
-    "threads": lambda _: ThreadPoolExecutor(2),
-    "processes": lambda _: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")),
-    "forked": lambda _: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")),
-    "submitit": submitit_executor,
-}
-
-
-@pytest.fixture(params=["dask", *EXECUTORS])
-def executor(request, tmp_path, monkeypatch):
-    """Executors of all kinds, whose workers find the tasks of tests."""
-    if request.param == "dask":
-        with Client(request.getfixturevalue("cluster").address, set_as_default=False) as client:
-            yield client.get_executor()
-        return
-    monkeypatch.setenv(
-        "PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    )
-    with EXECUTORS[request.param](tmp_path) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    """A log, and the tables that this process makes of it."""
-    here = tmp_path_factory.mktemp("here")
-    ingest([drive_at(here / "drive.mcap")], store=here / "store", recipe=Recipe())
-    return here / "drive.mcap", read_tables(here / "store")
-
-
-def read_tables(store):
-    return {path.name: path.read_bytes() for path in (store / "runs").rglob("*.parquet")}
-
-
-def test_any_executor_does_all_tasks_says_once_what_they_say_and_makes_the_same_bytes(
-    executor, drive, tmp_path, caplog
-):
-    with caplog.at_level(logging.INFO, "tcpipe"):
-        outcomes = sorted(run_all(where, range(2), jobs=1, cluster=executor), key=lambda outcome: outcome.index)
-    assert [outcome.result[0] for outcome in outcomes] == [0, 1]
-    said = [record.getMessage() for record in caplog.records if record.name == "tcpipe" and not step_of(record)]
-    assert sorted(said) == [f"task {n}" for n in range(2)]
-    log, tables = drive
-    assert ingest([log], store=tmp_path / "store", recipe=Recipe(), cluster=executor).results[0].status == "done"
-    assert read_tables(tmp_path / "store") == tables
-
-
-def test_what_has_not_begun_when_a_call_ends_does_not_begin(tmp_path):
-    with ThreadPoolExecutor(1) as threads:
-        with closing(run_all(time.sleep, [0, *[0.2] * 200], jobs=1, cluster=threads)) as outcomes:
-            next(outcomes)
-        began_s = time.monotonic()
-    assert time.monotonic() - began_s < 20.0
-
-
-def test_a_task_whose_worker_died_is_named_and_a_stopped_executor_is_one_line(caplog):
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as processes:
-        assert [outcome.died for outcome in run_all(die, [1, 2], jobs=1, cluster=processes)] == [True, True]
-    assert "executor ProcessPoolExecutor: a task ended without a result (BrokenProcessPool: " in caplog.text
-    with ThreadPoolExecutor(1) as threads:
-        pass
-    with pytest.raises(TcpipeError, match="executor ThreadPoolExecutor: takes no tasks"):
-        list(run_all(where, [1], jobs=1, cluster=threads))

@@ -18,8 +18,8 @@ from tcpipe.store import open_store
 
 TEXTS = {
     "name", "robot", "cluster", "map_name", "tags", "sample_id", "scenario", "names", "topics", "crs",
-    "start", "goal", "holdout", "strays", "shard", "min_age_s", "keep", "forget", "drives", "stac",
-    "collections", "around", "adapt", "budget_joule", "layers", "predictor", "reason",
+    "start", "goal", "holdout", "strays", "shard", "min_age_s", "keep", "forget", "drives",
+    "adapt", "budget_joule", "layers", "predictor", "reason",
 }  # fmt: skip
 """Parameters of commands that are text and no path."""
 
@@ -148,7 +148,7 @@ def test_a_bad_path_is_exit_code_2(here, call):
 
 def test_every_command_that_reads_or_writes_a_path_is_tried():
     tried = {call.split()[0] for call in CALLS}
-    assert {name for name, _ in PLACES} - tried == {"init", "schemas"}
+    assert {name for name, _ in PLACES} - tried == {"init"}
 
 
 FUNCTIONS = {

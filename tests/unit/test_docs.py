@@ -14,11 +14,9 @@ from PIL import Image
 from synthetic_store import box, region_file, small_store
 
 from tcpipe.cli import cli
-from tcpipe.formats.maps.open_data import Catalogue
 from tcpipe.formats.recipe_toml import parse_recipe
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.checking import from_values
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -159,8 +157,8 @@ def _problem(line: str) -> str | None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_and_options_exist(page: Path) -> None:
-    if page.name == "cli.md":
-        pytest.skip("generated from the commands themselves")
+    if page.name in {"cli.md", "CHANGELOG.md"}:
+        pytest.skip("generated from the commands themselves, or of commands of their time")
     assert not [problem for line in _command_lines(page) if (problem := _problem(line))]
 
 
@@ -185,10 +183,7 @@ def test_recipe_lines_are_recipes(where: str, body: str) -> None:
     import tomllib
 
     values = tomllib.loads(body)
-    if "stac" in values:
-        assert from_values(Catalogue, values, where=where).collections
-    else:
-        assert parse_recipe(values, where=where) != Recipe()
+    assert parse_recipe(values, where=where) != Recipe()
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open, make_table_command
 from tcpipe.formats.maps.layer_building import Raster, RasterLayer, Tally, iterate_shards, open_raster
-from tcpipe.formats.maps.map_facts import MapFacts, MapInputs, RasterOrigin
+from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
@@ -90,7 +90,6 @@ def build_map(
     crs: str | None = None,
     pixel_size_m: float | None = None,
     inputs: MapInputs | None = None,
-    origins: Sequence[RasterOrigin] = (),
 ) -> MapFacts:
     """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
 
@@ -104,7 +103,7 @@ def build_map(
         the terrain raster names its values, those names say which class each is.
     crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
     pixel_size_m : side of a map pixel [m]; None takes the finest raster's.
-    inputs, origins : what the caller wants to know the map by later, and where its rasters are from; kept in its facts.
+    inputs : what the caller wants to know the map by later; kept in its facts.
 
     `MapError`: a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line each.
     """
@@ -134,7 +133,7 @@ def build_map(
                     _write(writer, band, number)
             every = {role: min(bands, key=lambda band: band.tally.pixels) for role, bands in sources.items()}
             _refuse_empty(every)  # of several bands that with the least data counts
-            facts = _make_facts(grid, every, origin, inputs or MapInputs(), tuple(origins))
+            facts = _make_facts(grid, every, origin, inputs or MapInputs())
             writer.finish(facts, {role: _set_ranges(bands) for role, bands in sources.items()})
             write_checksums(half)
     return facts
@@ -290,7 +289,6 @@ def _make_facts(
     layers: Mapping[str, LayerSource],
     classes_from: str,
     inputs: MapInputs,
-    origins: tuple[RasterOrigin, ...],
 ) -> MapFacts:
     """Return what was found; layers that keep their own pixels may reach beyond the map."""
     covered = {}
@@ -309,7 +307,6 @@ def _make_facts(
         findings=(*assumed, *_find_all(layers, covered)),
         classes_from=classes_from,
         inputs=inputs,
-        origins=origins,
     )
 
 

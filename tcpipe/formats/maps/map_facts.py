@@ -39,39 +39,6 @@ class MapInputs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RasterOrigin:
-    """Where a raster of a map was taken from, of open data; the checksum of what was taken is among `MapInputs`."""
-
-    layer: str
-    url: str = ""
-    """Without a query."""
-    item: str = ""
-    date: str = ""
-    """When it was surveyed, as the catalogue has it; empty where it does not."""
-    resolution: str = ""
-    """Of a pixel, with the unit of its CRS."""
-    vertical_datum: str | None = None
-    """What heights refer to; None where the catalogue's entry does not say."""
-    licence: str
-    to_read_bytes: int = 0
-    """Of the part that was taken, as it is stored there."""
-    version: str = ""
-    """Of the whole raster as its server names it: ETag or time of change."""
-    checksum: str | None = None
-    """Multihash of the whole raster as the catalogue has it."""
-
-
-def origin_lines(origins: Sequence[RasterOrigin]) -> list[str]:
-    """Return where rasters are from, a line for each, and the licences."""
-    lines = [
-        f"{origin.layer:8s} {origin.date[:10] or 'no date'}, {origin.resolution}, {origin.to_read_bytes / 1e6:.2f} MB: {origin.url}"
-        + (f" (heights above {origin.vertical_datum or 'an unknown datum'})" if origin.layer == "height" else "")
-        for origin in origins
-    ]
-    return lines + [f"licence: {text}" for text in dict.fromkeys(origin.licence for origin in origins)]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MapFacts:
     """What building a map found; a map keeps it in its attributes."""
 
@@ -89,8 +56,6 @@ class MapFacts:
     classes_from: str
     """``file``, ``names`` of the terrain raster's values, ``store`` or ``default``."""
     inputs: MapInputs
-    origins: tuple[RasterOrigin, ...] = field(default=(), metadata=LEFT_OUT)
-    """Of rasters that were taken from open data."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +91,7 @@ def map_lines(summary: MapSummary) -> list[str]:
     for layer in summary.layers:
         line = f"{layer:{width}s} {_format_percent(summary.covered[layer]):>5s} covered, from {summary.sources[layer]}"
         lines.append(line + _format_detail(layer, summary))
-    return lines + origin_lines(summary.origins)
+    return lines
 
 
 def _format_detail(layer: str, summary: MapSummary) -> str:

@@ -15,7 +15,7 @@ from pyarrow.csv import write_csv
 
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
-from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines, list_first
+from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, clean_lines, list_first
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
@@ -24,7 +24,6 @@ from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
     CROISSANT,
-    DRIVE_NEXT,
     EXCLUDED,
     HUB_CARD,
     OVERVIEW,
@@ -39,13 +38,11 @@ from tcpipe.formats.finding_lines import format_mixed_groups, list_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
-from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import map_table, return_freed_memory, write_parquet_rows, write_pieces
-from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.place import open_place
 from tcpipe.formats.recipe_toml import resolve_recipe
-from tcpipe.formats.run_documents import SPOOL
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import (
     BUILD,
@@ -56,19 +53,23 @@ from tcpipe.pipeline.calls import (
     open_log,
     start_stopwatch,
 )
-from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, make_dataset_card
+from tcpipe.pipeline.dataset.card import (
+    CARD_COLUMNS,
+    PHYSICS_COLUMNS,
+    REPEATABILITY_COLUMNS,
+    VELOCITY_COLUMN,
+    make_dataset_card,
+    measure_repeatability,
+)
 from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     make_redaction,
     redact_card,
     redact_content,
-    redact_features,
     redact_inputs,
 )
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
-from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.splitting import read_exclusions
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
@@ -76,7 +77,7 @@ from tcpipe.recipe import Recipe, TrainConfig
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.store import Store, open_store
+from tcpipe.store import open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
 from tcpipe.tables.options import as_function
 
@@ -144,14 +145,14 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
     Findings on damaged runs (which are excluded), runs to be ingested again, runs that only the replaced dataset has, and empty splits make
-    the exit code 3. The bytes do not depend on ``jobs`` and ``cluster``.
+    the exit code 3. The bytes do not depend on ``jobs``.
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
     measure, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
     out, store, dry_run = options.out, options.store, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
-    opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
+    opened = open_store(store)
     log = open_log(opened)
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
@@ -178,11 +179,9 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
     with commit_call(log, BUILD, [make_absolute(place)]) as call:
-        with output as directory, _start_workers(directory, opened, inputs.digest, options) as workers:
-            card = _build(directory, inputs, marks, workers)
+        with output as directory:
+            card = _build(directory, inputs, marks, options.jobs)
             _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
-        for entry in workers.waiting.entries():
-            workers.waiting.delete(entry.name)
         result = _make_result(place, "done", card, left_out)
         counts = {"runs": len(inputs.runs), "samples": card.samples}
         written = sum(checksum.size_bytes for checksum in card.checksums.values())
@@ -328,49 +327,28 @@ def _name_remedy(place: Path | str) -> Iterator[None]:
         raise DatasetError(*error.problems, left) from None
 
 
-@contextmanager
-def _start_workers(directory: Path, store: Store, inputs: str, options: BuildDatasetOptions) -> Iterator[Workers]:
-    """Yield the workers; their spool is in the new directory, or in the store, which a cluster's workers see."""
-    if options.cluster is None:
-        yield Workers(options.jobs, None, Place(directory / SPOOL), Place(directory))
-        return
-    waiting = store.place.below(f"{SPOOL}/{inputs}")
-    try:
-        yield Workers(1, options.cluster, waiting, waiting.below("files"))
-    except MissingFileError as error:
-        if not error.where.startswith(waiting.where()):
-            raise
-        raise StoreError(
-            f"{waiting.where()}: another build of the same dataset was first and removed the shared spool; run the same command again"
-        ) from None
-
-
-def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> DatasetCard:
+def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
-    waiting, recipe = directory / SPOOL, options.recipe
+    waiting, recipe = directory / "spool", options.recipe
     waiting.mkdir()
-    content = gather_content(waiting, inputs, options, workers)
+    content = gather_content(waiting, inputs, options, jobs)
     redaction = make_redaction(content, inputs, recipe) if options.redact else None
     if redaction is not None:
         content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
     figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
     ids, compression = figures.column("sample_id"), recipe.dataset.compression
-    shards = write_patches(directory, content, ids, options.file_format, workers, compression=compression)
+    shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
     _write_overviews(directory, content.sources)
-    balance, drive_next = measure_balance(
-        figures.select(BALANCE_COLUMNS),
+    repeatability = measure_repeatability(
+        figures,
         content.samples.centres_xy_m(),
-        content.sources,
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
-        regions=options.regions,
-        buffer_m=content.split.buffer_m,
     )
-    write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redact_features(drive_next, redaction))
     if content.excluded.num_rows and redaction is None:
         write_csv(content.excluded, directory / EXCLUDED)
-    card = make_dataset_card(figures, options, inputs, content, balance=balance, shards=shards)
+    card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
     card = card if redaction is None else redact_card(card, redaction)
     shutil.rmtree(waiting)
     write_text(directory / HUB_CARD, format_hub_card(card))
@@ -384,7 +362,7 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
 
 def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     """Write the samples; return the columns that card and page are made from, mapped from another file."""
-    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *BALANCE_COLUMNS, *SAMPLE_COLUMNS)))
+    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS)))
 
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces():

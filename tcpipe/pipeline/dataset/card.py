@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.cost.labels import pool_budgets
 from tcpipe.cost.physics import fit_and_validate_physics
+from tcpipe.cost.repeatability import Floor, compute_slope_residuals, estimate_repeatability, find_repeated_pairs
 from tcpipe.formats.dataset_card import (
-    Balance,
     DatasetCard,
     FlaggedSamples,
     LabelColumns,
@@ -51,13 +51,34 @@ CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *
 """Columns of samples.parquet that the card is made from."""
 
 
+def measure_repeatability(
+    samples: pa.Table, xy_m: NDArray[np.float64], *, velocity_column: str, chord_m: float
+) -> dict[str, Floor | None]:
+    """Return how well each label repeats itself; ``samples`` has `REPEATABILITY_COLUMNS`, ``xy_m`` are their centres [m], shape (N, 2)."""
+    slope_rad = to_floats(samples, "slope_rad")
+    terrain = samples.column("terrain_class").fill_null(0).to_numpy()
+    repeated = find_repeated_pairs(xy_m, to_floats(samples, "course_rad"), terrain, chord_m=chord_m)
+    found = dict[str, Floor | None]()
+    for name in ("power_watt", velocity_column, "duration_s", "energy_joule"):  # one after another: each takes memory
+        values = to_floats(samples, name)
+        residual = compute_slope_residuals(values, terrain, slope_rad)
+        found[name] = estimate_repeatability(values, residual, repeated, xy_m, chord_m=chord_m)
+    return found
+
+
+REPEATABILITY_COLUMNS = (
+    *("course_rad", "terrain_class", "slope_rad", "power_watt", "velocity_mps", "fused_velocity_mps", "duration_s"),
+    "energy_joule",
+)
+
+
 def make_dataset_card(
     samples: pa.Table,
     options: BuildOptions,
     inputs: Inputs,
     content: Content,
     *,
-    balance: Balance,
+    repeatability: Mapping[str, Floor | None],
     shards: Sequence[Shard],
 ) -> DatasetCard:
     """Return the card without checksums; ``samples`` has `CARD_COLUMNS` and `PHYSICS_COLUMNS`."""
@@ -97,7 +118,7 @@ def make_dataset_card(
         split=content.split,
         distance_by_reason_m=content.distance_by_reason_m,
         removal=content.removal,
-        balance=balance,
+        repeatability=repeatability,
         runs=runs,
         run_tags=options.tags,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
@@ -205,16 +226,15 @@ def count_flagged(quality: pa.ChunkedArray) -> FlaggedSamples:
 
 
 def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
-    """Yield findings on samples: too few, flagged ones, empty splits, leakage, undersampled ground, no repetitions."""
+    """Yield findings on samples: too few, flagged ones, empty splits, leakage, no repetitions."""
     dataset = Subject("dataset", card.name)
     if card.samples < read_threshold("few-samples", "min_sample_count"):
         yield make_finding("few-samples", dataset, sample_count=card.samples)
     yield from _find_flagged(card, dataset)
     yield from _find_empty_splits(card)
     yield from (_find_leakage(part, card) for part in card.split.audit if part.overlapping_samples)
-    yield from _find_thin_ground(card)
     yield from compare_batteries((run.run_id, run.robot, run.findings) for run in card.runs if run.samples)
-    if not any(card.balance.repeatability.values()):
+    if not any(card.repeatability.values()):
         yield make_finding("no-repeated-places", dataset)
 
 
@@ -269,19 +289,3 @@ def _find_leakage(part: HeldOut, card: DatasetCard) -> Finding:
         overlapping_count=part.overlapping_samples,
         sample_count=part.samples,
     )
-
-
-def _find_thin_ground(card: DatasetCard) -> Iterator[Finding]:
-    """Yield a finding for each class of terrain with ranges of slope that hold few independent samples."""
-    is_thin = defaultdict[str, list[bool]](list)
-    for cell in card.balance.by_class_and_slope:
-        is_thin[cell["class"] or "any ground"].append(cell["rare"])
-    for name, thin in is_thin.items():
-        if any(thin):
-            yield make_finding(
-                "thin-ground",
-                Subject("class", name),
-                thin_count=sum(thin),
-                cell_count=len(thin),
-                enough_count=card.balance.enough_effective,
-            )

@@ -9,9 +9,7 @@ import logging
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.errors import DatasetError, TcpipeError
-from tcpipe.execution import run_all, unwrap_result
+from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import (
     Covariate,
     Exclusion,
@@ -34,7 +31,6 @@ from tcpipe.formats.dataset_card import (
     list_shifts,
 )
 from tcpipe.formats.dataset_files import (
-    Drawer,
     FileFormat,
     ParquetShardWriter,
     Pixels,
@@ -48,10 +44,8 @@ from tcpipe.formats.parquet import (
     add_geo_metadata,
     map_table,
     move_to_file,
-    read_table_bytes,
     take_rows,
     write_pieces,
-    write_table_bytes,
 )
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
@@ -60,7 +54,7 @@ from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_removed_by_ground, register_runs
-from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
+from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
@@ -253,8 +247,8 @@ class Content:
     findings: tuple[Finding, ...]
 
 
-def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> Content:
-    """Sample, split and order; segments are kept in files in ``directory``, which must be empty, pixels where ``workers`` see them.
+def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> Content:
+    """Sample, split and order; segments and pixels are kept in files in ``directory``, which must be empty.
 
     Raises `DatasetError`, `MapError`: no segment, none on the map, or none inside the region.
     """
@@ -272,7 +266,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         recipe.sample,
         gnss_crs=recipe.read.gnss_crs,
         shifts=shifts,
-        workers=workers,
+        jobs=jobs,
         directory=directory,
     )
     lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
@@ -382,7 +376,7 @@ def write_patches(
     content: Content,
     sample_ids: pa.ChunkedArray,
     file_format: FileFormat,
-    workers: Workers,
+    jobs: int,
     *,
     compression: Compression,
 ) -> list[Shard]:
@@ -390,45 +384,13 @@ def write_patches(
     samples, spool = content.samples, content.spool
     pixels = Pixels(spool.layers, spool.patch_px, samples.slot[samples.patch], spool.read)
     if file_format == "parquet":
-        rows = partial(_spool_rows, workers.waiting, samples)
-        drawers = make_parquet_writers(workers.out, pixels, rows, samples.assigned.select(samples.patch).split)
+        split = samples.assigned.select(samples.patch).split
+        drawers = make_parquet_writers(Place(directory), pixels, samples.take, split)
     else:
-        drawers = make_zarr_writers(
-            directory, workers.out, pixels, sample_ids, compression=compression, threads=workers.jobs
-        )
-    with closing(run_all(_write_shard, drawers, jobs=1, cluster=workers.cluster)) as outcomes:
-        for outcome in outcomes:
-            unwrap_result(outcome)
-    _copy_shards(workers.out, directory)
-    return [drawer.shard for drawer in drawers if isinstance(drawer, ParquetShardWriter)]
-
-
-def _spool_rows(waiting: Place, samples: SampleTable, rows: NDArray[np.int64]) -> Callable[[], pa.Table]:
-    """Put rows of the samples into the spool; return a picklable function that reads them there."""
-    name = f"rows/{rows[0]}"
-    waiting.put(name, write_table_bytes(samples.take(rows)))
-    return partial(_read_rows_at, waiting, name)
-
-
-def _read_rows_at(waiting: Place, name: str) -> pa.Table:
-    return read_table_bytes(waiting.read(name) or b"")
-
-
-def _write_shard(drawer: Drawer) -> TcpipeError | None:
-    try:
+        drawers = make_zarr_writers(directory, pixels, sample_ids, compression=compression, threads=jobs)
+    for drawer in drawers:
         drawer.write()
-    except TcpipeError as error:
-        return error
-    return None
-
-
-def _copy_shards(out: Place, directory: Path) -> None:
-    """Copy the shards into the new directory, one at a time, if workers wrote them elsewhere."""
-    if out == Place(directory):
-        return
-    for entry in out.entries():
-        (directory / entry.name).parent.mkdir(parents=True, exist_ok=True)
-        (directory / entry.name).write_bytes(out.read_range(entry.name, 0, entry.size_bytes))
+    return [drawer.shard for drawer in drawers if isinstance(drawer, ParquetShardWriter)]
 
 
 if TYPE_CHECKING:

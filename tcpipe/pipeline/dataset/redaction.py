@@ -16,8 +16,7 @@ from pyproj import Transformer
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, Redacted, judge_dataset
-from tcpipe.formats.geojson import FeatureCollection, PolygonGeometry
-from tcpipe.formats.maps.map_facts import RasterOrigin
+from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
@@ -246,29 +245,15 @@ def _redact_map(source: MapSource, redaction: Redaction) -> MapSource:
         sha256=None,
         sources=None,
         inputs=None,
-        origins=tuple(dict.fromkeys(map(_redact_origin, source.origins))),
         height_min_m=None if low is None else low - redaction.height_m,
         height_max_m=None if high is None else high - redaction.height_m,
         findings=redact_findings(source.findings),
     )
 
 
-def _redact_origin(origin: RasterOrigin) -> RasterOrigin:
-    return RasterOrigin(layer=origin.layer, licence=origin.licence)
-
-
 def _move_polygon(polygon: PolygonGeometry, redaction: Redaction) -> PolygonGeometry:
     move = replace(redaction, gnss_crs="EPSG:4326").placed
     return replace(polygon, coordinates=move_coordinates(polygon.coordinates, move))
-
-
-def redact_features(collection: FeatureCollection, redaction: Redaction) -> FeatureCollection:
-    """Return polygons (WGS84) at public places: whole cells of the maps' plane, since a scale would reveal itself."""
-    redaction = replace(redaction, scale=1.0)
-    features = (
-        replace(feature, geometry=_move_polygon(feature.geometry, redaction)) for feature in collection.features
-    )
-    return replace(collection, features=tuple(features))
 
 
 def move_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any:
@@ -289,8 +274,6 @@ def find_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
             if (np.abs(degrees) > REACH_DEG).any():
                 yield f"{end}_{axis}_deg is beyond {REACH_DEG:g} degrees"
     yield from (f"map {source.name} has the CRS {source.crs}" for source in card.maps if source.crs != PLANE)
-    origins = [origin for source in card.maps for origin in source.origins]
-    yield from (f"names the raster {origin.url}" for origin in origins if origin != _redact_origin(origin))
     named = [run.run_id for run in card.runs if run.logs or not re.fullmatch(r"run\d{4,}-[0-9a-f]+", run.run_id)]
     yield from (f"reveals the name of the log of run {name}" for name in named)
     ratio, _, most = compute_plane_per_chord(samples)

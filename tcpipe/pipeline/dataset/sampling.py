@@ -8,20 +8,17 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError
-from tcpipe.execution import Executor, run_all, unwrap_result
+from tcpipe.execution import run_all, unwrap_result
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
-from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file, take_rows
 from tcpipe.formats.place import Place
@@ -60,63 +57,26 @@ MapPlaces = Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
 
 
 @dataclass(frozen=True, slots=True)
-class Workers:
-    """Local processes, or the workers of a Dask scheduler or an executor; they see both places."""
-
-    jobs: int
-    cluster: str | Executor | None
-    waiting: Place
-    """The spool."""
-    out: Place
-    """For shards."""
-
-
-@dataclass(frozen=True, slots=True)
 class Spool:
     """Pixels of sampled batches: one file a batch, one layer after another, in the order of the dataset.
 
-    A span of the dataset is then one span of every file: shuffled on disk, never in memory, in a bucket as in a directory. A slot is the
+    A span of the dataset is then one span of every file: shuffled on disk, never in memory. A slot is the
     number of a batch (upper 32 bits) and a row of its file.
 
-    In a ``kept`` spool the other results of a batch follow its pixels, then their size (8 bytes). Of two workers that sample one batch the
-    first one's file stays; after a killed build the next one continues.
     """
 
     place: Place
     layers: Mapping[str, Layer]
     patch_px: int
-    kept: bool = False
-    """Whether it survives a killed build."""
     counts: tuple[int, ...] = ()
     """Patches by batch."""
 
     def write(self, batch: int, order: NDArray[np.intp], sampled: Sampled) -> Sampled:
         """Write the patches of a batch in an order of its rows, (n,); return the results without pixels."""
-        pixels, bare = sampled.patches.pixels, replace(sampled, patches=replace(sampled.patches, pixels={}))
+        pixels = sampled.patches.pixels
         waiting = [np.ascontiguousarray(pixels[layer][order]).data for layer in self.layers]
-        if not self.kept:
-            self.place.put(f"{batch}", b"".join(waiting), lasting=False)
-            return bare
-        results = _as_bytes(bare)
-        self.place.put_new(f"{batch}", b"".join((*waiting, results, len(results).to_bytes(_SIZE_BYTES, "little"))))
-        return self.find(batch) or bare
-
-    def find(self, batch: int) -> Sampled | None:
-        """Return the results of a complete batch in the spool; delete an incomplete one."""
-        name = f"{batch}"
-        size = self.place.size(name) if self.kept else None
-        if size is None:
-            return None
-        end = max(size - _SIZE_BYTES, 0)
-        more = int.from_bytes(self.place.read_range(name, end, _SIZE_BYTES), "little")
-        try:
-            sampled = _read_sampled(self.place.read_range(name, max(end - more, 0), min(more, end)))
-        except (ValueError, OSError, EOFError, KeyError, BadZipFile):
-            sampled = None
-        if sampled is None or size != len(sampled.kept) * self.sample_bytes + more + _SIZE_BYTES:
-            self.place.delete(name)
-            return None
-        return sampled
+        self.place.put(f"{batch}", b"".join(waiting), lasting=False)
+        return replace(sampled, patches=replace(sampled.patches, pixels={}))
 
     def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
         """Return the patches in ``slots``, shape (n, *patch); one span is read of each batch."""
@@ -167,20 +127,20 @@ def sample_all_segments(
     *,
     gnss_crs: str,
     shifts: Sequence[Shifts],
-    workers: Workers,
+    jobs: int,
     directory: Path,
 ) -> tuple[Sampled, NDArray[np.int64], Spool]:
     """Sample each of M segments from the first map with data for it; return the results, slots in the order of ``kept``, and the spool.
 
     ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments' positions,
     ``shifts`` say for each map by how much runs are moved on it.
-    The results are arrays in files in ``directory``. `TcpipeError` if the map or the segments cannot be used.
+    The results are arrays in files in ``directory``, pixels in files below it. `TcpipeError` if the map or the segments cannot be used.
     """
     sources = [open_map(*arguments) for arguments in maps()]
     check_same_layers(sources, config)
     found = [list_layers(source, config.patch_m, config.patch_px) for source in sources]
     layers = sort_layers(join_layers(found))
-    spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
+    spool = Spool(Place(directory / "pixels"), layers, config.patch_px)
     each = spool.sample_bytes
     if len(layers) > len(sources[0].layers):
         shapes = (
@@ -189,8 +149,6 @@ def sample_all_segments(
         message = "patches: %d segments of %.1f kB (%s) take up to %.1f MB before compression"
         logger.info(message, segments.num_rows, each / 1e3, ", ".join(shapes), segments.num_rows * each / 1e6)
     rows = list(_iterate_batches(segments, max(min(_BATCH_ROWS, _BATCH_BYTES // each), 1)))
-    if count := len(spool.place.files()):
-        logger.info("resuming: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
     batches = (  # made when a worker can have them: one copy of their segments exists at a time
         _Batch(index, ranks[at], take_rows(placed, at), maps, config, gnss_crs, shifts, spool)
@@ -201,7 +159,7 @@ def sample_all_segments(
     findings: dict[int, tuple[Finding, ...]] = {}
     meter = Meter("sampling", segments.num_rows)
     try:
-        with closing(run_all(_sample_batch, batches, jobs=workers.jobs, cluster=workers.cluster)) as outcomes:
+        with closing(run_all(_sample_batch, batches, jobs=jobs)) as outcomes:
             for outcome in outcomes:
                 part, batch = unwrap_result(outcome), outcome.index
                 meter.add(len(rows[batch]))
@@ -224,21 +182,6 @@ def sample_all_segments(
     return sampled, move_rows_to_file(slots, kept, directory), replace(spool, counts=tuple(counts))
 
 
-def _as_bytes(sampled: Sampled) -> bytes:
-    arrays: dict[str, Any] = {name: getattr(sampled, name) for name in _SAMPLED} | sampled.patches.columns()
-    with BytesIO() as file:
-        np.savez(file, findings=np.array(to_compact_json(sampled.findings)), **arrays)
-        return file.getvalue()
-
-
-def _read_sampled(data: bytes) -> Sampled:
-    with np.load(BytesIO(data), allow_pickle=False) as held:
-        columns = dict(held)
-    findings = parse_typed_json(columns.pop("findings").item(), tuple[Finding, ...], "findings")
-    rest = {name: columns.pop(name) for name in _SAMPLED}
-    return Sampled(patches=Patches({}, **columns), findings=findings, **rest)
-
-
 def _iterate_batches(segments: pa.Table, size: int) -> Iterator[NDArray[np.int64]]:
     """Yield the rows of each batch, rising."""
     places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
@@ -250,8 +193,6 @@ def _iterate_batches(segments: pa.Table, size: int) -> Iterator[NDArray[np.int64
 def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     """Sample one batch; write its pixels to the spool."""
     try:
-        if (sampled := batch.spool.find(batch.number)) is not None:
-            return sampled
         sources, pools = zip(*(_reuse_map(*arguments, batch.config) for arguments in batch.maps()), strict=True)
         sampled = sample_on_maps(
             batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools, shifts=batch.shifts

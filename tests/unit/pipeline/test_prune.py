@@ -13,7 +13,6 @@ from synthetic_store import add_run, commit_run, lanes, segments, supersede
 from tcpipe.errors import UsageError
 from tcpipe.formats.commits import Dataset, Entries
 from tcpipe.formats.integrity import seal_page
-from tcpipe.formats.run_documents import SPOOL
 from tcpipe.pipeline import prune as prune_module
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.prune import prune
@@ -251,18 +250,6 @@ def test_earlier_generations_go_when_they_are_old_and_the_last_stays(store):
     assert gone == {"manifest-1.json", "segments.parquet"} | {"track.parquet", "rejections.parquet"}
     assert [run.segments().num_rows for run in store.recipes_of("c")] == [15]
     assert verify(store.root).problems == ()
-
-
-def test_pixels_of_a_killed_build_go_when_they_are_old(store):
-    name = f"{SPOOL}/0123-abcdef01/7.arrow"
-    store.place.put(name, b"pixels")
-    assert verify(store.root).problems == (
-        f"{store.root / SPOOL}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones",
-    )
-    prune(store=store.root, recipe=Recipe())
-    assert store.place.read(name) == b"pixels"
-    assert name in {each.path.removeprefix(f"{store.root}/") for each in prune(store=store.root, min_age_s=0.0).removed}
-    assert not (store.root / SPOOL).exists()
 
 
 def test_a_document_that_cannot_be_read_keeps_what_lies_beside_it_and_stops_nothing_else(store):

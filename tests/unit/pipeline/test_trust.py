@@ -11,16 +11,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from made_tracks import with_columns
-from map_worlds import World
 from stored_files import flip, manifest, run_document, table
-from synthetic_store import WORLD, add_run, box, commit_run, lanes, put_map, region_file, segments, small_store
+from synthetic_store import add_run, box, commit_run, lanes, region_file, segments, small_store
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_page, write_sealed
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import MapDocument, read_as_at
@@ -213,49 +211,22 @@ def test_what_is_none_of_these_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["zarr", "parquet"])
-def test_a_sample_is_explained_and_comes_out_the_same(made, name):
+def test_a_sample_is_explained(made, name):
     for part in ("train", "unseen"):
         samples = open_dataset(made / name)[part].samples
         for row in (0, len(samples) // 2):
             sample_id = samples["sample_id"][row].as_py()
             found = explain(sample_id, dataset=made / name, store=made / "store")
-            assert found.differences == ()
             text = str(found)
             assert f"split {part}" in text
             assert f"/logs/{samples['run_id'][row].as_py()}.mcap" in text
             assert "tiles (column, row) (0, 0)" in text
-            assert "identical" in text
 
 
 def find_sample(made, run_id):
     """Return the first sample of a run that trains."""
     train = open_dataset(made / "zarr")["train"].samples["sample_id"].to_pylist()
     return next(name for name in train if name.startswith(run_id))
-
-
-def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path):
-    store = Store(copy("store"))
-    shutil.rmtree(store.root / "runs" / "north")
-    table = segments("north", *lanes(1.0 + 2.0 * np.arange(8), -14.0, 14.0), start_ns=int(1e18 + 1e12))
-    power = table.column("power_watt").to_numpy() + 1.0
-    add_run(store, "north", with_columns(table, power_watt=power))
-    found = explain(find_sample(made, "north"), dataset=made / "zarr", store=store.root)
-    assert found.differences[0].startswith("power_watt: ")
-    assert found.differences[1:] == ("run north was ingested again later, with other segments",)
-
-
-def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
-    store = Store(copy("store"))
-    sample = find_sample(made, "north")
-    height = WORLD.write(tmp_path, pixel_size_m=0.2)["height"]
-    put_map(store, "site", height=height, inputs=MapInputs({"height": {"height.tif": "another"}}))
-    found = explain(sample, dataset=made / "zarr", store=store.root).differences
-    assert "terrain: map site no longer has this layer" in found
-    assert found[-1] == "map site was added again later, from other files"
-    elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pixel_size_m=0.2)
-    put_map(store, "site", height=elsewhere["height"], inputs=MapInputs({"height": {"height.tif": "another"}}))
-    found = explain(sample, dataset=made / "zarr", store=store.root).differences
-    assert found[0] == "map site no longer gives a patch for it"
 
 
 def test_an_unknown_sample_and_an_unknown_run_are_said(made, copy):

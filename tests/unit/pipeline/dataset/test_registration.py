@@ -25,7 +25,6 @@ from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.pipeline.dataset import map_checks
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.explain import explain
 from tcpipe.planning.drives import compute_drive_cost, evaluate_drives, find_drive
 from tcpipe.planning.path_files import choose_map
 from tcpipe.recipe import Recipe, SampleConfig
@@ -100,13 +99,6 @@ def test_the_shift_is_said_and_a_run_without_one_is_not_moved(moved):
     assert refused.names["reason"] == "too few points on the map"
     assert [of.run_id for of in result.card.maps[0].registration] == ["off"]
     assert describe_finding(said).startswith("off: moved by 1.7")
-
-
-def test_an_aligned_sample_is_explained_by_the_same_shift(moved):
-    directory, _ = moved
-    for run_id in ("off", "short"):
-        sample_id = next(iter(read_run(directory / "out", run_id)))
-        assert explain(sample_id, dataset=directory / "out", store=directory / "store").differences == ()
 
 
 def test_whole_drives_are_moved_as_the_runs_of_the_dataset(moved, tmp_path):

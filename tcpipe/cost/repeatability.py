@@ -1,15 +1,6 @@
-"""What class and slope leave of a label: its correlation over distance, effective sample sizes, and how well it repeats (ADR-19).
+"""How well labels repeat themselves where the robot drove the same ground twice in the same direction (ADR-19).
 
-**Correlation.** The semivariogram γ(h) of the residuals, half the mean squared difference of residuals h apart, is fitted by
-c0 + c1 (1 - exp(-h / L)) (Cressie, *Statistics for Spatial Data*, 1993, sections 2.4 and 2.6): L is the correlation length,
-c1 / (c0 + c1) the share of variance that neighbours have in common. The mean of n samples then has the variance of the mean of
-
-    n_eff = n² / Σij ρ(hij) = n / (1 + (n - 1) m),   ρ(h) = c1 / (c0 + c1) exp(-h / L) for i ≠ j, ρ = 1 for i = j,
-
-independent ones, m being the mean of ρ over all pairs of two (Bayley and Hammersley, "The effective number of independent
-observations in an autocorrelated time series", 1946; Cressie 1993, section 1.3).
-
-**Repeatability.** A model that knows the ground alone cannot distinguish two passes. Two passes of one place and direction give
+A model that knows the ground alone cannot distinguish two passes. Two passes of one place and direction give
 s² = (r1 - r2)² / 2 of their residuals r; the mean over P pairs that share no sample is the variance of one pass. Its interval is a
 jackknife over blocks of ground, since the pairs of one block are not independent (Efron and Tibshirani, *An Introduction to the
 Bootstrap*, 1993, chapter 11). The offset between two footprints makes the figure rather too large than too small.
@@ -21,36 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import pdist
 from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_LAGS = (0.0, 0.5, 1.5, 2.5, 3.5, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 28.0, 40.0)
-"""Borders between the distances whose pairs are taken together, in chords."""
-_LENGTHS = np.geomspace(0.25, 40.0, 120)
-"""Correlation lengths that are tried, in chords."""
-_FEWEST_PAIRS = 30
 _FEWEST_FITTED = 12
 """Below so many samples a class is described by its mean, not by a parabola over slope."""
-_STRETCH, _MOST = 200, 2000
-"""The semivariogram is made from whole stretches of so many samples, and from so many samples at most."""
-_MOST_IN_CELL = 1000
-"""Mean correlations are over the pairs of so many samples at most, the first ones: rows are in random order."""
-
-
-@dataclass(frozen=True, slots=True)
-class Correlation:
-    """Correlation of residuals at distance h: ``share`` · exp(-h / ``length_m``)."""
-
-    length_m: float
-    share: float
-    """From 0 to 1."""
-    pairs: int
-    """Pairs of samples that it was estimated from."""
 
 
 def compute_slope_residuals(values: Floats, terrain_class: NDArray[np.integer], slope_rad: Floats) -> Floats:
@@ -62,62 +31,6 @@ def compute_slope_residuals(values: Floats, terrain_class: NDArray[np.integer], 
         design = np.vander(slope_rad[rows], powers, increasing=True)
         left[rows] = values[rows] - design @ np.linalg.lstsq(design, values[rows])[0]
     return left
-
-
-def fit_correlation(
-    residual: Floats, xy_m: Floats, run: NDArray[np.integer], start_ns: Ints, *, chord_m: float
-) -> Correlation | None:
-    """Return the correlation of a label's residuals, shape (N,), over distance; None where too few samples are near each other.
-
-    ``xy_m`` are centres of the footprints [m], shape (N, 2); ``run`` and ``start_ns`` [ns] order the samples, shape (N,).
-    """
-    rows = _draw_sections(run, start_ns)
-    apart = pdist(xy_m[rows]) / chord_m
-    bins, size = np.digitize(apart, _LAGS) - 1, len(_LAGS)
-    pairs = np.bincount(bins, minlength=size)[: size - 1]
-    enough = pairs >= _FEWEST_PAIRS
-    if enough.sum() < 3:
-        return None
-    lag = np.bincount(bins, apart, size)[: size - 1][enough] / pairs[enough]
-    half_squares = pdist(residual[rows, None], "sqeuclidean") / 2.0
-    gamma = np.bincount(bins, half_squares, size)[: size - 1][enough] / pairs[enough]
-    if not gamma.any():
-        return None
-    length, nugget, sill = _fit(lag, gamma, pairs[enough])
-    return Correlation(length * chord_m, sill / (nugget + sill), int(pairs.sum())) if nugget + sill > 0.0 else None
-
-
-def _draw_sections(run: NDArray[np.integer], start_ns: Ints) -> Ints:
-    """Return rows of whole stretches of the drives, spread evenly; all rows where there are few."""
-    order = np.lexsort((start_ns, run))
-    if len(order) <= _MOST:
-        return order
-    firsts = np.linspace(0, len(order) - _STRETCH, _MOST // _STRETCH).astype(np.int64)
-    return np.unique(np.concatenate([order[first : first + _STRETCH] for first in firsts]))
-
-
-def _fit(lag: Floats, gamma: Floats, pairs: Ints) -> tuple[float, float, float]:
-    """Return length, nugget and sill of the exponential model by weighted least squares (weights of Cressie 1985: pairs / γ²)."""
-    weight = np.sqrt(pairs) / np.maximum(gamma, 1e-12 * gamma.max())
-    best = (np.inf, 0.0, 1.0, 0.0)
-    for length in _LENGTHS:
-        design = np.column_stack([np.ones(len(lag)), 1.0 - np.exp(-lag / length)])
-        (nugget, sill), misfit = nnls(design * weight[:, None], gamma * weight)
-        best = min(best, (float(misfit), float(length), float(nugget), float(sill)))
-    return best[1:]
-
-
-def compute_effective_size(xy_m: Floats, *found: Correlation) -> float:
-    """Return to how many independent samples those at ``xy_m`` [m], shape (n, 2), are worth: from 1 to n, 0 of none.
-
-    Of several correlations, the one that leaves fewest counts.
-    """
-    count = len(xy_m)
-    if count <= 1:
-        return float(count)
-    apart_m = pdist(xy_m[:_MOST_IN_CELL])
-    alike = max(one.share * float(np.exp(apart_m / -one.length_m).mean()) for one in found)
-    return count / (1.0 + (count - 1) * alike)
 
 
 NEAR = 0.25
