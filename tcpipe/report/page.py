@@ -154,8 +154,8 @@ def show_verdict(
 
 def _describe_witnesses(verdict: Verdict, label: Affected) -> str:
     """Return size and witnesses of a label; "" where it has none."""
-    found = next((finding for finding in verdict.labels if finding.subject.name == label), None)
-    return "" if found is None else " · ".join(describe_label(label, found)).removeprefix(label).strip()
+    finding = verdict.find_label(label)
+    return "" if finding is None else " · ".join(describe_label(label, finding)).removeprefix(label).strip()
 
 
 @dataclass(frozen=True, slots=True)
