@@ -214,8 +214,7 @@ def describe_label(name: str, finding: Finding | None) -> list[str]:
     return [f"{name}{size}", f"confirmed by: {witnesses}{missing}"]
 
 
-_PROVES: Mapping[str, str] = dict.fromkeys(("slope", "charge"), " (to a factor of three)")
-_PROVES |= {"second_meter": " (to a factor of two)"}
+_PROVES = dict.fromkeys(("slope", "charge"), " (to a factor of three)") | {"second_meter": " (to a factor of two)"}
 """Certainty of the scale of power by each witness."""
 
 
