@@ -139,7 +139,7 @@ def format_finding(finding: Finding) -> str:
 
 
 def format_remedy_blocks(findings: Iterable[Finding]) -> list[str]:
-    """Return the recipes of remedies that fit in no line, each once, as they stand in a file."""
+    """Return the recipes of remedies that need several lines, each once, as lines of a file."""
     remedies = (remedy for finding in findings for remedy in finding.remedies if _is_block(remedy))
     blocks = dict.fromkeys(_build_recipe_fragment(remedy).toml() for remedy in remedies)
     return [line for block in blocks for line in block.splitlines()]

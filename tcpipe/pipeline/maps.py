@@ -48,7 +48,7 @@ _CLASSES = "classes"
 
 @dataclass(frozen=True, slots=True)
 class AddedMap:
-    """What became of a map; ``str`` of it is what the command prints."""
+    """Result of adding a map; the command prints its ``str``."""
 
     path: str
     status: Literal["done", "unchanged"]
@@ -259,7 +259,7 @@ _WHOLE_FRACTION = 0.9995
 
 @dataclass(frozen=True, slots=True)
 class MapPlan:
-    """What a catalogue of open data gives for a map; ``str`` of it is what ``--dry-run`` prints."""
+    """Rasters of open data for a map; ``--dry-run`` prints its ``str``."""
 
     kind: Literal["plan"]
     name: str

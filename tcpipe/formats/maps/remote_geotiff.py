@@ -34,11 +34,11 @@ from tcpipe.terrain.projection import Projection, parse_crs
 
 _BLOCK_BYTES = 1 << 16
 _MOST_BLOCKS = 128
-"""Of one request: 8 MB."""
+"""Most blocks of one request: 8 MB."""
 _MOST_BLOCKS_READ = 1_000_000
-"""Of one raster, as it is divided."""
+"""Most blocks of one raster."""
 _LARGEST_BYTES = 1 << 42
-"""Of a remote file; its parts lie at their places in a local one."""
+"""Largest remote file [byte]; a sparse local file has its parts at the same offsets."""
 _MOST_PIXELS = 400_000_000
 _SAME_PLACE = 1.0
 """In units of a raster's CRS: names of one CRS differ, and so do its shifts to WGS 84, but not by more."""
@@ -81,7 +81,7 @@ class RemoteFile:
         return self._local.read(count)
 
     def fetch_blocks(self, first: int, last: int) -> None:
-        """Fetch blocks; the first ones tell size and version of the file, which later ones must have, too."""
+        """Fetch blocks; later blocks must have the size and version of the file of the first."""
         span = first * _BLOCK_BYTES, (last + 1) * _BLOCK_BYTES - 1
         data, headers = self._client.get(self.url, span=span, most=span[1] + 1 - span[0])
         found = re.fullmatch(rf"bytes {span[0]}-(\d{{1,15}})/(\d{{1,15}})", headers["Content-Range"] or "")
