@@ -85,9 +85,9 @@ logger = logging.getLogger("tcpipe")
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _STREAMS = "streams"
 _PROVED = "proved.json"
-"""What was compared with its manifest, and the state of the files then; may be removed at any time."""
+"""Record of files that were compared with their manifest, and their state then; may be removed at any time."""
 _NAME_HEX = 8
-"""So many digits of its log's sha256 stand in a run's name, more where two recordings of one name share them."""
+"""Digits of the log's sha256 in a run's name, more if two logs of one name share them."""
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -112,7 +112,7 @@ class Store:
         return sorted(find_highest_numbers(self.place.files("maps")))
 
     def map_number(self, name: str) -> int:
-        """Return the number of a map's last document, 0 where there is none; `StoreError` if the name cannot be one."""
+        """Return the number of a map's last document, 0 without one; `StoreError` if the name cannot be a map's."""
         if not _MAP_NAME.fullmatch(name):
             raise StoreError(
                 f"map name {name!r}: expected letters, digits, '_', '-', '.', beginning with a letter or digit"
@@ -120,11 +120,11 @@ class Store:
         return find_highest_numbers(self.place.files("maps")).get(name, 0)
 
     def map_document(self, name: str) -> MapDocument:
-        """Return where a map lies, and its files; `StoreError` where there is none, or its document is not as it was written."""
+        """Return the place of a map, and its files; `StoreError` if it is missing, or its document has changed."""
         return read_as_at(self.place.below("maps"), name_document(name, self.map_number(name)), MapDocument)
 
     def map_files(self, name: str) -> tuple[Path, FetchedShards | None]:
-        """Return where a map lies on this machine, and where its tiles are read if they lie in a bucket: what `open_map` takes."""
+        """Return the place of a map on this machine, and of its tiles if the store is in a bucket, as `open_map` takes them."""
         return self.map_at(self.map_document(name))
 
     def map_at(self, document: MapDocument) -> tuple[Path, FetchedShards | None]:
@@ -262,7 +262,7 @@ class Store:
         return self.runs_place.folders()
 
     def name_run(self, stem: str, sha256: str) -> str:
-        """Return a new run's name: as much of its hash as tells it from another recording of the same name."""
+        """Return a new run's name, with enough of its hash to differ from another log of the same name."""
         names = [f"{stem}-{sha256[:length]}" for length in range(_NAME_HEX, len(sha256), 4)]
         for name in names:
             known = self.known_run(name) if self.runs_place.files(name) else None
@@ -414,7 +414,7 @@ def is_store(path: Path | str) -> bool:
 
 
 def _read_layout(place: Place) -> str | None:
-    """Return the data model of a store, None where there is none; `UsageError` where it is another one."""
+    """Return the data model of a store, None without a store; `UsageError` for another data model."""
     version = read_layout(place)
     if version not in (None, DATA_MODEL_VERSION):
         raise UsageError(describe_other_data_model(place.where(), version))

@@ -134,7 +134,7 @@ def cli() -> None:
 
 _NOTHING_HALF = "no output is incomplete; run the same command again"
 _LATEST_S = 4.0
-"""So long a process has to end in order: a library that waits for a network or computes lets no signal through to Python."""
+"""Longest time for an orderly end [s]: a library that waits for a network or computes passes no signal to Python."""
 
 
 class Terminated(BaseException):
@@ -287,5 +287,5 @@ def _fail(problems: Sequence[str], code: int) -> NoReturn:
 
 
 def _drop_stdout() -> None:
-    """Discard output that nobody can read."""
+    """Discard output after the reader closed the pipe."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

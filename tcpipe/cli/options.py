@@ -43,7 +43,7 @@ class Place(click.ParamType[str]):
         return value
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002  click's signature
-        """Let the shell complete it as a path."""
+        """Ask the shell to complete it as a path."""
         return [CompletionItem(incomplete, type="file")]
 
 

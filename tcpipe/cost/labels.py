@@ -57,7 +57,7 @@ class Labels:
 
 @dataclass(frozen=True, slots=True)
 class SensorError:
-    """What is not known of the power sensor: standard deviations, each one error of a whole run.
+    """Uncertainty of the power sensor: standard deviations, each of one error of a whole run.
 
     Attributes
     ----------

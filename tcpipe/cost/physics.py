@@ -57,7 +57,7 @@ _LEAST_JPM = 10.0  # a percentage of less says nothing, as in `tcpipe.learning.m
 _ALWAYS = ("idle", "drivetrain")  # are paid on any grade, and never given back
 
 PHYSICS_UNITS = {"idle": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
-"""Of the terms of physics."""
+"""Units of the terms of physics."""
 
 ALL = "all"
 """The ground of a fit that knows no classes, and of classes with too few segments."""
@@ -94,7 +94,7 @@ class Physics:
     terms : what each coefficient is of: (standing, drivetrain, rolling, grade or turning; terrain class or `ALL`), J of them.
     value : P0 [W], D [N], F [N], N [N], M [W per rad/s], shape (J,).
     covariance : of the values, shape (J, J); 0 where a coefficient stands at zero.
-    recovered : k, share of downhill work that comes back; 0 where nothing was driven down steeply enough to tell.
+    recovered : k, share of downhill work that comes back; 0 unless steep downhill segments determine it.
     residual_watt : robust standard deviation of what is left [W], at least 2 % of the power.
     segments : how many segments it is fitted on.
     """
@@ -185,7 +185,7 @@ def _always(terms: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
 
 
 def _list_determined_terms(metres: FitSamples, *, idle_watt: float | None, turning: bool) -> list[tuple[str, str]]:
-    """Return the coefficients that these metres can tell."""
+    """Return the coefficients that these segments determine."""
     names, counts = np.unique(metres.terrain, return_counts=True)
     own = [str(name) for name, count in zip(names, counts, strict=True) if count >= FEWEST and name != ALL]
     classes = own if len(own) == len(names) else [*own, ALL]

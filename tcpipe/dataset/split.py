@@ -43,7 +43,7 @@ _MIN_STD = 0.1
 """Standard deviations are taken as at least this share of their median, so that no sample outweighs a hundred."""
 
 _NAMED = 5
-"""So many unknown ids are named."""
+"""Most unknown ids in one message."""
 
 
 @dataclass(slots=True)

@@ -36,7 +36,7 @@ from tcpipe.formats.place import Place, find_changed_files, open_place
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
 _UNLISTED = ("report.html",)
-"""What lies beside a card that does not list it, since it is made of it."""
+"""Files next to a card that does not list them, since they are written from it."""
 REPORT_PATCHES = "report-patches"
 """Folder beside a dataset's page, of pictures that it shows: unlisted too."""
 GENERATIONS = "generations"
@@ -58,7 +58,7 @@ class FetchedShards:
     _proved: set[str] = field(default_factory=set)
 
     def size(self, path: Path) -> int:
-        """Return the size of a shard [byte]; `FileNotFoundError` where there is none."""
+        """Return the size of a shard [byte]; `FileNotFoundError` if it is missing."""
         return self._checksum(path).size_bytes
 
     def read(self, path: Path, offset: int, size: int) -> bytes:
@@ -149,7 +149,7 @@ class FoundCard(NamedTuple):
 
 
 def find_newest(url: str, cards: Sequence[str]) -> FoundCard | None:
-    """Return the card of the newest generation at a URL; None where it is none of ``cards``, or nothing was built.
+    """Return the card of the newest generation at a URL; None for another kind than ``cards``, or without a build.
 
     The number of requests does not depend on the number of generations.
     """
@@ -246,7 +246,7 @@ def _make_copy_directory(url: str, card: bytes) -> Path:
 
 
 def _make_subdirectory(directory: Path, url: str) -> Path:
-    """Return where a copy of what lies at a URL lies in a directory: so that lines about its files show where they are from."""
+    """Return the folder for a copy of a URL in a directory, named so that messages about its files show their origin."""
     path = directory.joinpath(*(part for part in url.split("/") if part not in ("", "..")))
     path.mkdir(parents=True, exist_ok=True)
     return path

@@ -43,7 +43,7 @@ class LabelStatistics:
 
 @dataclass(frozen=True, slots=True)
 class KeptSplit:
-    """Of an earlier dataset whose split was kept: samples that have it, and those that are gone."""
+    """Numbers of samples that keep the split of an earlier dataset, and of its samples that are missing now."""
 
     samples: int
     gone: int
@@ -51,7 +51,7 @@ class KeptSplit:
 
 @dataclass(frozen=True, slots=True)
 class SplitResult:
-    """What became of the recipe's section ``split``, and what the audit found."""
+    """Result of the recipe's section ``split``, and of its audit."""
 
     buffer_m: float
     """As it was used."""
@@ -71,12 +71,12 @@ class RunSource:
     logs: tuple[str, ...]
     """Names of its log's files."""
     sha256: str
-    """Of its log."""
+    """Checksum of its log."""
     segments_sha256: str | None = None
     driven_m: float | None = None
     tags: Mapping[str, str] | None = None
     findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
-    """Of its ingest."""
+    """Findings of its ingest."""
     energy_budget: EnergyBudget | None = None
     samples: int = 0
 
@@ -122,7 +122,7 @@ class FlaggedSamples:
 
 @dataclass(frozen=True, slots=True)
 class MapRegistration:
-    """How a map lies against a run's track (`tcpipe.terrain.registration`); no shift or scale where the ground cannot tell one."""
+    """Registration of a map to a run's track (`tcpipe.terrain.registration`); no shift or scale unless the ground determines it."""
 
     run_id: str
     points: int
@@ -136,7 +136,7 @@ class MapRegistration:
     """Metres that the track rises where the map rises by one."""
     height_scale_std: float | None = None
     expected_misfit_m: float | None = None
-    """What the track's own height errors and the map's resolution leave [m]."""
+    """Misfit by the track's own height errors and the map's resolution [m]."""
     applied_std_m: float | None = field(default=None, metadata=LEFT_OUT)
     """DRMS of the shift, where the run's positions were moved by it."""
 
@@ -174,7 +174,7 @@ class MapSource:
     classes_from: str | None = None
     inputs: MapInputs | None = None
     findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
-    """Of building it."""
+    """Findings of building it."""
     registration: tuple[MapRegistration, ...] = ()
 
     @property
@@ -194,7 +194,7 @@ class Removal:
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """A Parquet file of patches: where it lies in the dataset, its split and rows."""
+    """A Parquet file of patches: its path in the dataset, split and rows."""
 
     path: str
     split: str
@@ -203,7 +203,7 @@ class Shard:
 
 @dataclass(frozen=True, slots=True)
 class Redacted:
-    """What a redacted dataset does not tell, and what it does not hide."""
+    """Facts that a redacted dataset omits, and facts that it does not hide."""
 
     moved: str = (
         "to 0 N 0 E as a whole, grid north up: lon, lat, x, y, course, heights, regions; distances are those of the ground, as chord_m, "
@@ -272,7 +272,7 @@ class DatasetCard:
     flagged_samples: FlaggedSamples
     """How many samples carry a quality flag."""
     findings: tuple[Finding, ...] = ()
-    """Of the dataset itself: its choice of runs, sampling and splits. Runs and maps have their own."""
+    """Findings of the dataset itself: its choice of runs, sampling and splits. Runs and maps have their own."""
     verdict: Verdict
     """By all findings of the dataset, its maps and the runs that have samples."""
     physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
@@ -283,7 +283,7 @@ class DatasetCard:
     exclusions: tuple[Exclusion, ...] = field(default=(), metadata=LEFT_OUT)
     """A sample of two lists counts for the first one."""
     redaction: Redacted | None = field(default=None, metadata=LEFT_OUT)
-    """What is redacted; None for a dataset that is not redacted."""
+    """Omitted facts; None for a dataset that is not redacted."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""

@@ -327,7 +327,7 @@ class PatchFiles:
         return CHUNK_ROWS if self.arrays else GROUP_ROWS
 
     def expect(self, pieces: Iterable[int], layers: Iterable[str]) -> None:
-        """Have pieces brought here that are read soon, where they lie in a bucket."""
+        """Fetch pieces that are read soon, if they are in a bucket."""
         if self.fetched is not None and self.arrays:
             with _convert_errors(_AGAIN):
                 for layer in layers:
@@ -416,7 +416,7 @@ def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int,
 
 
 def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDArray[np.int64]:
-    """Return where each sample lies in the order of the files, (N,); ``splits`` is the samples' column, (N,)."""
+    """Return the row of each sample in the order of the files, (N,); ``splits`` is the samples' column, (N,)."""
     places = np.arange(len(splits))
     if card.format == "parquet":  # one split after the other
         rows = np.concatenate([np.flatnonzero(splits == name) for name in SPLITS])

@@ -139,7 +139,7 @@ def format_finding(finding: Finding) -> str:
 
 
 def format_remedy_blocks(findings: Iterable[Finding]) -> list[str]:
-    """Return the recipes of remedies that fit in no line, each once, as they stand in a file."""
+    """Return the recipes of remedies that need several lines, each once, as lines of a file."""
     remedies = (remedy for finding in findings for remedy in finding.remedies if _is_block(remedy))
     blocks = dict.fromkeys(_build_recipe_fragment(remedy).toml() for remedy in remedies)
     return [line for block in blocks for line in block.splitlines()]
@@ -156,18 +156,20 @@ def _build_recipe_fragment(remedy: Remedy) -> RecipeFragment:
 
 def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more: str = "") -> list[str]:
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
-    ordered = sort_findings(findings)
-    found = [finding for finding in ordered if finding.severity != "note"]
-    notes = sum(finding.severity == "note" and finding.code != WITNESSES_OF_LABEL for finding in ordered)
-    return list_findings(found[:most]) + _count_rest(len(found) - most, notes, more)
+    printed = _sort_printed(findings)
+    problems = [finding for finding in printed if finding.severity != "note"]
+    return list_findings(problems[:most]) + _count_rest(len(problems) - most, len(printed) - len(problems), more)
+
+
+def _sort_printed(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the findings, the worst first, except those on witnesses, which are lines of the verdict."""
+    return [finding for finding in sort_findings(findings) if finding.code != WITNESSES_OF_LABEL]
 
 
 def list_findings(findings: Iterable[Finding]) -> list[str]:
     """Return every finding as a line, the worst first, notes too, with the recipe that fits in no line below it."""
     lines = []
-    for finding in sort_findings(findings):
-        if finding.code == WITNESSES_OF_LABEL:  # a line of the verdict
-            continue
+    for finding in _sort_printed(findings):
         lines += [f"{finding.severity}: {format_finding(finding)}"]
         lines += [f"    {line}" for line in format_remedy_blocks([finding])]
     return lines
@@ -187,13 +189,14 @@ def format_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) 
 
 def list_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) -> list[str]:
     """Return a line for each label: ``energy 172 ± 7 J/m · confirmed by: slope · usable``; ± is σ of one segment."""
-    labels = {finding.subject.name: finding for finding in verdict.labels}
-    return [" · ".join([*describe_label(name, labels.get(name)), getattr(verdict, name)]) for name in quantities]
+    return [
+        " · ".join([*describe_label(name, verdict.find_label(name)), getattr(verdict, name)]) for name in quantities
+    ]
 
 
 def describe_power(verdict: Verdict) -> list[str]:
     """Return idle and driving power, and the energy per metre of known robots, as one line; nothing without energy."""
-    finding = next((finding for finding in verdict.labels if finding.subject.name == "energy"), None)
+    finding = verdict.find_label("energy")
     if finding is None or "driving_watt" not in finding.numbers:
         return []
     sizes = {name: format_number(name, number) for name, number in finding.numbers.items()}
@@ -211,19 +214,16 @@ def describe_label(name: str, finding: Finding | None) -> list[str]:
     return [f"{name}{size}", f"confirmed by: {witnesses}{missing}"]
 
 
-_PROVES: Mapping[str, str] = {
-    "slope": " (to a factor of three)", "charge": " (to a factor of three)", "second_meter": " (to a factor of two)"
-}  # fmt: skip
-"""What a witness of power proves of its scale."""
+_PROVES = dict.fromkeys(("slope", "charge"), " (to a factor of three)") | {"second_meter": " (to a factor of two)"}
+"""Certainty of the scale of power by each witness."""
 
 
 def _format_size(key: str, numbers: Mapping[str, float]) -> str:
     """Return `` 172 ± 7 J/m`` or, of several runs, `` 158 to 190 ± 7 J/m``, with the decimals of σ; of a position σ alone."""
     std, suffix = numbers[key], key.removeprefix("std")
     digits = max(-int(np.floor(np.log10(std))), 0) if std > 0.0 else 3
-    values = dict.fromkeys(
-        f"{numbers[f'{of}{suffix}']:.{digits}f}" for of in ("mean", "most") if f"{of}{suffix}" in numbers
-    )
+    means = [numbers[name] for name in (f"mean{suffix}", f"most{suffix}") if name in numbers]
+    values = dict.fromkeys(f"{mean:.{digits}f}" for mean in means)
     return f" {' to '.join(values)}{' ' if values else ''}± {std:.{digits}f}{_UNITS[suffix][0]}"
 
 
@@ -337,18 +337,23 @@ def format_mixed_groups(
     groups: Sequence[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
 ) -> list[str]:
     """Return the same of groups of different things, each with the arguments of `format_group`."""
-    found = [group for group in groups if group[0].severity != "note"]
-    ordered = sorted(found, key=lambda group: rank_severity(group[0].severity))[:most]
-    notes = sum(group.severity == "note" and group.code != WITNESSES_OF_LABEL for group, *_ in groups)
-    return list_mixed_groups(ordered) + _count_rest(len(found) - most, notes, more)
+    printed = _sort_printed_groups(groups)
+    problems = [group for group in printed if group[0].severity != "note"]
+    return list_mixed_groups(problems[:most]) + _count_rest(len(problems) - most, len(printed) - len(problems), more)
+
+
+def _sort_printed_groups(
+    groups: Iterable[tuple[FindingGroup[K], int | None, str]],
+) -> list[tuple[FindingGroup[K], int | None, str]]:
+    """Return what `_sort_printed` does of groups."""
+    printed = (group for group in groups if group[0].code != WITNESSES_OF_LABEL)
+    return sorted(printed, key=lambda group: rank_severity(group[0].severity))
 
 
 def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
     """Return every group as a line, the worst first, notes too."""
     lines = []
-    for group, total, what in sorted(groups, key=lambda entry: rank_severity(entry[0].severity)):
-        if group.code == WITNESSES_OF_LABEL:
-            continue
+    for group, total, what in _sort_printed_groups(groups):
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines

@@ -27,7 +27,7 @@ _WGS84_NAMES = ("CRS84", "4326")
 _MAX_OVERLAP_M2 = 0.01
 _MAX_WIDTH_KM, _KM_PER_DEG = 1_000.0, 111.32
 MAX_BYTES = 50_000_000
-"""Of a GeoJSON file."""
+"""Largest GeoJSON file [byte]."""
 
 MAX_VALUES = 1_500_000
 """Lists and objects of a file, nearly all of them positions."""
@@ -115,20 +115,17 @@ def read_polygons(path: Path, *, is_terrain: bool = False) -> tuple[list[Polygon
     for where, properties, geometry in _iterate_features(path):
         invalid: list[BaseGeometry] = []
         is_empty = geometry is None or (isinstance(geometry, dict) and geometry.get("coordinates") == [])
-        found = (
-            ()
-            if is_terrain and is_empty
-            else _iterate_polygons(where, geometry, problems, invalid if is_terrain else None)
-        )
-        polygons = list(found)  # fills ``invalid``
-        mended = shapely.get_parts(shapely.get_parts(shapely.make_valid(np.array(invalid, dtype=object))))
-        polygons += [part for part in mended if part.geom_type == "Polygon"]
+        polygons: list[BaseGeometry] = []
+        if not (is_terrain and is_empty):
+            polygons += _iterate_polygons(where, geometry, problems, invalid if is_terrain else None)
+        repaired = shapely.get_parts(shapely.get_parts(shapely.make_valid(np.array(invalid, dtype=object))))
+        polygons += [part for part in repaired if part.geom_type == "Polygon"]
         features.append(PolygonFeature(where, properties, tuple(polygons), len(invalid)))
     return features, problems
 
 
 def shorten_value(value: object) -> str:
-    """Return a value as it stands in a file, cut if it is long."""
+    """Return a value as a file has it, cut if it is long."""
     text = repr(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
 
@@ -276,7 +273,7 @@ class LineFeature(Generic[P]):
 
 
 def read_line(path: Path) -> NDArray[np.float64]:
-    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` where there is none."""
+    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` without a line."""
     try:
         features = list(_iterate_features(path))
     except RegionError as error:

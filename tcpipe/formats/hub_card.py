@@ -25,7 +25,7 @@ _LICENCES = {
     "apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-2.0", "cc-by-3.0", "cc-by-4.0", "cc-by-sa-3.0", "cc-by-sa-4.0",
     "cc-by-nc-3.0", "cc-by-nc-4.0", "cc-by-nd-4.0", "cc-by-nc-nd-4.0", "cc-by-nc-sa-4.0", "odbl", "pddl", "odc-by", "gpl-3.0",
 }  # fmt: skip
-"""Those of which the Hub knows the name; others are told by theirs."""
+"""Names of licences that the Hub knows; others keep their own name."""
 _SIZES = {10**3: "n<1K", 10**4: "1K<n<10K", 10**5: "10K<n<100K", 10**6: "100K<n<1M", 10**7: "1M<n<10M"}
 _SHOWN_LAYERS = 12
 

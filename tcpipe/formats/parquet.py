@@ -341,7 +341,7 @@ def move_rows_to_file(array: NDArray[N], rows: NDArray[np.int64], directory: Pat
 
 
 def return_freed_memory() -> None:
-    """Have columns go back to the system when nobody needs them: heaps would keep the room of all that there ever was."""
+    """Return freed memory of columns to the system: the heap would keep the largest amount that was ever used."""
     pa.set_memory_pool(pa.system_memory_pool())
     with suppress(OSError, AttributeError, TypeError):  # only glibc has it
         library = ctypes.CDLL(None)

@@ -211,7 +211,7 @@ _MOST_DOTS = 1000
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the values of a TOML document; `ValueError` where it is none, is nested too deep, or a line has too many dots."""
+    """Return the values of a TOML document; `ValueError` for other text, too deep nesting, or a line with too many dots."""
     for number, line in enumerate(text.splitlines(), 1):
         if (dots := line.count(".")) > _MOST_DOTS:
             raise ValueError(f"line {number} has {dots} dots, at most {_MOST_DOTS}")

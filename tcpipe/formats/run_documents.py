@@ -36,7 +36,7 @@ class LogOrigin:
     sha256: str
     size_bytes: int = 0
     sha256_of: Literal["log", "index"] = "log"
-    """What is hashed: of a log in object storage, of which only a part was fetched, sizes and indexes of its files (ADR-30)."""
+    """Hashed content: of a log in object storage, of which only a part was fetched, sizes and indexes of its files (ADR-30)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class Ingestion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Manifest(Ingestion):
-    """What became of a run under a recipe; ``info.report`` has the findings of every stage."""
+    """Result of a run under a recipe; ``info.report`` has the findings of every stage."""
 
     recipe: IngestSections
     counts: Counts
@@ -154,7 +154,7 @@ class Manifest(Ingestion):
 
 @dataclass(frozen=True, slots=True)
 class StreamInfo:
-    """What stands in the metadata of a role's Parquet file; ``key`` names the read settings it was made with."""
+    """Metadata of a role's Parquet file; ``key`` names the read settings with which it was written."""
 
     key: str
     robot: str
@@ -249,7 +249,7 @@ def is_unmarked_store(place: Place) -> bool:
 
 
 def read_layout(place: Place) -> str | None:
-    """Return the data model of a store, None where there is none; `StoreError` where its mark is not as it was written."""
+    """Return the data model of a store, None without a store; `StoreError` if its mark has changed."""
     where, data = place.where(MARK), place.read(MARK)
     if broken := data is not None and find_broken_seal(data, where):
         raise StoreError(f"{broken}; {COPY_MARK}")

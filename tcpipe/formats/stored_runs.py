@@ -1,4 +1,4 @@
-"""Finished ingestions as they lie in a store: their documents and tables, each proved when it is read."""
+"""Finished ingestions in a store: their documents and tables, each verified when it is read."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class RunDirectory:
     runs: Place
     """``runs/`` of the store."""
     facts: RunFacts
-    """What the log has of it: enough to choose by."""
+    """Facts in the log of commits, enough to select the run."""
     files_state: FilesState = ()
     """Distinguishes its files from what is written under their names later."""
 
@@ -116,7 +116,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Ingestions:
-    """What a store, or one of its runs, holds of finished ingestions, by run and recipe."""
+    """Finished ingestions of a store, or of one of its runs, by run and recipe."""
 
     state: State
     finished: tuple[RunDirectory, ...]
@@ -130,7 +130,7 @@ class Ingestions:
 
     @property
     def damaged(self) -> dict[tuple[str, str], str]:
-        """What is lost, as lines."""
+        """Lost files, as lines."""
         return {key: str(lost) for key, lost in self.lost.items()}
 
     @property
@@ -158,7 +158,7 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
 
 
 def make_file_finder(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
-    """Return what tells the size [byte] and modification time [ns] of a file of the runs of rows; None where there is none."""
+    """Return a function that finds the size [byte] and modification time [ns] of a file of the runs of rows; None without a file."""
     return _find_on_disk(place.path) if place.path else _find_listed(place, rows)
 
 
@@ -253,7 +253,7 @@ class _LentTables(Mapping[str, pa.Table]):
 
 
 def lend_streams(place: Place, streams: Streams, stored: Mapping[str, Checksum]) -> Streams:
-    """Return L1 with the tables that a long log fills read whenever they are asked for: nobody holds them in between.
+    """Return L1 with large tables that are read at each access, and not kept in memory between accesses.
 
     In a bucket they are held: each time they would be fetched.
 

@@ -41,7 +41,7 @@ JSON, PAGE, SAMPLES = "evaluation.json", "evaluation.html", "predictions.parquet
 
 @dataclass(frozen=True, slots=True)
 class EvaluationResult:
-    """What was found and where it lies; ``str`` of it is what the command prints."""
+    """Result and its path; the command prints its ``str``."""
 
     path: Path | str
     values: Evaluation
@@ -141,7 +141,7 @@ def _read_at_url(url: str, key: str) -> EvaluationResult | None:
 def _make_key(
     model: str | Path, dataset: str | Path, config: EvaluateConfig, own: list[str], *, simulated: bool
 ) -> str:
-    """Return what tells one evaluation from another."""
+    """Return the text that identifies an evaluation."""
     lines = [
         seal_document(read_model_card(fetch_directory(model))),
         compute_dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
@@ -165,14 +165,14 @@ class AdaptationFacts:
     model: str
     dataset: str
     robots: tuple[str, ...]
-    """Of the model, then of the dataset."""
+    """Robots of the model, then of the dataset."""
     known_m: tuple[float, ...]
     errors: tuple[AdaptedErrors, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class AdaptationResult:
-    """What was found and where it lies; ``str`` of it is what the command prints."""
+    """Result and its path; the command prints its ``str``."""
 
     path: Path
     values: AdaptationFacts

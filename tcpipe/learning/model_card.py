@@ -27,17 +27,17 @@ from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
 KIND = "tcpipe model"
 
 SCHEMA_VERSION = 4
-"""Of model.json and the files beside it."""
+"""Version of model.json and the files next to it."""
 
 
 @dataclass(frozen=True, slots=True)
 class LayerRange:
-    """What patches of a layer of the user's were like: the means of its bands, or shares of its classes."""
+    """Range of a user's layer in training patches: the means of its bands, or shares of its classes."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
     largest: float
-    """Of all training samples and bands, how far from the mean, in standard deviations."""
+    """Largest distance from the mean of all training samples and bands, in standard deviations."""
 
     @classmethod
     def estimate(cls, values: NDArray[np.float64]) -> LayerRange:
@@ -52,12 +52,12 @@ class LayerRange:
 
 
 _LEAST_SHARE = 1e-3
-"""Of its mean, by which a band varies at least: what is rounded is not outside."""
+"""Least variation of a band, as a share of its mean: rounding is not outside the training range."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingRange:
-    """What the training samples held; predictions beyond it are extrapolations."""
+    """Range of the training samples; predictions beyond it are extrapolations."""
 
     class_counts: Mapping[int, int]
     """Samples by their terrain class."""
@@ -66,7 +66,7 @@ class TrainingRange:
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest ``slope_rad``, ``cross_slope_rad``, ``relief_m`` (highest above lowest pixel of a patch)."""
     layers: Mapping[str, LayerRange] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Of the user's layers that it takes."""
+    """Ranges of the user's layers that the model uses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Training:
     """Hash of dataset and options: the same key, the same training."""
     config: FitConfig
     kind: ModelKind
-    """Of the model: that of the options, or the one that was chosen."""
+    """Kind of the model: that of the options, or the one that was chosen."""
     optimizer: str
     samples: Mapping[str, int]
     """``fitted``, and ``held out`` to stop by."""
@@ -107,7 +107,7 @@ class ModelCard:
     schema_version: int = SCHEMA_VERSION
     inputs: Inputs
     layers: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Of its channels, those that are not the paper's, as its dataset describes them."""
+    """Descriptions of channels that are not the paper's, from its dataset."""
     chord_m: float
     """d: T = d / v."""
     max_arc_to_chord: float
@@ -122,11 +122,11 @@ class ModelCard:
     classes: tuple[TerrainClass, ...]
     training_range: TrainingRange
     physics: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
-    """Of the robot, by the dataset: the planner takes what turns cost from it."""
+    """Physics of the robot, by the dataset: the planner takes the cost of turns from it."""
     dataset: TrainedOn
     training: Training
     checksums: Mapping[str, Checksum] = field(default_factory=dict)
-    """Of the files beside it, by name."""
+    """Checksums of the files next to it, by name."""
 
     @cached_property
     def class_table(self) -> ClassTable:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TrainOptions:
-    """What is trained on what, and how; None of the network's own options is the default of `tcpipe.learning.fitting.FitConfig`."""
+    """Options of training; a network option that is None has the default of `tcpipe.learning.fitting.FitConfig`."""
 
     dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
     out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))

@@ -37,7 +37,7 @@ _CUT_DEVIATION = 0.87962566103423978
 
 _FILED = {"weight": "kernel", "bias": "bias"}
 _FILED_NORM = {"weight": "gamma", "bias": "beta", "running_mean": "moving_mean", "running_var": "moving_variance"}
-"""What torch calls a weight, and its name in a file, which is that of Keras."""
+"""Names of weights in torch, and in a file, as Keras has them."""
 
 
 class Normed(nn.Module):
@@ -182,7 +182,7 @@ def find_device_name() -> str:
 
 
 def move_to_device(patches: Floats) -> Any:
-    """Return patches (N, px, px, depth) as images (N, depth, px, px), which lie in memory as the patches do."""
+    """Return patches (N, px, px, depth) as images (N, depth, px, px), with the memory layout of the patches."""
     return torch.from_numpy(np.ascontiguousarray(patches, np.float32)).to(find_device()).permute(0, 3, 1, 2)
 
 
@@ -250,7 +250,7 @@ class SmallNetwork(Network):
 
 
 _EPSILON = 1e-7
-"""Of Adam, as Keras has it; torch's own is 1e-8."""
+"""Epsilon of Adam, as Keras has it; torch's own is 1e-8."""
 
 
 class Trainer:

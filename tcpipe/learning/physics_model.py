@@ -52,7 +52,7 @@ class PhysicsModel(Predictor):
     recovered: Floats
     """Share of negative work that comes back, shape ()."""
     usual_turn_radpm: Floats
-    """Of the training samples: what a metre is taken to turn where nothing is known of it, shape ()."""
+    """Usual turn of a metre of the training samples, for metres with an unknown turn, shape ()."""
     rolling_newton: Floats
     """F by class id, shape (256,)."""
     turning_joule_per_rad: Floats
@@ -163,10 +163,10 @@ class Curves:
     form: Form
     knots_rad: Floats
     pooled: Floats
-    """Of all ground, and of classes that are not known, shape (J, outputs)."""
+    """Coefficients of all ground, and of unknown classes, shape (J, outputs)."""
     class_id: NDArray[np.int64]
     own: Floats
-    """Of each of these classes, shape (classes, J, outputs)."""
+    """Coefficients of each of these classes, shape (classes, J, outputs)."""
 
     def predict(self, slope_rad: Floats, class_id: NDArray[np.int64]) -> Floats:
         """Return outputs, shape (N, outputs), of metres of ground."""

@@ -30,7 +30,7 @@ LeverArms = dict[str, tuple[float, float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Autopilot:
-    """What an autopilot logged: messages by name (those of instances beside the first are called ``name_1`` …), and parameters."""
+    """Log of an autopilot: messages by name (those of instances beside the first are called ``name_1`` …), and parameters."""
 
     kind: AutopilotKind
     messages: Mapping[str, Stamped]

@@ -1,4 +1,4 @@
-"""What messages mean: from a topic's fields to the SI columns of its role, row by row, with everything that is left out counted.
+"""Meaning of messages: from a topic's fields to the SI columns of its role, row by row; excluded rows are counted by reason.
 
 Columns in, columns out, named as in the levels' tables. Sources: the definitions of sensor_msgs, nav_msgs and geometry_msgs (their
 comments fix units, frames and what -1 and 0 mean), REP-103, REP-105, REP-145.
@@ -170,7 +170,7 @@ def _is_absent(columns: Columns, name: str) -> Mask:
 
 
 _UNMEASURED_VAR = 1e3
-"""Drivers fill in 1e3 to 1e9 [SI units squared] for what they do not measure; nobody measures as badly as that."""
+"""Smallest variance [SI units squared] that means "not measured": drivers write 1e3 to 1e9 for such components."""
 
 
 def _find_unmeasured(columns: Columns, name: str, twist: Floats) -> Mask:
@@ -192,7 +192,7 @@ _FEWEST_ZEROS = 20
 
 
 def _read_orientation(columns: Columns, prefix: str) -> tuple[Floats, Mask]:
-    """Return unit quaternions (N, 4), NaN where they are none, and which rows those are."""
+    """Return unit quaternions (N, 4), NaN for other values, and the rows of these."""
     given = np.stack([columns[f"{prefix}.{c}"].astype(np.float64) for c in "xyzw"], -1)
     length = np.linalg.norm(given, axis=-1)
     bad = ~(np.abs(length - 1.0) < _QUAT_TOLERANCE)
@@ -241,7 +241,7 @@ def _read_nav_sat_fix(columns: Columns) -> Readings:
 
 
 def _read_altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
-    """Return heights with the median of the known ones where there is none, and where that is.
+    """Return heights, the median of the known ones where a height is missing, and the rows of these.
 
     NaN is sensor_msgs/NavSatFix's word for it; a receiver's own digits never stand still, so one constant is a word for it too.
     """
@@ -310,7 +310,7 @@ def _make_ground_velocity(
 
 
 _HELD_COURSE_MPS = 0.3
-"""Below this receivers hold the course they last had, or tell any: the velocity is then anywhere on a circle of that radius."""
+"""Speed [m/s] below which a receiver repeats its last course or invents one: the velocity is anywhere on a circle of that radius."""
 _SLOW_STD_MPS = 0.1
 
 
@@ -381,7 +381,7 @@ def _read_gps_fix(columns: Columns) -> Readings:
 
 
 _STDS_OF_95 = 2.0
-"""gps_common/GPSFix: errors are told at 95 per cent confidence."""
+"""gps_common/GPSFix: errors are stated at 95 per cent confidence."""
 
 
 def _read_velocity_twist(columns: Columns) -> Readings:
@@ -441,7 +441,7 @@ _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
 def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, NDArray[Any]], Floats]:
-    """Return a twist's columns, null where it is not measured, and the twist as it was told, shape (N, 6)."""
+    """Return a twist's columns, null where it is not measured, and the twist as published, shape (N, 6)."""
     linear, angular = _read_vector(columns, f"{prefix}.linear"), _read_vector(columns, f"{prefix}.angular")
     twist = np.concatenate((linear, angular), -1)
     unmeasured = _find_unmeasured(columns, covariance, twist)

@@ -38,22 +38,22 @@ from tcpipe.tables.columns import to_integers
 from tcpipe.tables.levels import GEOMETRY, PLACED_SEGMENTS, Streams
 
 _NEARBY_NS = 5_000_000_000
-"""Gates and refusals this long before and after a segment are told [ns]."""
+"""Rejections this long before and after a segment are printed [ns]."""
 
 
 Value: TypeAlias = str | int | float | bool | None
-"""Of a column in one row."""
+"""Value of a column in one row."""
 
 Row: TypeAlias = Mapping[str, Any]
 """Values of a row of samples.parquet by column."""
 
 Setting: TypeAlias = Value | Sequence[Value | Mapping[str, Value]] | Mapping[str, Value | Sequence[Value]]
-"""Of a key of a recipe."""
+"""Value of a key of a recipe."""
 
 
 @dataclass(frozen=True, slots=True)
 class MessageRange:
-    """Which messages of a role lie in a segment: from ``first`` to ``last`` of so many."""
+    """Messages of a role in a segment: from ``first`` to ``last`` of all."""
 
     topic: str
     type: str
@@ -220,7 +220,7 @@ def _run(store: Store, directory: Path, card: DatasetCard, sample: Row) -> RunDi
 
 
 def _find_messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, MessageRange]]:
-    """Yield, for every role, its topic and which of its messages lie in the segment."""
+    """Yield, for every role, its topic and its messages in the segment."""
     for role, table in streams.tables.items():
         stamps = to_integers(table, "stamp_ns")
         first, last = np.searchsorted(stamps, [start_ns, end_ns], side="left")

@@ -29,7 +29,7 @@ from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, MaskedTra
 
 @dataclass(frozen=True, slots=True)
 class Ingested:
-    """What became of a log: the log as it was then, and what a commit is to have of its run."""
+    """Result of ingesting a log: the log at that time, and the facts of its run for the commit."""
 
     source: LogSource
     result: IngestResult

@@ -37,7 +37,7 @@ _CLASSES = "classes"
 
 @dataclass(frozen=True, slots=True)
 class AddedMap:
-    """What became of a map; ``str`` of it is what the command prints."""
+    """Result of adding a map; the command prints its ``str``."""
 
     path: str
     status: Literal["done", "unchanged"]

@@ -78,14 +78,14 @@ class Status:
     groups: tuple[Group, ...]
     """By state and cause."""
     to_do: Estimate | None
-    """What the next ingest will take; None where nothing is to do."""
+    """Estimate for the next ingest; None if nothing is to do."""
     problems: tuple[Finding, ...]
     """Sources that cannot be read, runs that are not complete, logs that wait for too long, calls that were killed, damaged commits."""
     gone: tuple[str, ...]
     """Sources that cannot be read and that only calls before the latest ingest were given."""
     superseded_runs: int
     begun: tuple[BegunCall, ...]
-    """Calls that have begun and not ended: they run, perhaps run, or were killed and nobody acknowledged that."""
+    """Calls that have begun and not ended: they run, perhaps run, or were killed without an acknowledgement."""
     history: tuple[CallRecord, ...]
     """The latest calls, the last one first."""
     verdict: Verdict
@@ -93,7 +93,7 @@ class Status:
     runs: int
     """Under the ruling recipe."""
     findings: Mapping[str, int]
-    """Of those, how many have a finding, by code: what is no note, the worst first."""
+    """Number of runs with each warning and error, by code, the worst first."""
     losses: tuple[StoreLoss, ...]
     """The ten largest, over the runs under the ruling recipe."""
     exit_code: int

@@ -55,7 +55,7 @@ _INDEX = "index"
 _KNOWN = "dataset, run, store, map (.zarr), model or cost map"
 
 _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
-"""What a directory is, by the document that proves all files beside it."""
+"""Kind of a directory, by the document with the checksums of its files."""
 
 _HOW_MADE = {"dataset": "build", "model": "train", "cost map": "make"}
 
@@ -66,7 +66,7 @@ _BESIDE = ".aux.xml"
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """What was read again, and each thing that is not as it was written; ``str`` of it is what the command prints."""
+    """Number of files that were read again, and changed ones; the command prints its ``str``."""
 
     path: str
     kind: str
@@ -74,7 +74,7 @@ class Verified:
     read: Mapping[str, int]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    """How to repair the problems; what a redacted dataset does not tell."""
+    """How to repair the problems; limits of a redacted dataset."""
 
     def __str__(self) -> str:
         """Return a line of what was read, and one for each problem."""

@@ -47,7 +47,7 @@ UNCERTAIN, UNLABELLED = "position_uncertain", "no_label"
 
 @dataclass(frozen=True, slots=True)
 class IntervalComparison:
-    """A drive's sum as it was measured and predicted, and the ends of its interval, None where the model tells no errors."""
+    """Measured and predicted sum of a drive, and the ends of its interval, None if the model has no errors."""
 
     measured: float
     predicted: float
@@ -75,15 +75,15 @@ class DriveCost:
     driven_m: float
     """Odometer of the whole drive."""
     segments_m: float
-    """Of it in segments: no starts, stops, turns in place, reversing."""
+    """Distance in segments: without starts, stops, turns in place, reversing [m]."""
     compared_m: float
-    """Of them with labels, on ground that the model knows."""
+    """Distance of segments with labels, on ground inside the training range [m]."""
     rest_m: Mapping[str, float]
     """The other segments, by why they are not compared; a metre may have several reasons."""
     samples_in_training: int
-    """Of this very drive: a drive with any is not held back."""
+    """Training samples of this drive: a drive with any is no holdout."""
     near_training_percent: float
-    """Of its segments with their middle within 1.05 chords of that of a training sample of any drive."""
+    """Share of its segments with their middle within 1.05 chords of that of a training sample of any drive [%]."""
     duration_s: IntervalComparison
     energy_joule: IntervalComparison
     label_energy: str
@@ -95,7 +95,7 @@ class DriveCost:
 
 
 def find_drive(store: Store, log: str) -> RunDirectory:
-    """Return the ingested run of a log, by its path or its run's name; `UsageError` if there is none, or it lies under several recipes."""
+    """Return the ingested run of a log, by its path or its run's name; `UsageError` if it is missing, or has several recipes."""
     found = []
     for run in store.runs():
         known = store.run_json(run.run_id)
@@ -302,7 +302,7 @@ class Drives:
 
 @dataclass(frozen=True, slots=True)
 class DrivesResult:
-    """What was found and where it lies; ``str`` of it is what the command prints."""
+    """Result and its path; the command prints its ``str``."""
 
     path: Path | str
     values: Drives

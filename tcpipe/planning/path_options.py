@@ -98,7 +98,7 @@ class PlanPathOptions:
 
 @dataclass(frozen=True, slots=True)
 class CostMapOptions:
-    """Of which map the costs are predicted, with which model, and how finely."""
+    """Options of a cost map: map, model and resolution."""
 
     model: str = required(MODEL)
     out: str = option("cost-map", Option(kind="published", metavar="[OUT]", is_argument=True))

@@ -1,4 +1,4 @@
-"""What a log shows of its power sensor's errors: the zero of a current at rest, a gain that changes, and a sign that is lost.
+"""Errors of the power sensor that a log shows: the zero of a current at rest, a gain that changes, and a sign that is lost.
 
 A battery sags in proportion to the current: dU = -R dI over seconds, with R its resistance. That is known without any model of the robot or
 its ground, so that it judges the current: where R seems to change at once, the gain of the current did (by the inverse), and where the
@@ -128,12 +128,11 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     """Return the clearest change of the gain, by the battery's resistance before and after; None where it is not sure, or gradual."""
     if sag is None:
         return None
-    edge_ns = np.arange(sag.stamp_ns[0], sag.stamp_ns[-1], round(_BLOCK_S * 1e9), dtype=np.int64)
-    by_volt, weight = (np.diff(product) for product in sag.products(edge_ns))
+    edge_ns, by_volt, weight = _split_blocks(sag)
     used = weight > 0.0
     edge_ns, by_volt, weight = edge_ns[:-1][used], by_volt[used], weight[used]
     count = len(weight)
-    if count < 2 * _FEWEST_BLOCKS or not _is_known(by_volt, weight):
+    if count < 2 * _FEWEST_BLOCKS or _estimate_ohm(by_volt, weight) is None:
         return None
     resistance, place = -by_volt / weight, np.arange(count)
 
@@ -152,7 +151,6 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
         variance = max(step / (len(at) - 3), 1e-300)
         return (unexplained(ones) - step) / variance, (unexplained(ones, at) - step) / variance
 
-    halves = _compare_halves(edge_ns, by_volt, weight)
     judged = {first: judge(first) for first in range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1)}
     first = max(judged, key=lambda at: judged[at][0])
     before, after = (
@@ -161,38 +159,40 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     is_sure = judged[first][0] > _SURE**2 and judged[first][1] > _GRADUAL**2
     least = read_threshold("current-gain-changes", "min_change_fraction")
     if not is_sure or min(before, after) <= 0.0 or abs(before / after - 1.0) < least:
-        return halves
+        return _compare_halves(edge_ns, by_volt, weight)
     return GainChange(int(edge_ns[first]), before / after)
 
 
 def _compare_halves(edge_ns: Stamps, by_volt: Floats, weight: Floats) -> GainChange | None:
     """Return the gain of the second half of the blocks over the first; None where it is usual, or a half does not show the resistance."""
     middle = len(weight) // 2
-    first, last = slice(middle), slice(middle, None)
-    if not (_is_known(by_volt[first], weight[first]) and _is_known(by_volt[last], weight[last])):
+    first_ohm, last_ohm = (_estimate_ohm(by_volt[half], weight[half]) for half in (slice(middle), slice(middle, None)))
+    if first_ohm is None or last_ohm is None:
         return None
-    ratio = float(by_volt[first].sum() / weight[first].sum()) / float(by_volt[last].sum() / weight[last].sum())
-    most = read_threshold("current-gain-changes", "max_ratio_of_halves")
+    ratio, most = first_ohm / last_ohm, read_threshold("current-gain-changes", "max_ratio_of_halves")
     return None if 1.0 / most <= ratio <= most else GainChange(int(edge_ns[middle]), ratio)
 
 
 def estimate_resistance_ohm(sag: Sag | None) -> float | None:
-    """Return the resistance of the battery by all of its sag [ohm]; None where it is not known to 5 %."""
-    if sag is None:
-        return None
+    """Return the resistance of the battery by all of its sag [ohm]; None if it is not known to 5 %."""
+    return None if sag is None else _estimate_ohm(*_split_blocks(sag)[1:])
+
+
+def _split_blocks(sag: Sag) -> tuple[Stamps, Floats, Floats]:
+    """Return the edges of blocks [ns] and, of each block, the sums of voltage times current and of the current's square."""
     edge_ns = np.arange(sag.stamp_ns[0], sag.stamp_ns[-1], round(_BLOCK_S * 1e9), dtype=np.int64)
-    by_volt, weight = (np.diff(product) for product in sag.products(edge_ns))
-    return -float(by_volt.sum() / weight.sum()) if len(weight) and _is_known(by_volt, weight) else None
+    by_volt, by_amp = (np.diff(product) for product in sag.products(edge_ns))
+    return edge_ns, by_volt, by_amp
 
 
-def _is_known(by_volt: Floats, by_amp: Floats) -> bool:
-    """Return whether the battery sags clearly, by what blocks leave over."""
+def _estimate_ohm(by_volt: Floats, by_amp: Floats) -> float | None:
+    """Return the resistance of the battery by blocks [ohm]; None unless the residuals of the blocks show a clear sag."""
     total = float(by_amp.sum())
     if total <= 0.0:
-        return False
-    resistance = -float(by_volt.sum()) / total
-    std = float(np.linalg.norm(by_volt + resistance * by_amp)) / total
-    return resistance > _CLEAR * std
+        return None
+    ohm = -float(by_volt.sum()) / total
+    std_ohm = float(np.linalg.norm(by_volt + ohm * by_amp)) / total
+    return ohm if ohm > _CLEAR * std_ohm else None
 
 
 def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Floats) -> NDArray[np.bool_]:
@@ -206,9 +206,9 @@ def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Flo
     (volt_0, amp_0), (volt_1, amp_1) = sag.products(start_ns), sag.products(end_ns)
     by_volt, by_amp = volt_1 - volt_0, amp_1 - amp_0
     driven = rise > 0.0
-    if not _is_known(by_volt[driven], by_amp[driven]):
+    resistance = _estimate_ohm(by_volt[driven], by_amp[driven])
+    if resistance is None:
         return nothing
-    resistance = -float(by_volt[driven].sum()) / float(by_amp[driven].sum())
     residual_volt = estimate_robust_std(sag.volt + resistance * sag.amp)
     gain = 2.0 * resistance * by_volt / residual_volt**2
     clear = gain > _LIKELY

@@ -303,7 +303,7 @@ _OVERLAP_NODES = 24  # of the overlap of two periods
 
 @dataclass(frozen=True, slots=True)
 class SignalModel:
-    """What a signal is made of; variances in its unit squared.
+    """Parts of a signal; variances in its unit squared.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which rows of a power topic are no measurement: missing or marked values, values far from their neighbours, and overflows.
+"""Rows of a power topic that are no measurement: missing or marked values, values far from their neighbours, and overflows.
 
 A meter may be read less often than its messages are sent: the neighbours of a value are the nearest different values.
 """
@@ -57,16 +57,15 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     steps, repeats = np.abs(np.diff(value[rest])), np.bincount(np.cumsum(new) - 1)
     isolated = marked & (distance > _compute_usual(steps)) & (repeats <= _MOST_REPEATS * np.median(repeats[rest]))
     rest = np.flatnonzero(~isolated)
-    by_most, deviation = _compare_with_median(value[rest], 5, 0.9)
-    relative, _ = _compare_with_median(value[rest], 5, 0.99)
+    deviation, (by_most, relative) = _compare_with_median(value[rest], 5, (0.9, 0.99))
     limit, low_limit, times = (
         read_threshold(EXCLUDED, f"max_{name}") for name in ("of_top", "of_top_clear", "scatters")
     )
-    scatter = max(np.quantile(deviation, 0.9), np.median(steps))
-    far = relative > limit
+    scatter, far = max(np.quantile(deviation, 0.9), np.median(steps)), relative > limit
     isolated[rest] = far | ((relative > low_limit) & (deviation > times * scatter))
     found[rows] = isolated[np.cumsum(new) - 1]
-    block = np.flatnonzero(_compare_with_median(value[rest], 11, 0.99)[0] > limit)
+    _, (by_wide_median,) = _compare_with_median(value[rest], 11, (0.99,))
+    block = np.flatnonzero(by_wide_median > limit)
     runs = np.split(rest[block], np.flatnonzero(np.diff(block) > 1) + 1)
     is_block = any(run.size > 2 and at_s[run[-1]] - at_s[run[0]] < _SHORTEST_DRIVE_S for run in runs)
     share = max(far.mean(), np.mean(by_most > limit))
@@ -78,11 +77,12 @@ def _compute_usual(steps: Floats) -> float:
     return float(np.quantile(np.abs(np.append(0.0, steps[steps != 0.0])), 0.99))
 
 
-def _compare_with_median(values: Floats, width: int, quantile: float) -> tuple[Floats, Floats]:
-    """Return deviations from the median of ``width`` values: relative to that or to its quantile over the run, and absolute."""
+def _compare_with_median(values: Floats, width: int, quantiles: tuple[float, ...]) -> tuple[Floats, list[Floats]]:
+    """Return deviations from the median of ``width`` values: absolute, and relative to it or, if larger, its quantiles over the run."""
     middle = np.median(sliding_window_view(np.pad(values, width // 2, mode="edge"), width), axis=1)
     size, deviation = np.abs(middle), np.abs(values - middle)
-    return deviation / np.maximum(size, np.quantile(size[size > 0.0], quantile) if size.any() else 1.0), deviation
+    tops = np.quantile(size[size > 0.0], quantiles) if size.any() else np.ones(len(quantiles))
+    return deviation, [deviation / np.maximum(size, top) for top in tops]
 
 
 def undo_overflow(current_amp: Floats) -> tuple[Floats, float, bool]:

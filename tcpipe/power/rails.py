@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _PERIODS = 3
-"""So many periods without a sample are a gap, where the recipe allows less: a message that is lost now and then is none."""
+"""Periods without a sample that are a gap, if the recipe allows less: single lost messages are no gap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ def interpolate_rail(each: Rail, at_ns: Stamps) -> tuple[Floats, Floats]:
 
 
 def compute_power_watt(rails: list[Rail], at_ns: Stamps) -> Floats:
-    """Return the power of all rails at each time, [W], shape (M,), ends held; NaN if a rail is never known, or there is none."""
+    """Return the power of all rails at each time, [W], shape (M,), ends held; NaN without rails, or if a rail is never known."""
     total = np.full(len(at_ns), np.nan if not rails else 0.0)
     for each in rails:
         volt, amp = interpolate_rail(each, at_ns)
@@ -125,7 +125,7 @@ def compute_power_watt(rails: list[Rail], at_ns: Stamps) -> Floats:
 
 
 def sum_power(rails: list[Rail]) -> Samples | None:
-    """Return the power of all rails [W] at the first one's currents; None where a rail is never known, or there is none."""
+    """Return the power of all rails [W] at the first one's currents; None without rails, or if a rail is never known."""
     if not rails or not all(len(each.stamp_ns) for each in rails):
         return None
     stamp_ns = rails[0].current.stamp_ns
@@ -184,7 +184,7 @@ Rule = Literal["exact", "averaged", "right_endpoint"]
 
 
 def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
-    """Return the energy of all rails over each span [J], shape (M,); NaN where any rail is unknown in part of it, or there is none."""
+    """Return the energy of all rails over each span [J], shape (M,); NaN without rails, or where a rail is unknown in part of it."""
     total = np.full(len(start_ns), np.nan if not rails else 0.0)
     for each in rails:
         energy = np.full(len(start_ns), np.nan)
@@ -241,7 +241,7 @@ FEWEST_ROWS = 40
 """Fewest rows of a stationary robot."""
 _QUARTERS = 4
 _UNSEEN_SHARE = 0.1
-"""Of the power: how far one stationary second may be from the rest of the run. The pack of FoMo's robot,
+"""Share of the power by which one stationary second may differ from the rest of the run. The pack of FoMo's robot,
 which stands once for seconds, gives 12 % of that more while driving than the drives take (docs/explanation/real-data.md)."""
 
 

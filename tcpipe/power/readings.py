@@ -40,17 +40,22 @@ from tcpipe.robots import (
     PowerSource,
     parse_fields,
 )
+from tcpipe.tables.facts import PowerSign
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold, select_findings
 
 _LOG_TIME = "log_time_ns"
 _POWER = Subject("role", "power")
 _ASSUMED, _WRAPPED, _NOMINAL = "current-sign-assumed", "current-wrapped", "voltage-assumed"
 _STATUS, _CHARGING = "power_supply_status", 1
-"""Of sensor_msgs/BatteryState."""
+"""Field of sensor_msgs/BatteryState and its value while the battery is charged."""
 _SIGNS = ("drawn_negative", "drawn_positive")
 
 Rails = Mapping[str, list[RailReadings]]
 """By topic."""
+
+
+def _list_rails(rails: Rails) -> list[tuple[str, RailReadings]]:
+    return [(topic, rail) for topic, of_topic in rails.items() for rail in of_topic]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,38 +69,21 @@ class Sides:
 
 @dataclass(frozen=True, slots=True)
 class PowerReadings:
-    """What the power topics hold: ``rails`` row by row as the messages; none where it was rejected, and ``findings`` hold the reason."""
+    """Power topics: ``rails`` have a row for each message; without rails ``findings`` state why the power is rejected."""
 
     rails: Rails = field(default_factory=dict)
-    averaged: bool = False
-    averaging_unknown: bool = False
-    """Whether it averages is not known; ``averaged`` is what to assume where the motion does not show it either."""
     findings: tuple[Finding, ...] = ()
-    current_sign: str | None = None
-    """The sign of a drawn current, and its source; None without power."""
-    includes: tuple[str, ...] = ()
-    """What the currents feed besides the drives."""
-    gain_std_fraction: float | None = None
-    """σ of the gain of the least certain source, as a fraction."""
-    offset_std_amp: float | None = None
-    """Of the zero of its current [A]."""
-    rest_current_amp: tuple[float, float] | None = None
-    """Lowest and highest current of a rail at rest [A]; None where a source does not state it."""
-    charge_ratio: float | None = None
-    """Integral of the current over the fall of the battery's charge; None without a counter, or where it falls by less than 5 %."""
-    meter_slope: float | None = None
-    """Slope of a second meter's power over this one; None without a second meter that follows it."""
+    facts: PowerSign | None = None
+    """None without power; its ``zero_amp`` is not subtracted yet."""
+    averaging_unknown: bool = False
+    """Whether the source averages is unknown; ``facts.averaged`` is the assumption if the motion does not show it."""
     sides: Sides | None = None
-    """Currents of both sides of the drive; None where they are not told apart."""
-    offset_amp: float = 0.0
-    """Zero of each rail's current that the recipe states [A]; it is not subtracted yet."""
-    charging: bool = False
-    """Whether messages state that the battery is charged."""
+    """Currents of both sides of the drive; None if they are not measured separately."""
 
     @property
     def is_rejected(self) -> bool:
-        """Whether there are topics, but what they hold is not used."""
-        return any(found.code == REJECTED for found in self.findings)
+        """Whether there are power topics, but tcpipe does not use them."""
+        return any(finding.code == REJECTED for finding in self.findings)
 
 
 def read_power(
@@ -150,35 +138,32 @@ def read_power(
             rejected[0] = replace(rejected[0], remedies=_propose_sources(scaled))
         return PowerReadings(findings=tuple(rejected))
     given: CurrentSign = "auto" if any(source.joints for source in sources) else current_sign
-    sign, of_sign, told_by = _sign(rails, log_times, sources, given)
+    sign, sign_findings, sign_source = _sign(rails, log_times, sources, given)
     if sign == 0:
-        return PowerReadings(findings=of_sign)
+        return PowerReadings(findings=sign_findings)
     includes = tuple(dict.fromkeys(source.other_loads for source in sources if source.other_loads))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
     nominal = list(_find_nominal(sources))
     constant = [] if nominal else list(_find_constant_voltages(rails, _sum_currents(rails, log_times)[1]))
-    findings += [*of_sign, *loads, *nominal, *constant]
+    findings += [*sign_findings, *loads, *nominal, *constant]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(source.energy for source in sources)
-    unknown = any(source.averaging_unknown for source in sources) and not counts
-    averaged = counts or any(source.averaged for source in sources)
-    rest = [source.rest_current_amp for source in sources if source.current and source.rest_current_amp]
-    return PowerReadings(
-        signed,
-        averaged,
-        unknown,
-        tuple(dict.fromkeys(findings)),
-        told_by,
+    rest_amp = [source.rest_current_amp for source in sources if source.current and source.rest_current_amp]
+    is_rest_known = rest_amp and len(rest_amp) == sum(bool(source.current or source.energy) for source in sources)
+    facts = PowerSign(
+        sign_source,
+        counts or any(source.averaged for source in sources),
         includes,
-        gain_std_fraction=math.hypot(max(gains), *(found.numbers["std_fraction"] for found in constant)),
-        offset_std_amp=max(source.zero_std for source in sources),
-        rest_current_amp=(min(range_amp[0] for range_amp in rest), max(range_amp[1] for range_amp in rest))
-        if rest and len(rest) == sum(bool(source.current or source.energy) for source in sources)
-        else None,
-        charge_ratio=_compare_charges(topics, signed),
-        sides=_find_sides(topics, sources, signed, sign),
-        offset_amp=offset_amp,
-        charging=any(np.any(columns.get(_STATUS, ()) == _CHARGING) for _, columns in topics.values()),
+        math.hypot(max(gains), *(finding.numbers["std_fraction"] for finding in constant)),
+        max(source.zero_std for source in sources),
+        (min(low for low, _ in rest_amp), max(high for _, high in rest_amp)) if is_rest_known else None,
+        offset_amp,
+        any(np.any(columns.get(_STATUS, ()) == _CHARGING) for _, columns in topics.values()),
+        _compare_charges(topics, signed),
+    )
+    unknown = any(source.averaging_unknown for source in sources) and not counts
+    return PowerReadings(
+        signed, tuple(dict.fromkeys(findings)), facts, unknown, _find_sides(topics, sources, signed, sign)
     )
 
 
@@ -188,33 +173,28 @@ def _scale_source(source: PowerSource, factor: float) -> PowerSource:
     return replace(source, **{name: factor * getattr(source, name) for name in scales})
 
 
-_FULL_PERCENT = 100.0
-
-
 def _compare_charges(topics: Mapping[str, tuple[str, Columns]], rails: Rails) -> float | None:
     """Return the integral of the current over the fall of the charge, of the topic whose charge contradicts it most."""
     ratios = []
-    for topic, found in rails.items():
+    for topic, of_topic in rails.items():
         _, columns = topics[topic]
         charge_ah = _read_charge(columns)
-        if charge_ah is not None and not is_power_only(found[0].voltage_volt):
+        if charge_ah is not None and not is_power_only(of_topic[0].voltage_volt):
             time_s = np.asarray(columns[_LOG_TIME], np.float64) * 1e-9
-            ratios.append(compare_charge(time_s, np.sum([rail.current_amp for rail in found], axis=0), charge_ah))
+            ratios.append(compare_charge(time_s, np.sum([rail.current_amp for rail in of_topic], axis=0), charge_ah))
     return max((ratio for ratio in ratios if ratio), key=lambda ratio: abs(math.log(abs(ratio))), default=None)
 
 
 def _read_charge(columns: Columns) -> Floats | None:
     """Return the charge of a battery message [Ah], shape (N,): its own, else its state of charge times its capacity; None without both."""
-    values = {name: np.asarray(columns[name], np.float64) for name in _CHARGES if name in columns}
+    names = ("charge", "percentage", "capacity", "design_capacity")
+    values = {name: np.asarray(columns[name], np.float64) for name in names if name in columns}
     if np.isfinite(values.get("charge", np.nan)).any():
         return values["charge"]
     share, capacity_ah = values.get("percentage"), values.get("capacity", values.get("design_capacity"))
     if share is None or capacity_ah is None or not np.isfinite(share * capacity_ah).any():
         return None
-    return share * capacity_ah / (_FULL_PERCENT if np.nanmax(share) > 1.0 else 1.0)
-
-
-_CHARGES = ("charge", "percentage", "capacity", "design_capacity")
+    return share * capacity_ah / (100.0 if np.nanmax(share) > 1.0 else 1.0)
 
 
 _MIN_CORRELATION = 0.7
@@ -231,7 +211,7 @@ def compare_second_meters(
 ) -> PowerReadings:
     """Return the power with the slope of the second meter that contradicts it most; ``meters`` are power topics that are not used."""
     series = [_sum_watt(topics[topic][1], rails) for topic, rails in power.rails.items()]
-    if not series or not meters:
+    if power.facts is None or not meters:
         return power
     slopes = []
     for topic, (type_name, columns) in meters.items():
@@ -244,7 +224,8 @@ def compare_second_meters(
         slope, correlation = compare_meters(np.asarray(drive, np.float64), watt) or (np.nan, 0.0)
         if abs(correlation) > _MIN_CORRELATION:
             slopes.append(abs(slope))
-    return replace(power, meter_slope=max(slopes, key=lambda slope: abs(math.log(slope)), default=None))
+    worst = max(slopes, key=lambda slope: abs(math.log(slope)), default=None)
+    return replace(power, facts=replace(power.facts, meter_slope=worst))
 
 
 def _sum_watt(columns: Columns, rails: Sequence[RailReadings]) -> tuple[Floats, Floats]:
@@ -264,15 +245,14 @@ def _find_sides(
         of_sign = -1 if sources[0].sign == "drawn_negative" else 1
         first, second = (of_sign * sign * field.sign * read_values(columns, field) for field in fields_added)
         return Sides(np.asarray(columns[_LOG_TIME], np.float64), first, second)
-    named = [(rail.name.lower(), topic, rail) for topic, found in rails.items() for rail in found]
-    left, right = ([entry for entry in named if side in entry[0]] for side in ("left", "right"))
-    if len(named) != 2 or len(left) != 1 or len(right) != 1:
+    every = _list_rails(rails)
+    left, right = ([entry for entry in every if side in entry[1].name.lower()] for side in ("left", "right"))
+    if len(every) != 2 or len(left) != 1 or len(right) != 1:
         return None
-    (_, topic, first_rail), (_, other, second_rail) = left[0], right[0]
-    first_ns, second_ns = (np.asarray(topics[name][1][_LOG_TIME], np.float64) for name in (topic, other))
-    known = np.isfinite(second_rail.current_amp)
-    second_amp = np.interp(first_ns, second_ns[known], second_rail.current_amp[known])
-    return Sides(first_ns, first_rail.current_amp, second_amp)
+    left_ns, right_ns = (np.asarray(topics[topic][1][_LOG_TIME], np.float64) for topic, _ in (*left, *right))
+    left_amp, right_amp = (rail.current_amp for _, rail in (*left, *right))
+    known = np.isfinite(right_amp)
+    return Sides(left_ns, left_amp, np.interp(left_ns, right_ns[known], right_amp[known]))
 
 
 def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
@@ -286,17 +266,16 @@ def _find_nominal(sources: Sequence[PowerSource]) -> Iterator[Finding]:
 def _find_constant_voltages(rails: Rails, amp: Floats) -> Iterator[Finding]:
     """Yield the rails whose voltage has too few levels to be measured, while the whole current [A] changes."""
     fraction, least = (read_threshold(_NOMINAL, f"constant_{name}") for name in ("std_fraction", "levels_count"))
-    for rail in (rail for found in rails.values() for rail in found):
+    for _, rail in _list_rails(rails):
         levels = np.unique(rail.voltage_volt[np.isfinite(rail.voltage_volt)])
         if 0 < levels.size < least and levels[0] != UNIT_VOLT and np.unique(amp).size > 4 * least:
-            yield make_finding(
-                _NOMINAL, _POWER, names={"rail": rail.name}, voltage_volt=levels.mean(), std_fraction=fraction
-            )
+            names, volt = {"rail": rail.name}, levels.mean()
+            yield make_finding(_NOMINAL, _POWER, names=names, voltage_volt=volt, std_fraction=fraction)
 
 
 @dataclass(frozen=True, slots=True)
 class _TopicRails:
-    """What a topic's messages hold: a rail for each source."""
+    """Sources of a topic's messages, and a rail for each."""
 
     sources: list[PowerSource]
     rails: list[RailReadings]
@@ -314,7 +293,7 @@ class _TopicRails:
 def _read_first_valid(
     topic: str, columns: Columns, choices: Sequence[list[PowerSource]], known: Sequence[PowerSource]
 ) -> _TopicRails | list[Finding]:
-    """Return the rails of the first choice whose numbers can be power, or why there are none."""
+    """Return the rails of the first choice whose numbers can be power, or why no choice can."""
     rejected: list[Finding] = []
     for sources in choices:
         found = read_rails(columns, sources, topic, known)
@@ -393,9 +372,8 @@ def _unwrap_currents(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
 
 def _pair_rails(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
     """Give the one rail without current and the one without voltage a common name: they are one rail on two topics."""
-    flat = [rail for found in rails.values() for rail in found]
-    without_voltage = [rail.name for rail in flat if not np.isfinite(rail.voltage_volt).any()]
-    without_current = [rail.name for rail in flat if not np.isfinite(rail.current_amp).any()]
+    without_voltage = [rail.name for _, rail in _list_rails(rails) if not np.isfinite(rail.voltage_volt).any()]
+    without_current = [rail.name for _, rail in _list_rails(rails) if not np.isfinite(rail.current_amp).any()]
     if len(without_voltage) != 1 or len(without_current) != 1 or without_voltage == without_current:
         return rails
     pair = {*without_voltage, *without_current}
@@ -408,9 +386,8 @@ def _pair_rails(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailRead
 def _find_incomplete(rails: Rails) -> list[Finding]:
     """Return why rails, each of the topics that hold its parts, are no power: one without voltage, or without current."""
     parts: dict[str, list[tuple[str, RailReadings]]] = {}
-    for topic, found in rails.items():
-        for rail in found:
-            parts.setdefault(rail.name, []).append((topic, rail))
+    for topic, rail in _list_rails(rails):
+        parts.setdefault(rail.name, []).append((topic, rail))
     return [
         reject_power(named_parts[0][0], f"no-{quantity}", names={"rail": name})
         for name, named_parts in parts.items()
@@ -421,7 +398,7 @@ def _find_incomplete(rails: Rails) -> list[Finding]:
 
 def _find_too_small(rails: Rails) -> list[Finding]:
     """Return why rails together are no power: the smallest motors take more without load, their unit is another one."""
-    parts = [(topic, rail) for topic, found in rails.items() for rail in found]
+    parts = _list_rails(rails)
     volts = {rail.name: np.nanmedian(rail.voltage_volt) for _, rail in parts if np.isfinite(rail.voltage_volt).any()}
     amps = {
         rail.name: np.nanquantile(np.abs(rail.current_amp), 0.99)
@@ -454,7 +431,7 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
     """
     kept: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
     findings = []
-    for topic, rail in ((topic, rail) for topic, found in rails.items() for rail in found):
+    for topic, rail in _list_rails(rails):
         volt, amp, names = rail.voltage_volt, rail.current_amp, {"rail": rail.name}
         excluded = np.abs(amp) > rail.largest_amp
         stated = np.nan if rail.counter else np.where(excluded, np.nan, amp)  # a counter's first row has no current
@@ -480,7 +457,7 @@ def _undo_overflows(
     """Return the rails without overflows of signed currents, and findings; power is rejected where the voltage does not confirm them."""
     whole: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
     findings, are_clear = [], True
-    for topic, rail in ((topic, rail) for topic, found in rails.items() for rail in found):
+    for topic, rail in _list_rails(rails):
         current_amp, span_amp, is_clear = undo_overflow(rail.current_amp)
         whole[topic].append(replace(rail, current_amp=current_amp))
         if span_amp and not rail.counter:
@@ -501,7 +478,7 @@ def _undo_overflows(
 def _correlate_voltage(rails: Rails, log_times: Mapping[str, Floats]) -> float:
     """Return the correlation of voltage and whole current within seconds, of either sign; 0 where it is unknown."""
     time_s, amp = _sum_currents(rails, log_times)
-    volts = ((log_times[topic], rail.voltage_volt) for topic, found in rails.items() for rail in found)
+    volts = ((log_times[topic], rail.voltage_volt) for topic, rail in _list_rails(rails))
     at_ns, volt = next(each for each in volts if np.isfinite(each[1]).any())
     samples = [make_samples(at.astype(np.int64), value) for at, value in ((at_ns, volt), (1e9 * time_s, amp))]
     sag = measure_sag([make_rail("", *samples, averaged=False)])
@@ -558,8 +535,7 @@ def _sum_currents(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Floats
     """Return the sum of all rails' currents [A] at the log times of the first topic that carries one, and these times [s]."""
     parts = [
         (log_times[topic][known] / 1e9, rail.current_amp[known])
-        for topic, found in rails.items()
-        for rail in found
+        for topic, rail in _list_rails(rails)
         if (known := np.isfinite(rail.current_amp)).any()
     ]
     time_s = parts[0][0]

@@ -29,16 +29,16 @@ Stamps = NDArray[np.int64]
 
 _FEWEST_INTERVALS = 20
 _LEAST_MESSAGES = 1.5
-"""For which a reading lasts."""
+"""Fewest messages per reading."""
 _LONGEST_INTERVAL = 4
 """In reading periods: longer ones, as of a stationary robot, show no period."""
 _REGULAR_SHARE = 0.9
 _SINGLE_SHARE = 0.5
-"""Of the intervals, one reading period long."""
+"""Smallest share of intervals that are one reading period long."""
 _TOLERANCE = 0.3
-"""Of a reading period: a reading shows at the next message, and no device is read at exact times."""
+"""Tolerance in reading periods: the next message shows a reading, and devices are not read at exact times."""
 _JUMPING_SHARE = 0.1
-"""Of the changes."""
+"""Smallest share of changes by more than one level."""
 
 
 def find_readings(stamp_ns: Stamps, values: Floats) -> NDArray[np.int64] | None:
@@ -185,7 +185,7 @@ def _compute_squared_residuals(power_watt: Floats, causes: Floats) -> Floats:
 
 
 _INSTANT_S = 0.1
-"""Motion is averaged over so much about a sample."""
+"""Span around a sample over which motion is averaged [s]."""
 _WIDTHS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 _DELAYS_S = np.linspace(-2.0, 2.0, 81)
 SMOOTHING_MARGIN_S, DELAY_MARGIN_S = _WIDTHS_S[-1], 2.0 + _INSTANT_S
@@ -195,7 +195,7 @@ _DELAY_GROUPS = 8
 _MAX_ROWS = 20_000
 """Power samples that are compared with the motion, evenly taken of more."""
 _FEWEST_MEANS = 20
-"""Of a width, one after the other in the record: to fewer the five causes fit by chance, where power wanders slowly."""
+"""Fewest means of a width in the record: five causes fit fewer by chance if power wanders slowly."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
-"""From a power topic's messages to voltages and currents, by the tables that say what its type means; and whether they can be believed.
+"""Voltages and currents of a power topic's messages, by the tables of its type; and reasons to reject them.
 
-A *rail* is one voltage and the currents drawn at it; a robot's propulsion power is the sum over its rails. What feeds computers and user
-ports is never part of it where the message tells them apart (paper, section IV-A: "current consumed by the motors for propulsion").
+A *rail* is one voltage and the currents drawn at it; a robot's propulsion power is the sum over its rails. The supply of computers and user
+ports is not part of it if the message measures it separately (paper, section IV-A: "current consumed by the motors for propulsion").
 
 Power of joints (sensor_msgs/JointState): each draws p = torque * speed + r * torque². Where the torque is the motor current's (times the
 torque constant, at the shaft whose speed is measured) and r the motor's resistance over the squared constant, that is the motor's
@@ -99,7 +99,7 @@ REJECTED = "power-rejected"
 class RailReadings:
     """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,).
 
-    Of a counter of energy the current is a first one, by times that nobody has judged yet. In ``unmeasured_count`` rows one of the summed
+    Of a counter of energy the current is a first one, by times that are not verified yet. In ``unmeasured_count`` rows one of the summed
     currents stood still or was clipped: there the current is NaN.
     """
 
@@ -245,7 +245,7 @@ def read_rails(
 
 
 def _read_joints(columns: Columns, source: PowerSource, topic: str) -> RailReadings | Finding:
-    """Return the power of a source's joints, or why there is none; torques against the motion have the wrong sign."""
+    """Return the power of a source's joints, or why it is unknown; torques against the motion have the wrong sign."""
     motion = select_joints(columns, source)
     if not motion.names:
         there = ", ".join(np.unique(columns[NAMES]).tolist())
@@ -315,7 +315,7 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
 
 _FROZEN_NS, _FEWEST_EQUAL = 5_000_000_000, 20
 _MOVES = 0.5
-"""Of the range that holds 90 % of a current: what changes by so much is driven."""
+"""Share of the range of 90 % of a current: a current that changes by more is driven."""
 _BESIDE, _CROWDED = 20, 10.0
 """Levels next to the end of a range, and how many times as many values as on one of them are at the end of a clipped current."""
 
@@ -400,7 +400,7 @@ def _choose_stamps(columns: Columns) -> NDArray[np.int64]:
 
 
 def _sum_fields(columns: Columns, fields: Sequence[FieldPath]) -> Floats:
-    """Return the sum of fields, NaN where there is none or one of them is not known."""
+    """Return the sum of fields, NaN without fields or where one of them is unknown."""
     if not fields:
         return np.full(len(next(iter(columns.values()))), np.nan)
     parts = [

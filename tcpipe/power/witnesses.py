@@ -14,7 +14,7 @@ The limits were measured on logs of two Warthogs and a rover and on simulated dr
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding, Severity, Subjec
 
 Floats = NDArray[np.float64]
 
+IMPLAUSIBLE = "power-implausible"
 _GRAVITY_MPS2 = 9.80665
 
 _MIN_SEGMENTS = 20
@@ -44,23 +45,21 @@ _MIN_METER_ROWS = 50
 
 
 class Climb(NamedTuple):
-    """What a slope costs: power = … + factor · m g sin(slope) v. ``factor`` is 1 / efficiency, ``std`` its standard deviation.
+    """Power of climbing: … + factor · m g sin(slope) v. ``factor`` is 1 / efficiency, ``std`` its standard deviation.
 
-    ``reliability`` is the correlation of the slope with that of its neighbours, in [-1, 1]: below 0.7 the slopes are mostly noise.
+    ``reliability`` is the correlation of the slope with that of its neighbours, in [-1, 1].
     """
 
     factor: float
     std: float
     reliability: float
 
-    def judge(self, low: float, high: float, *, min_reliability: float, max_std_fraction: float) -> ScaleVerdict:
-        """Return what the factor proves of the scale of power, if ``low`` to ``high`` are possible."""
-        if not self.reliability >= min_reliability or not 0.0 < self.std < max_std_fraction * abs(self.factor):
-            return "unconfirmed"
-        return "confirmed" if low < self.factor < high else "contradicted"
-
-
-ScaleVerdict = Literal["confirmed", "contradicted", "unconfirmed"]
+    def is_certain(self) -> bool:
+        """Return whether the slopes are more than noise, and the factor can confirm or contradict the scale of power."""
+        least, most = (
+            read_threshold(IMPLAUSIBLE, name) for name in ("min_slope_reliability", "max_climb_std_fraction")
+        )
+        return self.reliability >= least and 0.0 < self.std < most * abs(self.factor)
 
 
 def estimate_climb(
@@ -94,23 +93,22 @@ def estimate_climb(
     columns, instruments = (
         np.column_stack([ones, velocity, weight * each[used], turn[used]]) for each in (slope, instrument)
     )
-    factor, std = _fit_with_instruments(columns, instruments, power_watt[used], of=2)
+    factor, std = _fit_with_instruments(columns, instruments, power_watt[used], column=2)
     return Climb(factor, std, float(np.corrcoef(slope[used], instrument[used])[0, 1]))
 
 
 def _average_neighbours(values: Floats, piece: NDArray[np.int64]) -> Floats:
     """Return the mean of the values two before and two behind in the same piece, shape (M,); NaN without either."""
-    found = np.full((2, len(values)), np.nan)
+    neighbours = np.full((2, len(values)), np.nan)
     shift = _INSTRUMENT_SHIFT
     same = piece[shift:] == piece[:-shift]
-    found[0, shift:][same] = values[:-shift][same]
-    found[1, :-shift][same] = values[shift:][same]
-    known = np.isfinite(found)
-    total, count = np.where(known, found, 0.0).sum(axis=0), known.sum(axis=0)
-    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+    neighbours[0, shift:][same] = values[:-shift][same]
+    neighbours[1, :-shift][same] = values[shift:][same]
+    count = np.isfinite(neighbours).sum(axis=0)
+    return np.asarray(np.where(count > 0, np.nansum(neighbours, axis=0) / np.maximum(count, 1), np.nan))
 
 
-def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, *, of: int) -> tuple[float, float]:
+def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, *, column: int) -> tuple[float, float]:
     """Return one coefficient of a robust two-stage least-squares fit and its σ; columns and instruments have shape (M, K)."""
     size = np.maximum(np.abs(columns).max(axis=0), 1e-12)
     columns, instruments = columns / size, instruments / size
@@ -127,7 +125,7 @@ def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, 
     starts = np.arange(0, len(target), _BLOCK_SEGMENTS)
     sums = np.add.reduceat(fitted * (weight * residual)[:, None], starts, axis=0)
     covariance = inverse @ (sums.T @ sums) @ inverse.T * (len(starts) / max(len(starts) - columns.shape[1], 1))
-    return float(value[of] / size[of]), float(np.sqrt(covariance[of, of]) / size[of])
+    return float(value[column] / size[column]), float(np.sqrt(covariance[column, column]) / size[column])
 
 
 def compute_weight_ratio(net_energy_jpm: Floats, rise: Floats, mass_kg: float) -> float | None:
@@ -209,12 +207,11 @@ def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Ite
     most, most_of_batteries = (read_threshold(_BATTERY, name) for name in ("max_ratio", "max_ratio_of_batteries"))
     for robot, by_run in by_robot.items():
         for run_id, ohm in by_run.items():
-            others = [other for other_id, other in by_run.items() if other_id != run_id]
-            if len(others) > 1:  # of three or more runs a single odd one does not make the others odd
-                others.append(ohm)
-            ratio = ohm / float(np.median(others)) if others else 1.0
-            if max(ratio, 1.0 / ratio) > most:
-                severity: Severity | None = "error" if max(ratio, 1.0 / ratio) > most_of_batteries else None
-                yield make_finding(
-                    _BATTERY, Subject("run", run_id), severity=severity, names={"robot": robot}, ratio=ratio
-                )
+            # Of two runs each is compared with the other; of three or more a single odd one does not make the others odd.
+            compared = [other for other_id, other in by_run.items() if other_id != run_id or len(by_run) != 2]
+            ratio = ohm / float(np.median(compared))
+            excess = max(ratio, 1.0 / ratio)
+            if excess > most:
+                severity: Severity | None = "error" if excess > most_of_batteries else None
+                names = {"robot": robot}
+                yield make_finding(_BATTERY, Subject("run", run_id), severity=severity, names=names, ratio=ratio)

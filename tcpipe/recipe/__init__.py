@@ -2,7 +2,7 @@
 
 It is checked when it is made, in TOML and in Python alike. ``formats.recipe_toml`` reads it from TOML; docs/reference/recipe.md and
 ``tcpipe init`` are written from the docstrings here.
-Units stand in the names. Rulings and their sources: docs/explanation/rulings.md.
+Names end in their units. Rulings and their sources: docs/explanation/rulings.md.
 
 A bound is where a value can mean nothing any more, or costs without end: it is far outside of what any robot, sensor or site asks for.
 """
@@ -45,7 +45,7 @@ Radians = Annotated[float, Bounds(ge=-6.3, le=6.3)]
 Offset = Annotated[float, Bounds(ge=-2e9, le=2e9)]
 """Between two clocks [s]: from one that counts from its start to UTC, or back."""
 Scale = Annotated[float, Bounds(ge=0.01, le=100)]
-"""Of a measurement, to be multiplied with; further off are other units."""
+"""Factor on a measurement; values outside the bounds are other units."""
 
 
 class _Section:
@@ -411,7 +411,7 @@ class TableMapping:
 
 @dataclass(frozen=True, slots=True)
 class IngestSections:
-    """What rules a run's files, beside its log and robot: all that its stages get, and what `recipe_id` is the hash of."""
+    """Sections of a recipe that decide a run's files, with its log and robot; `recipe_id` is their hash."""
 
     read: ReadConfig
     fuse: FuseConfig

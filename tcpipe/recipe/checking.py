@@ -104,7 +104,7 @@ def _find_dataclasses(kind: Any, found: set[type]) -> set[type]:
 
 @cache
 def _read_key_docstrings(cls: type) -> Mapping[str, str]:
-    """Return the docstring that stands below each field of a dataclass."""
+    """Return the docstring of each field of a dataclass."""
     body = cast("ast.ClassDef", ast.parse(dedent(inspect.getsource(cls))).body[0]).body
     found = {}
     for statement, text in pairwise(body):
@@ -136,7 +136,7 @@ def _format_schema(schema: Mapping[str, Any]) -> str:
 
 
 TO_MEASURE = "?"
-"""In a suggested recipe: a number that the user must measure. It is not TOML, so that nobody uses it unread."""
+"""Number in a suggested recipe that the user must measure. It is not TOML, so that it is not used unread."""
 
 
 def as_toml(value: Any) -> str:
@@ -160,7 +160,7 @@ def _make_key(name: str) -> str:
 
 
 def parse_utc_ns(text: str) -> int:
-    """Return a time in ISO 8601 as [ns since 1970], UTC where it names no zone; `ValueError` where it is none."""
+    """Return a time in ISO 8601 as [ns since 1970], UTC where it names no zone; `ValueError` for other text."""
     moment = datetime.fromisoformat(text)
     since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
     return 1000 * (since // timedelta(microseconds=1))

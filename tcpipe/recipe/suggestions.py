@@ -42,7 +42,7 @@ class RecipeFragment:
         return " and ".join(f"{head} {', '.join(lines)}" for head, lines in self._format_tables())
 
     def toml(self) -> str:
-        """Return it as lines that stand in a recipe as they are."""
+        """Return it as lines of a recipe."""
         return "\n".join(line for head, lines in self._format_tables() for line in (head, *lines))
 
     def _format_tables(self) -> Iterator[tuple[str, list[str]]]:
@@ -155,7 +155,7 @@ def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Rem
 
 @cache
 def format_recipe_key(name: str) -> str:
-    """Return the dotted name of a key whose value only the reader knows, as a message names it; `RecipeError` if there is none."""
+    """Return the dotted name of a key whose value only the reader knows, as a message names it; `RecipeError` for another name."""
     section, _, key = name.partition(".")
     known = read_annotations(Recipe)
     if section not in known or (key and key not in read_annotations(known[section])):

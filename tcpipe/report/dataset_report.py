@@ -55,7 +55,7 @@ SAMPLE_COLUMNS = (
     *("terrain_class", "terrain_name", "slope_rad", "yaw_change_rad", "quality"),
     *(column for *columns, _ in LABELS.values() for column in columns),
 )
-"""Of samples.parquet that the page needs."""
+"""Columns of samples.parquet that the page needs."""
 
 Floats = NDArray[np.float64]
 

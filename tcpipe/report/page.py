@@ -154,8 +154,8 @@ def show_verdict(
 
 def _describe_witnesses(verdict: Verdict, label: Affected) -> str:
     """Return size and witnesses of a label; "" where it has none."""
-    found = next((finding for finding in verdict.labels if finding.subject.name == label), None)
-    return "" if found is None else " · ".join(describe_label(label, found)).removeprefix(label).strip()
+    finding = verdict.find_label(label)
+    return "" if finding is None else " · ".join(describe_label(label, finding)).removeprefix(label).strip()
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +164,7 @@ class Section:
 
     title: str
     text: str = ""
-    """What follows a line break is folded."""
+    """Text; the part after a line break is folded."""
     header: Sequence[str] = field(default_factory=tuple)
     rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
     plots: Sequence[Plot] = ()
@@ -200,7 +200,7 @@ def render_page(
     Parameters
     ----------
     title, lead, verdict, numbers, warnings : the top of the page, in this order.
-    sections : in the order of the page; the first stands beside the verdict, the titles form the table of contents.
+    sections : in the order of the page; the first is next to the verdict, the titles form the table of contents.
     links : pages that belong to it.
     script, data : file beside this one that runs when all figures are drawn, and its data.
     reads_pictures : whether the page may load pictures beside it; it never loads anything else.

@@ -1,4 +1,4 @@
-"""What is known of robots and of the messages that tell their power: TOML files beside this one, read by `tcpipe.formats.recipe_toml`.
+"""Profiles of robots and of messages with their power: TOML files in this folder, read by `tcpipe.formats.recipe_toml`.
 
 A recipe holds the same tables, ``[robots.NAME]`` and ``[[power_sources]]``; they go before these.
 
@@ -16,7 +16,7 @@ from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.findings import LEFT_OUT
 
 Size = Annotated[float, Bounds(ge=0.05, le=100)]
-"""Of a robot [m]: from a toy's to a mining truck's."""
+"""Size of a robot [m]: from a toy's to a mining truck's."""
 Speed = Annotated[float, Bounds(ge=0.01, le=100)]
 PlausibleSpeed = Annotated[float, Bounds(ge=2, le=1000)]
 """A bound that no true track reaches [m/s]: at walking pace it would refuse robots that drive."""
@@ -34,7 +34,7 @@ sheet: total output error ± 1.5 %; its zero drifts by 3.4 mA per kelvin, 0.14 A
 OFFSET_STD_WATT = 5.0
 """σ of the zero of a power without voltage [W]: that of a current at 24 V."""
 NOMINAL_STD_FRACTION = 0.1
-"""σ of a voltage that nobody measured, as a fraction: a battery of lead falls by 20 % of its nominal voltage, one of lithium by 25 %."""
+"""σ of an assumed voltage, as a fraction: a battery of lead falls by 20 % of its nominal voltage, one of lithium by 25 %."""
 
 TORQUE_GAIN_STD_FRACTION, LOSS_STD_FRACTION = 0.1, 0.3
 """σ of the gain of torques, which most drivers compute from the motor current with a nominal torque constant (data sheets: ± 10 %), and of
@@ -246,7 +246,7 @@ class Profiles:
     power_sources: list[PowerSource] = field(default_factory=list)
 
     def types(self, *, propulsion: bool = False) -> list[str]:
-        """Return the message types that carry power, best first; with ``propulsion`` those that tell it apart for some robot."""
+        """Return the message types that carry power, best first; with ``propulsion`` those that measure it separately for some robot."""
         return list(
             dict.fromkeys(
                 source.type
@@ -256,7 +256,7 @@ class Profiles:
         )
 
     def refusals(self) -> dict[str, str]:
-        """Return the message types that carry currents but tell no power, and why."""
+        """Return the message types that carry currents but do not determine the power, and why."""
         telling = {source.type for source in self.power_sources if not source.unsupported_reason}
         return {source.type: source.unsupported_reason for source in self.power_sources if source.type not in telling}
 

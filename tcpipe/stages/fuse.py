@@ -43,7 +43,7 @@ from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     """Return the track of a run; rows are in order of clock epoch and stamp.
 
-    Each clock epoch, and each section between long pauses, is fused for itself. Stamps are multiples of the track's period; where no sensor
+    Each clock epoch, and each section between long pauses, is fused separately. Stamps are multiples of the track's period; where no sensor
     measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
 
     Raises `FusionError`: no sensor measures motion, or the estimate breaks down.

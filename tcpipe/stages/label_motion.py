@@ -42,7 +42,7 @@ Arrays = dict[str, NDArray[np.float64]]
 _ROLLING_MPS = 0.05
 """Wheels slower than this are stationary: their slip is unknown."""
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
-"""Of the median specific force: another one is of another unit, or without gravity, and its vibration is not known."""
+"""Range of the median specific force [m/s²]: outside, the unit differs or gravity is removed, and the vibration is unknown."""
 
 
 def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:

@@ -1,4 +1,4 @@
-"""What is one error of all segments of a run (gain and zero of the power sensor, the scale of a lone odometry), and what confirms them."""
+"""Errors that all segments of a run share (gain and zero of the power sensor, scale of a lone odometry), and findings on them."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def find_negative_idle(
 _FEWEST_UNPOWERED = 5
 """Segments in a row: fewer may be chance."""
 _IDLE_FRACTION = 0.1
-"""Of the median net power."""
+"""Share of the median net power."""
 _MISSING_RESIDUALS = 3.0
 
 

@@ -1,7 +1,7 @@
-"""What confirms position, time and energy of a run: each label is compared with measurements that do not enter it.
+"""Witnesses of position, time and energy of a run: measurements that do not enter the label.
 
-Witnesses are independent sensors or physics outside of the label's own sensor; an internal consistency check is none. A witness that
-contradicts makes a label unusable; a label without a witness is "confirmed by nothing" and at best usable with care.
+An internal consistency check is no witness. A witness that contradicts a label makes it unusable; a label without a witness is
+"confirmed by nothing" and at best usable with care.
 """
 
 from __future__ import annotations
@@ -14,22 +14,14 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
-from tcpipe.power.witnesses import RESISTANCE_OHM, Climb, ScaleVerdict, compute_weight_ratio, estimate_climb
+from tcpipe.power.witnesses import IMPLAUSIBLE, RESISTANCE_OHM, compute_weight_ratio, estimate_climb
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Robot
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import StageFacts
-from tcpipe.tables.findings import (
-    NOTHING,
-    WITNESSES_OF_LABEL,
-    Affected,
-    Finding,
-    Subject,
-    make_finding,
-    read_threshold,
-)
+from tcpipe.tables.findings import NOTHING, WITNESSES_OF_LABEL, Affected, Finding, Subject, make_finding, read_threshold
 
-_IMPLAUSIBLE, _SIDE, _LARGE = "power-implausible", "power-side-missing", "energy-per-metre-large"
+_SIDE, _LARGE = "power-side-missing", "energy-per-metre-large"
 _POWER = Subject("role", "power")
 
 
@@ -41,18 +33,20 @@ class _Comparison:
     ratio: float
     low: float
     high: float
-    proves: ScaleVerdict
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether the ratio is inside its range."""
+        return self.low < self.ratio < self.high
 
     @property
     def excess(self) -> float:
         """By how much the ratio is outside of the range, as a logarithm."""
         return float(max(np.log(abs(self.ratio) / self.high), np.log(self.low / max(abs(self.ratio), 1e-9))))
 
-    @property
-    def scale(self) -> float:
-        """The power of ten by which the current has to be multiplied to bring the ratio nearest to the middle of the range."""
-        middle = np.sqrt(self.low * self.high)
-        return float(10.0 ** -round(np.log10(abs(self.ratio) / middle)))
+    def find_scale(self) -> float:
+        """Return the power of ten that brings the ratio nearest to the middle of the range, as a factor on the current."""
+        return float(10.0 ** -round(np.log10(abs(self.ratio) / np.sqrt(self.low * self.high))))
 
 
 def find_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> Iterator[Finding]:
@@ -81,7 +75,7 @@ def _summarize(table: pa.Table, name: str, unit: str, per_metre: str) -> dict[st
 
 
 def _list_confirming_sensors(table: pa.Table, facts: StageFacts) -> list[str]:
-    """Return the odometries that confirm the motion of most segments, beside fixes or another odometry."""
+    """Return the odometries that confirm the motion of most segments, next to fixes or another odometry."""
     fused = facts.fuse.sensors if facts.fuse else ()
     if np.median(to_integers(table, "confirming_sensor_count")) < 2:
         return []
@@ -92,108 +86,84 @@ def _list_confirming_sensors(table: pa.Table, facts: StageFacts) -> list[str]:
 def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> Iterator[Finding]:
     """Yield what confirms or contradicts the energy."""
     comparisons, missing = _compare_power(table, facts, robot)
-    confirming = [each.witness for each in comparisons if each.proves == "confirmed"]
-    contradicting = [each for each in comparisons if each.proves == "contradicted"]
+    contradicting = [each for each in comparisons if not each.is_possible]
     if contradicting:
         yield _make_implausible(max(contradicting, key=lambda each: each.excess), comparisons)
-    share = facts.power.side_share if facts.power else None
-    limit = read_threshold(_SIDE, "min_share_fraction")
+        missing = [f"contradicted by {', '.join(each.witness for each in contradicting)}"]
+    share, limit = facts.power.side_share if facts.power else None, read_threshold(_SIDE, "min_share_fraction")
     if share is not None and not limit <= share <= 1.0 - limit:
         yield make_finding(_SIDE, _POWER, share_fraction=min(share, 1.0 - share))
-    energy = _summarize(table, "energy", "joule", "jpm")
-    if not contradicting and energy["mean_jpm"] > read_threshold(_LARGE, "max_mean_jpm"):
-        yield make_finding(_LARGE, _POWER, mean_jpm=energy["mean_jpm"], max_jpm=read_threshold(_LARGE, "max_mean_jpm"))
-    idle_watt = to_floats(table, "idle_power_watt")[0]
-    sizes = {"driving_watt": np.nanmedian(to_floats(table, "power_watt")), "idle_watt": idle_watt}
-    why = (
-        f"contradicted by {', '.join(each.witness for each in contradicting)}" if contradicting else ", ".join(missing)
-    )
+    energy, max_jpm = _summarize(table, "energy", "joule", "jpm"), read_threshold(_LARGE, "max_mean_jpm")
+    if not contradicting and energy["mean_jpm"] > max_jpm:
+        yield make_finding(_LARGE, _POWER, mean_jpm=energy["mean_jpm"], max_jpm=max_jpm)
+    sizes = {
+        "driving_watt": np.nanmedian(to_floats(table, "power_watt")),
+        "idle_watt": to_floats(table, "idle_power_watt")[0],
+    }
     sensor = facts.label.power_sensor if facts.label else None
     if sensor is not None and sensor.battery_ohm is not None:
         sizes[RESISTANCE_OHM] = sensor.battery_ohm
-    yield _make_witnesses("energy", confirming, why, **energy, **sizes)
+    confirming = [each.witness for each in comparisons if each.is_possible]
+    yield _make_witnesses("energy", confirming, ", ".join(missing), **energy, **sizes)
 
 
-def _make_implausible(found: _Comparison, comparisons: list[_Comparison]) -> Finding:
+def _make_implausible(worst: _Comparison, comparisons: list[_Comparison]) -> Finding:
     """Return the finding that a witness contradicts the scale of power; only a warning where another witness confirms it."""
-    is_confirmed = any(each.proves == "confirmed" for each in comparisons)
-    above = found.ratio > found.high
-    bound = found.high if above else found.low
-    scale = found.scale
-    mends = scale != 1.0 and all(each.low < each.ratio * scale < each.high for each in comparisons)
+    bound, limit = ("largest", worst.high) if worst.ratio > worst.high else ("smallest", worst.low)
+    scale = worst.find_scale()
+    is_remedy = scale != 1.0 and all(each.low < each.ratio * scale < each.high for each in comparisons)
     return make_finding(
-        _IMPLAUSIBLE,
+        IMPLAUSIBLE,
         _POWER,
-        severity="warning" if is_confirmed else None,
-        names={"witness": found.witness, "bound": "largest" if above else "smallest"},
-        remedies=suggest("scale", {"read": {"current_scale": scale}}) if mends else (),
-        ratio=found.ratio / bound,
+        severity="warning" if any(each.is_possible for each in comparisons) else None,
+        names={"witness": worst.witness, "bound": bound},
+        remedies=suggest("scale", {"read": {"current_scale": scale}}) if is_remedy else (),
+        ratio=worst.ratio / limit,
     )
 
 
 def _compare_power(table: pa.Table, facts: StageFacts, robot: Robot) -> tuple[list[_Comparison], list[str]]:
-    """Return what each witness proves of the scale of power, and why others are missing."""
-    limit = {name: read_threshold(_IMPLAUSIBLE, name) for name in _LIMITS}
+    """Return the witnesses that confirm or contradict the scale of power, and why others are missing."""
+    charge_ratio, meter_slope = (facts.power.charge_ratio, facts.power.meter_slope) if facts.power else (None, None)
     found, missing = list[_Comparison](), list[str]()
-    power = facts.power
-    for witness, ratio, most in (
-        ("charge", power.charge_ratio if power else None, limit["max_charge_factor"]),
-        ("second_meter", 1.0 / power.meter_slope if power and power.meter_slope else None, limit["max_meter_factor"]),
+    for witness, ratio, limit in (
+        ("charge", charge_ratio, "max_charge_factor"),
+        ("second_meter", 1.0 / meter_slope if meter_slope else None, "max_meter_factor"),
     ):
         if ratio is None:
-            missing += [f"no {witness.replace('_', ' ')}"]
-            continue
-        proves: ScaleVerdict = "confirmed" if 1.0 / most < ratio < most else "contradicted"
-        found.append(_Comparison(witness, ratio, 1.0 / most, most, proves))
+            missing.append(f"no {witness.replace('_', ' ')}")
+        else:
+            found.append(
+                _Comparison(
+                    witness, ratio, 1.0 / read_threshold(IMPLAUSIBLE, limit), read_threshold(IMPLAUSIBLE, limit)
+                )
+            )
+    coarse = []  # ranges that are too wide to confirm anything
+    power_watt = to_floats(table, "power_watt")
     if robot.power_range_watt is not None:
-        found += _compare_driving_power(table, *robot.power_range_watt)
+        coarse.append(_Comparison("robot_model", float(np.nanmedian(power_watt)), *robot.power_range_watt))
     if robot.mass_kg is None:
-        return found, [*missing, "mass unknown"]
-    low, high = limit["min_climb_factor"], limit["max_climb_factor"]
-    climb = _estimate_climb(table, robot.mass_kg)
-    proves = "unconfirmed" if climb is None else climb.judge(
-        low, high, min_reliability=limit["min_slope_reliability"], max_std_fraction=limit["max_climb_std_fraction"]
-    )  # fmt: skip
-    if climb is None or proves == "unconfirmed":
-        missing.append("too little slope")
+        missing.append("mass unknown")
     else:
-        found.append(_Comparison("slope", climb.factor, low, high, proves))
-    found += _compare_with_weight(table, robot.mass_kg, limit["min_weight_ratio"], limit["max_weight_ratio"])
-    return found, missing
+        rise = (to_floats(table, "end_z_m") - to_floats(table, "start_z_m")) / to_floats(table, "chord_m")
+        start_ns, end_ns = to_integers(table, "start_ns"), to_integers(table, "end_ns")
+        climb = estimate_climb(
+            power_watt=power_watt,
+            velocity_mps=to_floats(table, "velocity_mps"),
+            rise=rise,
+            mean_abs_yaw_rate_radps=to_floats(table, "mean_abs_yaw_rate_radps"),
+            piece=np.cumsum(np.concatenate(([False], start_ns[1:] != end_ns[:-1]))).astype(np.int64),
+            mass_kg=robot.mass_kg,
+        )
+        if climb is None or not climb.is_certain():
+            missing.append("too little slope")
+        else:
+            found.append(_Comparison("slope", climb.factor, *_read_range("climb_factor")))
+        net_jpm = to_floats(table, "net_energy_joule") / to_floats(table, "chord_m")
+        if (ratio := compute_weight_ratio(net_jpm, rise, robot.mass_kg)) is not None:
+            coarse.append(_Comparison("weight", ratio, *_read_range("weight_ratio")))
+    return [*found, *(each for each in coarse if not each.is_possible)], missing
 
 
-_LIMITS = (
-    "min_climb_factor", "max_climb_factor", "min_slope_reliability", "max_climb_std_fraction", "min_weight_ratio", "max_weight_ratio",
-    "max_charge_factor", "max_meter_factor",
-)  # fmt: skip
-
-
-def _compute_rise(table: pa.Table) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    return (to_floats(table, "end_z_m") - to_floats(table, "start_z_m")) / to_floats(table, "chord_m")
-
-
-def _estimate_climb(table: pa.Table, mass_kg: float) -> Climb | None:
-    start_ns, end_ns = to_integers(table, "start_ns"), to_integers(table, "end_ns")
-    return estimate_climb(
-        power_watt=to_floats(table, "power_watt"),
-        velocity_mps=to_floats(table, "velocity_mps"),
-        rise=_compute_rise(table),
-        mean_abs_yaw_rate_radps=to_floats(table, "mean_abs_yaw_rate_radps"),
-        piece=np.cumsum(np.concatenate(([False], start_ns[1:] != end_ns[:-1]))).astype(np.int64),
-        mass_kg=mass_kg,
-    )
-
-
-def _compare_with_weight(table: pa.Table, mass_kg: float, low: float, high: float) -> Iterator[_Comparison]:
-    """Yield that energy per metre is impossible for the robot's weight; the range is too wide to confirm anything."""
-    net_jpm = to_floats(table, "net_energy_joule") / to_floats(table, "chord_m")
-    ratio = compute_weight_ratio(net_jpm, _compute_rise(table), mass_kg)
-    if ratio is not None and not low < ratio < high:
-        yield _Comparison("weight", ratio, low, high, "contradicted")
-
-
-def _compare_driving_power(table: pa.Table, low_watt: float, high_watt: float) -> Iterator[_Comparison]:
-    """Yield that the median power is outside the range of this robot model; the range is too wide to confirm anything."""
-    watt = float(np.nanmedian(to_floats(table, "power_watt")))
-    if not low_watt < watt < high_watt:
-        yield _Comparison("robot_model", watt, low_watt, high_watt, "contradicted")
+def _read_range(name: str) -> tuple[float, float]:
+    return read_threshold(IMPLAUSIBLE, f"min_{name}"), read_threshold(IMPLAUSIBLE, f"max_{name}")

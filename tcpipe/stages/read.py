@@ -22,14 +22,14 @@ from tcpipe.stages.message_arrays import Arrays, LogReader, gather_messages
 from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read_power import (
     add_averaging,
+    add_side_share,
     find_repeats,
-    find_side_share,
     list_second_meters,
     read_rail_power,
     remove_repeats,
 )
 from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
-from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
+from tcpipe.tables.facts import RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
 from tcpipe.tables.findings import Finding, Severity, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
@@ -118,9 +118,9 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     streams, repeats = remove_repeats(streams)
     streams, crs, of_pose = place_pose(streams, assignment, config)
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
-    power, assumed = add_averaging(power, streams, config)
+    power, assumed = add_averaging(add_side_share(power, streams), streams, config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
-    report = make_read_report(assignment, every, clocks, streams, power=power, sensors=sensors, offset_s=offset_s)
+    report = make_read_report(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
     findings = (
         *report.findings,
@@ -136,7 +136,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     if not any(role in streams for role in MOTION_ROLES):
         what = "no motion in the log: wheel_odometry, visual_odometry, gnss and pose have no usable rows"
         raise RoleError(what, findings=report.findings)
-    return Streams(streams, sensors, assignment.robot, crs, power.averaged, report)
+    return Streams(streams, sensors, assignment.robot, crs, power.facts is not None and power.facts.averaged, report)
 
 
 def _read_times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
@@ -181,7 +181,10 @@ def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings)
     parts = []
     for rail in power.rails[source.topic]:
         voltage, current = read_rail_power(rail, times, columns)
-        known, current = np.isfinite(voltage) | np.isfinite(current), current - power.offset_amp
+        known, current = (
+            np.isfinite(voltage) | np.isfinite(current),
+            current - (power.facts.zero_amp if power.facts else 0.0),
+        )
         values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
         parts.append({name: value[known] for name, value in values.items()})
     return parts
@@ -195,7 +198,6 @@ def make_read_report(
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
     clocks: AlignedClocks,
-    streams: Mapping[str, pa.Table],
     *,
     power: PowerReadings,
     sensors: Mapping[str, Sensor],
@@ -222,25 +224,9 @@ def make_read_report(
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
         time_offset_s=offset_s,
-        power=None if power.current_sign is None else _describe_power(power, find_side_share(power, streams)),
+        power=power.facts,
     )
     return StageReport(tuple(dict.fromkeys(findings)), facts)
-
-
-def _describe_power(power: PowerReadings, side_share: float | None) -> PowerSign:
-    return PowerSign(
-        power.current_sign or "",
-        power.averaged,
-        power.includes,
-        power.gain_std_fraction,
-        power.offset_std_amp,
-        power.rest_current_amp,
-        power.offset_amp,
-        power.charging,
-        charge_ratio=power.charge_ratio,
-        meter_slope=power.meter_slope,
-        side_share=side_share,
-    )
 
 
 def _find_unused(source: TopicReadings, timeline: Timeline | None) -> Iterator[Finding]:

@@ -33,7 +33,7 @@ def read_power_of_topics(
     config: ReadConfig,
     *,
     known: Profiles,
-    meters: Mapping[str, tuple[str, Columns]] = {},
+    meters: Mapping[str, tuple[str, Columns]],
 ) -> PowerReadings:
     """Return the rails of the topics used as power, by message type and columns; none unless all of them can be decoded.
 
@@ -64,14 +64,14 @@ def list_second_meters(
     assignment: RoleAssignment, topics: Mapping[str, Topic], config: ReadConfig, known: Profiles
 ) -> list[str]:
     """Return the topics of known power messages that are not used, to be compared with those that are."""
+    if "power" not in assignment.roles:
+        return []
     types = set(known.types()) - {*known.refusals(), *FLOAT_TYPES}
+    excluded = {*config.ignore_topics, *(topic for role in assignment.roles.values() for topic in role.topics)}
     return [
         topic
         for topic in assignment.left_out
-        if "power" in assignment.roles
-        and topic not in config.ignore_topics
-        and topics[topic].type_name in types
-        and topics[topic].problem is None
+        if topic not in excluded and topics[topic].type_name in types and topics[topic].problem is None
     ]
 
 
@@ -79,11 +79,11 @@ _STRAIGHT_RADPS, _MOVING_MPS = 0.05, 0.2
 """Largest turn rate and smallest speed of straight driving."""
 
 
-def find_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> float | None:
-    """Return the share of one side in the current in straight driving, by an odometry; None without sides or odometry."""
-    motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
-    if power.sides is None or motion is None:
-        return None
+def add_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> PowerReadings:
+    """Return the power with the share of one side in the current in straight driving, if both sides and an odometry are known."""
+    motion = _choose_odometry(streams)
+    if power.facts is None or power.sides is None or motion is None:
+        return power
     at_ns = to_integers(motion, "log_time_ns").astype(np.float64)
     order = np.argsort(at_ns, kind="stable")
     speed_mps, turn_radps = (
@@ -91,7 +91,12 @@ def find_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> fl
         for name in ("velocity_x_mps", "angular_velocity_z_radps")
     )
     is_straight = (speed_mps > _MOVING_MPS) & (turn_radps < _STRAIGHT_RADPS)
-    return compute_side_share(power.sides.first_amp, power.sides.second_amp, is_straight)
+    share = compute_side_share(power.sides.first_amp, power.sides.second_amp, is_straight)
+    return replace(power, facts=replace(power.facts, side_share=share))
+
+
+def _choose_odometry(streams: Mapping[str, pa.Table]) -> pa.Table | None:
+    return next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
 
 
 def name_rail_columns(rail: str) -> tuple[str, str]:
@@ -147,9 +152,9 @@ def add_averaging(
 ) -> tuple[PowerReadings, tuple[Finding, ...]]:
     """Return the power with whether its values are means over their period, and the finding where that is assumed."""
     counts = any(rail.counter is not None for rails in power.rails.values() for rail in rails)
-    if config.power_averaged != "auto" and not counts:
-        return replace(power, averaged=config.power_averaged == "yes"), ()
-    if not power.averaging_unknown or "power" not in streams:
+    if power.facts is not None and config.power_averaged != "auto" and not counts:
+        return replace(power, facts=replace(power.facts, averaged=config.power_averaged == "yes")), ()
+    if power.facts is None or not power.averaging_unknown or "power" not in streams:
         return power, ()
     table = select_rows(streams["power"], "clock_epoch", 0)
     rail = select_rows(table, "rail", table["rail"][0].as_py())
@@ -157,10 +162,10 @@ def add_averaging(
     period_s = float(np.median(np.diff(power_ns))) / 1e9 if len(power_ns) > 1 else np.inf
     if period_s < read_threshold(_ASSUMED, "min_period_s"):
         return power, ()
-    motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
+    motion = _choose_odometry(streams)
     verdict = None if motion is None else _test_by_motion(power_ns, watt, select_rows(motion, "clock_epoch", 0))
-    averaged = power.averaged if verdict is None else verdict
-    power = replace(power, averaged=averaged)
+    averaged = power.facts.averaged if verdict is None else verdict
+    power = replace(power, facts=replace(power.facts, averaged=averaged))
     if verdict is None and period_s < read_threshold(_ASSUMED, "min_unobserved_period_s"):
         return power, ()
     severity: Severity | None = "warning" if verdict is None else None

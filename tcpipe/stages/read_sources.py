@@ -81,12 +81,8 @@ def read_sources(
         arrays[role, topic] = _read_fields(messages[topic], role, config)
     types = {topic: topics[topic].type_name for _, topic in arrays}
     of_power = {topic: (types[topic], columns) for (role, topic), columns in arrays.items() if role == "power"}
-    used = {topic for _, topic in played}
-    meters = {
-        topic: (topics[topic].type_name, messages[topic])
-        for topic in list_second_meters(assignment, topics, config, known)
-        if topic in messages and topic not in used
-    }
+    second = [topic for topic in list_second_meters(assignment, topics, config, known) if topic in messages]
+    meters = {topic: (topics[topic].type_name, messages[topic]) for topic in second}
     power = read_power_of_topics(of_power, assignment, config, known=known, meters=meters)
     sources = []
     messages.clear()

@@ -1,6 +1,6 @@
 """A column with its unit and meaning, and a table schema that checks Arrow tables against its columns.
 
-Units, frames, flag bits and one-line meanings stand in the Arrow field metadata, so that every Parquet file explains itself.
+The Arrow field metadata contain units, frames, flag bits and one-line meanings, so that every Parquet file explains itself.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ class ChangeFacts:
 
 @dataclass(frozen=True, slots=True)
 class ParameterFacts:
-    """What a section showed of a parameter: its difference from what was known beforehand, with σ, and σ beforehand.
+    """Estimate of a parameter in a section: difference from its prior, with σ, and σ of the prior.
 
     ``variation``: RMS of its changes over the section.
     """
@@ -379,7 +379,7 @@ class Smoothing:
 
     @property
     def width_s(self) -> float:
-        """Over how long each value is a mean [s]."""
+        """Length of the mean of each value [s]."""
         return self.before_s + self.after_s
 
     @property
@@ -389,13 +389,13 @@ class Smoothing:
 
     @property
     def late_s(self) -> float:
-        """How late the middle of that time is stamped [s]."""
+        """Delay of the stamp after the middle of that time [s]."""
         return (self.before_s - self.after_s) / 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class PowerSensorFacts:
-    """What is not known of the power sensor: σ of its gain and of the zero of a rail [A], and what the log shows (`tcpipe.power.audit`).
+    """Uncertainty of the power sensor: σ of its gain and of the zero of a rail [A], with observations from the log (`tcpipe.power.audit`).
 
     ``rest_amp``: lowest and highest current of a rail in halts; ``battery_ohm``: resistance of the battery by its sag [ohm]; the gain
     changed by ``gain_ratio`` at ``gain_changed_ns``; ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None

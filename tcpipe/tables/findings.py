@@ -23,12 +23,12 @@ Affected: TypeAlias = Literal["position", "time", "energy"]
 WITNESSES_OF_LABEL = "label-witnesses"
 """Code of the findings that state what confirms a label; their subject is the label."""
 Witness: TypeAlias = Literal["wheel_odometry", "visual_odometry", "slope", "charge", "second_meter", "nothing"]
-"""What can confirm a label: an odometry beside GNSS (position, time); the power that slopes need, the fall of the battery's charge, or a
-second meter (energy)."""
+"""Measurement that can confirm a label: an odometry next to GNSS (position, time); the power that slopes need, the fall of the battery's
+charge, or a second meter (energy)."""
 NOTHING: Witness = "nothing"
 
 Action: TypeAlias = Literal["kept", "corrected", "inflated", "excluded", "rejected"]
-"""What tcpipe did with the subject of a finding; inflated: raised its standard deviations."""
+"""How tcpipe treated the subject of a finding; inflated: raised its standard deviations."""
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 AFFECTED: tuple[Affected, ...] = ("position", "time", "energy")
@@ -226,7 +226,7 @@ def select_problems(findings: Iterable[Finding]) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True)
 class StageReport(Generic[F]):
-    """What a stage, or all stages so far, observed: findings, and facts that the next stages and the pages use."""
+    """Observations of a stage, or of all stages so far: findings, and facts that the next stages and the pages use."""
 
     findings: tuple[Finding, ...]
     facts: F
@@ -262,6 +262,10 @@ class Verdict:
         """The worst of the three grades."""
         return max((self.position, self.time, self.energy), key=GRADES.index)
 
+    def find_label(self, label: str) -> Finding | None:
+        """Return the finding with size, σ and witnesses of a label; None if there is no such finding."""
+        return next((finding for finding in self.labels if finding.subject.name == label), None)
+
 
 def judge(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict: each label has the grade of its worst finding; without a witness it is usable with care at best."""
@@ -272,7 +276,9 @@ def judge(findings: Iterable[Finding]) -> Verdict:
         if finding.severity != "note" and finding.code in catalogue and catalogue[finding.code].affects
     )
     reasons = tuple(sort_findings(decisive))
-    labels = _merge_witnesses(findings)
+    witnesses = select_findings(findings, WITNESSES_OF_LABEL)
+    by_label = [[finding for finding in witnesses if finding.subject.name == label] for label in AFFECTED]
+    labels = tuple(_merge_label(of_label) for of_label in by_label if of_label)
     confirmed_by: dict[Affected, tuple[Witness, ...]] = {
         finding.subject.name: tuple(finding.names["witnesses"].split(", "))  # type: ignore[arg-type,misc]
         for finding in labels
@@ -286,29 +292,21 @@ def judge(findings: Iterable[Finding]) -> Verdict:
     return Verdict(**grades, reasons=reasons, confirmed_by=confirmed_by, labels=labels)
 
 
-def _merge_witnesses(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return one finding with witnesses for each label; of several runs with the range of their means."""
-    by_label: dict[str, list[Finding]] = {}
-    for finding in findings:
-        if finding.code == WITNESSES_OF_LABEL:
-            by_label.setdefault(finding.subject.name, []).append(finding)
-    return tuple(_merge_label(by_label[label]) for label in AFFECTED if label in by_label)
-
-
 def _merge_label(findings: Sequence[Finding]) -> Finding:
+    """Return one finding for the witnesses of a label, of several runs with the range of their means."""
     first = findings[0]
     if len(findings) == 1:
         return first
-    count = sum(finding.names["witnesses"] == NOTHING for finding in findings)
-    others = dict.fromkeys(name for finding in findings for name in finding.names["witnesses"].split(", "))
-    others.pop(NOTHING, None)
-    names = {"witnesses": ", ".join(others) or NOTHING}
-    if count:
-        rest = f"; the others by {', '.join(others)}" if others else ""
+    witnesses = dict.fromkeys(name for finding in findings for name in finding.names["witnesses"].split(", "))
+    names = {"witnesses": ", ".join(witnesses)}
+    if NOTHING in witnesses:
+        count = sum(finding.names["witnesses"] == NOTHING for finding in findings)
+        others = ", ".join(name for name in witnesses if name != NOTHING)
+        rest = f"; the others by {others}" if others else ""
         names = {"witnesses": NOTHING, "missing": f"in {count} of {len(findings)} runs{rest}"}
     values = {name: [each.numbers[name] for each in findings if name in each.numbers] for name in first.numbers}
-    numbers = {name: max(found) if name.startswith("std") else min(found) for name, found in values.items()}
-    numbers |= {name.replace("mean", "most"): max(found) for name, found in values.items() if name.startswith("mean")}
+    numbers = {name: max(each) if name.startswith("std") else min(each) for name, each in values.items()}
+    numbers |= {name.replace("mean", "most"): max(each) for name, each in values.items() if name.startswith("mean")}
     return replace(first, names=names, numbers=numbers)
 
 

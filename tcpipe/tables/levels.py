@@ -20,7 +20,7 @@ from tcpipe.tables.facts import NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import Finding, StageReport
 
 DATA_MODEL_VERSION = "4.0"
-"""Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
+"""Version of every manifest and card that is written; docs/reference/data-model.md has its history."""
 
 TABLES_VERSION = "4.0"  # in which a table last changed
 
@@ -32,7 +32,7 @@ def describe_other_data_model(where: str, version: str) -> str:
 
 
 GEOMETRY = "geometry"
-"""Column that tells other tools where a row lies (GeoParquet)."""
+"""Column with the place of a row for other tools (GeoParquet)."""
 
 _METADATA_KEY = b"tcpipe"
 
@@ -375,7 +375,7 @@ PLACED_SEGMENTS = LABELLED_SEGMENTS.select_columns(
     *(f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")),
     *("run_id", "chord_m", "arc_length_m", "position_std_m"),
 )
-"""What sampling reads of a segment."""
+"""Columns of a segment that sampling reads."""
 
 SAMPLES = TableSchema(
     "samples",
@@ -483,7 +483,7 @@ class Datum:
 
 @dataclass(frozen=True, slots=True)
 class TrackInfo:
-    """What belongs to a whole track; ``datum`` is None for a local frame (a log without GNSS)."""
+    """Facts of a whole track; ``datum`` is None for a local frame (a log without GNSS)."""
 
     run_id: str
     robot: str

@@ -68,7 +68,7 @@ SPEED = Option(
 PREDICTOR = Option("Run your own model: FILE.py[:NAME] or entry point.", metavar="CODE")
 DRY_RUN = Option("Say what would be done, and what it would take; do nothing.")
 SEED = Range(0, 2**32 - 1)
-"""What every generator of random numbers takes."""
+"""Seeds of all random number generators."""
 
 
 def required(shown: Option) -> Any:
@@ -110,7 +110,7 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
 
 
 def _check_bounds(options: Any, function: str) -> None:
-    """Raise `UsageError` for all numbers out of their range, values that are no choice, and points that are none."""
+    """Raise `UsageError` for all numbers out of their range, unknown choices, and texts that are no points."""
     problems = []
     for entry in fields(options):
         kind, value = entry.metadata.get("option", Option()).kind, getattr(options, entry.name)

@@ -1,9 +1,9 @@
-"""Does the map lie where the track was driven? The ground's height under the track tells.
+"""Registration of a map to a track, by the heights of the ground under the track.
 
-A track's heights and the map's differ by a constant (ellipsoid against geoid, the robot's own height) that says nothing. What is left is
+A track's heights and the map's differ by a constant (ellipsoid against geoid, the robot's own height) without information. The rest is
 the shape of the ground; the horizontal shift at which the two shapes agree best is searched over a small window, as in terrain-aided
-navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary no shift can be
-told, and none is. The regression of the track's heights on the map's gives the unit of the map, such as feet.
+navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary the shift is
+not observable, and stays zero. The regression of the track's heights on the map's gives the unit of the map, such as feet.
 
 The shift is fitted together with a tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, and from
 the misfit itself: along slopes that are noisy a step is too short.
@@ -38,7 +38,7 @@ KNOWN_M = 0.25
 _STEP_M = 0.25
 _SPACING_M = 0.5
 _MOST_POINTS, _MOST_TOGETHER = 1_200, 6_000
-"""Of one track, and of several."""
+"""Most points of one track, and of several."""
 _FEWEST_POINTS = 60
 _BLOCKS = 12
 """Stretches left out in turn (delete-one-block jackknife): errors of GNSS and of the map are alike over metres."""
@@ -48,12 +48,12 @@ _AGREE, _SCATTER_QUANTILE = 0.999, 0.1
 """Runs' own shifts scatter about the common one by at most the 90 % upper limit."""
 _OUTLIER = 3.5
 _SIGMAS = 5.0
-"""So far must the misfit fall beyond its own uncertainty: the best of 600 shifts falls by three by chance."""
+"""Least fall of the misfit in its standard deviations: the best of 600 shifts falls by three by chance."""
 _LEAST_GAIN = -2.0 * np.log(0.9)
 """A shift that leaves more than 90 % of the misfit is not what was wrong."""
 _RIVAL_SIGMAS = 3.0
 _APART_M = 0.75
-"""Ground that fits nearly as well somewhere else, this far away, does not tell where the track is [m]."""
+"""Distance [m] at which ground that fits nearly as well makes the place of the track ambiguous."""
 _RIDGE = 1e-12
 _FLAT = 1e-4
 """The misfits of shifts rise so little along one direction, compared with the other, that the ground does not vary along it."""
@@ -211,7 +211,7 @@ def register_tracks(source: MapReader, tracks: Sequence[tuple[FloatArray, FloatA
 
 
 def _find_ground(excess_m: FloatArray, points: _Points) -> tuple[Points, Points]:
-    """Return which points are on the map's ground at the shift that fits best, (N,), and which of them tell a shift.
+    """Return the points on the map's ground at the shift that fits best, (N,), and those of them that determine a shift.
 
     These are not on cliffs, unless too few are left.
     """
@@ -311,7 +311,7 @@ def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
 def _refine_shift(
     raw_m: FloatArray, points: _Points, chosen: tuple[Points, Points], shift_m: FloatArray, scale: HeightScale
 ) -> Registration:
-    """Refine the best shift of the lattice by the good points, and tell how sure it is by leaving stretches out; misfits are near ones'."""
+    """Refine the best shift of the lattice by the good points, with σ by leaving sections out; misfits are those of near points."""
     near, good = chosen
     excess_m, tilt, stretches = _flatten(raw_m[good], points.select(good))
     variance, middle = excess_m.var(axis=0), (shift_m.size // 2, shift_m.size // 2)

@@ -229,7 +229,7 @@ _PIXELS_DIFFER = "patch-pixels-unlike-map"
 
 @dataclass(frozen=True, slots=True)
 class PatchFrames:
-    """Where N patches lie in the map's CRS: centre [m], and the vectors of one ground metre along and left of travel, (N, 2)."""
+    """Places of N patches in the map's CRS: centre [m], and the vectors of one ground metre along and left of travel, (N, 2)."""
 
     centre_xy_m: FloatArray
     along_xy: FloatArray

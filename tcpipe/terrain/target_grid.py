@@ -29,10 +29,10 @@ LATTICE_STEP_PX = 16
 """Positions are projected at every so-many-th pixel and interpolated between: 1e-7 px off for a site, 1e-3 px for a country."""
 
 MAX_PIXELS = 2**32
-"""Of a map: 3.3 km a side at 5 cm; 21 GB before compression."""
+"""Most pixels of a map: 3.3 km a side at 5 cm; 21 GB before compression."""
 
 MAX_SIDE_PX = 2**18
-"""Of a side of a map: 13 km at 5 cm."""
+"""Longest side of a map [px]: 13 km at 5 cm."""
 
 _FINER = 0.95
 _TURN = 1e-9

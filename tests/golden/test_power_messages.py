@@ -89,7 +89,7 @@ def test_husarions_drivers_are_summed_however_many_there_are(drivers, share, sig
     found = power_of(log_of(tmp_path / "a", "husarion_ugv_msgs/msg/RobotDriverState", husarion(drivers, sign)))
     np.testing.assert_allclose(watt(found), VOLT * share * AMP, rtol=1e-6)
     assert found.averaging_unknown
-    assert found.current_sign.startswith("drawn_positive" if sign > 0 else "drawn_negative")
+    assert found.facts.current_sign.startswith("drawn_positive" if sign > 0 else "drawn_negative")
 
 
 def test_a_driver_that_is_missing_now_and_then_is_no_smaller_current(tmp_path):
@@ -143,7 +143,7 @@ def test_a_husky_a300_tells_its_drives_or_else_its_pack(lynx, expected, tmp_path
     path = log_of(tmp_path / "a", "clearpath_platform_msgs/msg/Power", a300(lynx))
     found = power_of(path, "husky_a300")
     np.testing.assert_allclose(watt(found), expected, rtol=1e-6)
-    assert found.averaged
+    assert found.facts.averaged
     codes = {of.code for of in found.findings}
     assert ({"power-fallback", "power-includes-loads"} <= codes) == (lynx == 0.0)
     assert power_of(path, "husky").findings[0].names["platforms"] == "A300"
@@ -163,7 +163,7 @@ def test_a_vescs_watt_hours_are_its_power(tmp_path):
     found = power_of(path)
     np.testing.assert_allclose(watt(found)[1:], (VOLT * AMP)[1:], rtol=1e-6)
     assert np.isnan(watt(found)[0])
-    assert found.averaged
+    assert found.facts.averaged
 
 
 def test_a_vesc_that_counts_nothing_tells_its_mean_current(tmp_path):

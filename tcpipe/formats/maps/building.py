@@ -58,7 +58,7 @@ Files = Path | Sequence[Path]
 """One file of a layer, or all; the last lies on top."""
 
 LayerSource = RasterLayer | PolygonLayer
-"""What becomes a layer of a map."""
+"""Source of a layer of a map."""
 
 OrthoBands = Literal["grey", "rgb"]
 
@@ -67,7 +67,7 @@ _RGB: tuple[Use, ...] = ("red", "green", "blue")
 
 @dataclass(frozen=True, slots=True)
 class MoreLayers:
-    """What a map is to have beside height, ortho and terrain."""
+    """Layers of a map in addition to height, ortho and terrain."""
 
     files: Mapping[str, Files] = field(default_factory=dict)
     """Rasters by the layer's name; those of several bands keep their own pixels."""
@@ -319,7 +319,7 @@ def _compute_class_shares(source: LayerSource) -> dict[str, float]:
 
 
 MAX_BYTES = 2_000_000
-"""Of a class table: every value of 16 bits, and to spare."""
+"""Largest class table [byte]: enough for every value of 16 bits."""
 
 _SHOWN = 20
 _INT64 = 2**63

@@ -1,7 +1,8 @@
 """GeoTIFF, JPEG 2000 and ERDAS Imagine, as windows of numbers with their validity: the one home of rasterio.
 
-GDAL opens whatever a file's content says, also what is on another disk or another continent. So a user's file is looked at first: its
-beginning names its one driver, and what lies beside it must be plain too. A virtual raster (VRT), which names other files, is refused.
+GDAL opens whatever a file's content says, also what is on another disk or another continent. So tcpipe checks a user's file first:
+its first bytes determine its one driver, and the files of its name in the same folder must be plain too. Virtual rasters (VRT), which
+name other files, are not supported.
 
 A raster is opened *for a role* (height, ortho, terrain, or a layer of the user's) and refused at once, in one line, if it cannot play
 it: no place on the earth, placed by control points only, wrong bands, wrong numbers.
@@ -41,13 +42,13 @@ from tcpipe.terrain.layers import LUMA_RGB, MAX_BANDS
 from tcpipe.terrain.target_grid import MapGrid
 
 Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
-"""What is taken of a raster: heights, an orthophoto or one of its colours, class values, or numbers in a unit of their own."""
+"""Content of a raster: heights, an orthophoto or one of its colours, class values, or numbers in a unit of their own."""
 
 USES: dict[str, Use] = {"height": "metres", "ortho": "grey", "terrain": "classes"}
 """Use by role; a colour's role is its layer."""
 
 _WEIGHTS = {"grey": LUMA_RGB, "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}
-"""Of red, green and blue, by use."""
+"""Weights of red, green and blue, by use."""
 
 _METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "km": 1000.0, "kilometre": 1000.0, "dm": 0.1, "decimetre": 0.1}
 _METRES |= {"cm": 0.01, "centimetre": 0.01, "mm": 0.001, "millimetre": 0.001}
@@ -85,19 +86,19 @@ _OTHERS = {
     b"{": "JSON",
     b"<": "XML",
 }
-"""What a file is, by how it begins; GDAL reads most of these as rasters."""
+"""Kinds of files by their first bytes; GDAL reads most of them as rasters."""
 
 _VRT = b"<VRTDataset"
 """By which GDAL knows a virtual raster, in the first bytes of a file of any name."""
 
 _REDIRECTIONS = ("OVERVIEWS", "ProxyOverviewRequest")
-"""Domains of tags, in a GeoTIFF or in the statistics beside a raster, that tell GDAL to open another file, or an address."""
+"""Domains of tags, in a GeoTIFF or in its statistics file, that make GDAL open another file, or an address."""
 
 _MAX_OPEN = 32
 """Files that are open at one time."""
 
 _MAX_BLOCK_BYTES = 256_000_000
-"""What is decoded at one time: a tile or a strip of a raster."""
+"""Largest block that is decoded at one time: a tile or a strip of a raster [byte]."""
 
 _LOOKED_AT_PX, _MAX_COLOURS = 2048, 32
 """Longest side of a raster whose colours are counted [px], and most of them that are proposed as classes."""
@@ -127,17 +128,17 @@ class Tile:
     """Type and bands, which the tiles of one layer share."""
     findings: tuple[Finding, ...]
     names: Mapping[int, str]
-    """Names of values, from the raster attribute table or the category names; empty where there are none."""
+    """Names of values, from the raster attribute table or the category names; empty without such names."""
     driver: str
     dtype: str
     """Type of the values that are read: the file's for classes, else float64."""
     nodata: float
-    """The tag; NaN also if there is none."""
+    """The tag; NaN also without a tag."""
     bands: tuple[int, ...]
     scale: tuple[float, float]
     """Scale and offset to metres, to grey from 0 to 255, or to the numbers that are meant."""
     unit: str
-    """Of numbers, as the file says; empty where it does not."""
+    """Unit of numbers by the file; empty if the file states no unit."""
     is_half: bool
     """Whether float16 keeps the numbers: they are of 16 bits, or whole ones of 8 bits."""
     opaque: NDArray[np.bool_] | None
@@ -250,13 +251,13 @@ def read_tile(path: Path, role: str, use: Use) -> Tile:
 
 
 def list_raster_files(path: Path) -> tuple[Path, ...]:
-    """Return every file that a raster is made of: itself, and what lies beside it (masks, world files, statistics)."""
+    """Return every file of a raster: itself, and files of its name in the same folder (masks, world files, statistics)."""
     with rasterio.Env(**GDAL_CONFIG):
         return _list_plain_files(path)[1]
 
 
 def _find_driver(path: Path, raster: Path) -> str:
-    """Return the driver of a file by what it begins with, which GDAL goes by; ``raster`` is the one that it is or lies beside."""
+    """Return the driver of a file by its first bytes, as GDAL does; ``raster`` is that file or the raster that it belongs to."""
     head = _read_beginning(path)
     for start, driver in _DRIVERS.items():
         if head.startswith(start):
@@ -285,7 +286,7 @@ def _read_beginning(path: Path) -> bytes:
 
 
 def _list_plain_files(path: Path, raster: Path | None = None) -> tuple[str, tuple[Path, ...]]:
-    """Return a raster's driver and files, itself first, once neither it nor what lies beside it reaches elsewhere or is too large.
+    """Return a raster's driver and files, itself first; `MapError` if one of them names a file elsewhere or is too large.
 
     ``raster`` is the one that it lies beside, if any.
     """
@@ -521,7 +522,7 @@ def _describe_as_vrt(dataset: Any) -> str:
 
 
 def burn_polygons(polygons: NDArray[np.object_], ids: NDArray[np.uint8], grid: MapGrid) -> NDArray[np.uint8]:
-    """Return the id of the last polygon that each pixel's centre lies in, shape (rows, cols); 0 where there is none."""
+    """Return the id of the last polygon that contains each pixel's centre, shape (rows, cols); 0 without a polygon."""
     shape = grid.rows, grid.cols
     if not len(polygons):
         return np.zeros(shape, np.uint8)

@@ -37,7 +37,7 @@ from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
 from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, MapGrid, compute_source_lattice
 
 MAX_FILES = 100_000
-"""Of one layer."""
+"""Most files of one layer."""
 
 _OFF_GRID_PX = 0.05
 """Tiles whose corners are farther from the pixels of the rest do not lie on one grid [px]."""
@@ -65,7 +65,7 @@ class Raster:
 
     @property
     def name(self) -> str:
-        """What it is called without its folder."""
+        """Its name without the folder."""
         return label_files([Path(tile.path.name) for tile in self.tiles])
 
     def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
@@ -155,7 +155,7 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
 
 
 def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.int64]]:
-    """Return the affine of all tiles together, and where each lies in it: first row, last row, first column, last column."""
+    """Return the affine of all tiles together, and the place of each in it: first row, last row, first column, last column."""
     pixels = [tuple(f"{tile.affine[n]:.6g}" for n in (0, 1, 3, 4)) for tile in tiles]
     base = pixels.index(Counter(pixels).most_common(1)[0][0])
     at, off = _find_grid_positions(tiles, base)
@@ -247,7 +247,7 @@ class Plateau:
 
 @dataclass(slots=True)
 class Tally:
-    """What has been seen of one layer while it was written."""
+    """Statistics of one layer, counted while it is written."""
 
     pixels: int = 0
     low: float = math.inf
@@ -258,7 +258,7 @@ class Tally:
     nodata: float = math.nan
     """Tag of the raster; NaN also if it has none."""
     plateaus: dict[float, Plateau] = field(default_factory=lambda: {1.0: Plateau(), -1.0: Plateau()})
-    """Of values times 1 and -1; in heights the lowest alone."""
+    """Plateaus of values times 1 and times -1; heights have only the first."""
 
     def count(self, layer: Layer, label: str, shard: Pixels) -> bool:
         """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
@@ -303,7 +303,7 @@ class RasterLayer:
     grid: MapGrid
     projection: Projection | None
     scheme: ClassScheme | None
-    """Of a categorical layer."""
+    """Classes of a categorical layer."""
     tally: Tally = field(default_factory=Tally)
 
     @property
@@ -348,42 +348,37 @@ class RasterLayer:
         return sorted({*(np.flatnonzero(self.tally.by_class[1:]) + 1).tolist(), *self.tally.unnamed})
 
     def list_findings(self) -> tuple[Finding, ...]:
-        """Return the raster's findings, a datum shift that is known only roughly, and values that are no class."""
-        subject, unnamed = Subject("layer", self.layer.name), sorted(self.tally.unnamed)
+        """Return the raster's findings, and those on a rough datum shift, values that are no class, isolated values and a narrow range."""
+        subject = Subject("layer", self.layer.name)
         rough = self.projection.find_rough_shift(subject) if self.projection else ()
-        if not unnamed:
-            return (*self.raster.findings, *rough, *self._find_isolated())
-        values = ", ".join(map(str, unnamed[:_NAMED])) + (" …" if len(unnamed) > _NAMED else "")
-        finding = make_finding(
-            "class-values-unnamed",
-            subject,
-            names={"values": values, "file": self.name},
-            pixel_count=self.tally.unnamed_pixels,
-            value_count=len(unnamed),
-        )
-        return (*self.raster.findings, *rough, finding)
+        found = self._find_unnamed(subject) if self.tally.unnamed else self._find_isolated(subject)
+        return (*self.raster.findings, *rough, *found)
 
-    def _find_isolated(self) -> Iterator[Finding]:
+    def _find_unnamed(self, subject: Subject) -> Iterator[Finding]:
+        unnamed, count = sorted(self.tally.unnamed), self.tally.unnamed_pixels
+        values = ", ".join(map(str, unnamed[:_NAMED])) + (" …" if len(unnamed) > _NAMED else "")
+        names = {"values": values, "file": self.name}
+        yield make_finding("class-values-unnamed", subject, names=names, pixel_count=count, value_count=len(unnamed))
+
+    def _find_isolated(self, subject: Subject) -> Iterator[Finding]:
         """Yield findings on values that are probably no data, and on a photo that uses little of 16 bits; white may be a collar."""
-        subject, tiles, names = Subject("layer", self.layer.name), self.raster.tiles, {"file": self.name}
+        tiles, names = self.raster.tiles, {"file": self.name}
         files = [self.raster.open_file(tile.path, tile.driver) for tile in tiles[:_NAMED]]
         least = 0.0 if self.layer.kind == "relative" else read_threshold(_ISOLATED, "min_ortho_fraction")
         for sign, plateau in self.tally.plateaus.items():
             if plateau.is_isolated(least):
                 value, share = sign * plateau.value, plateau.counts[0] / plateau.total
                 commands = [suggest_nodata(file, tile, value) for file, tile in zip(files, tiles, strict=False)]
-                remedies, named = (
-                    [Remedy("nodata", command=text) for text in commands if text],
-                    {"value": f"{value:.6g}"},
-                )
-                yield make_finding(_ISOLATED, subject, names=names | named, remedies=remedies, pixel_fraction=share)
+                remedies = [Remedy("nodata", command=command) for command in commands if command]
+                named = names | {"value": f"{value:.6g}"}
+                yield make_finding(_ISOLATED, subject, names=named, remedies=remedies, pixel_fraction=share)
         counts = self.tally.by_class[1:255]
         if self.layer.name == "ortho" and "uint16" in tiles[0].kind and counts.any():
             low, high = np.searchsorted(np.cumsum(counts) / counts.sum(), (_TAIL, 1.0 - _TAIL)).tolist()
             if (share := (high - low + 1) / 255.0) < read_threshold(_NARROW, "min_range_fraction"):
                 command = suggest_bytes(files[0], tiles[0].path, (high + 1.5) / tiles[0].scale[0])
-                scale = [Remedy("scale", command=command)]
-                yield make_finding(_NARROW, subject, names=names, remedies=scale, range_fraction=share)
+                remedies = [Remedy("scale", command=command)]
+                yield make_finding(_NARROW, subject, names=names, remedies=remedies, range_fraction=share)
 
     def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
         return compute_source_lattice(self.grid, self.raster.georeference, self.projection, row0, rows, col0, cols)

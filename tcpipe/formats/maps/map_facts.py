@@ -30,7 +30,7 @@ from tcpipe.terrain.layers import (
 
 @dataclass(frozen=True, slots=True)
 class MapInputs:
-    """What a map was made from: the sha256 of each file of each role, and the CRS that was asked for."""
+    """Inputs of a map: the sha256 of each file of each role, and the CRS that the user gave."""
 
     files: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     crs: str | None = None
@@ -40,7 +40,7 @@ class MapInputs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapFacts:
-    """What building a map found; a map keeps it in its attributes."""
+    """Results of building a map, which the map stores in its attributes."""
 
     sources: Mapping[str, str]
     """Files by layer."""
@@ -49,7 +49,7 @@ class MapFacts:
     height_min_m: float
     height_max_m: float
     class_share: Mapping[str, float]
-    """Of terrain: share of each class among the pixels that have one."""
+    """Share of each terrain class among the pixels that have a class."""
     class_shares: Mapping[str, Mapping[str, float]] = field(default_factory=dict, metadata=LEFT_OUT)
     """The same of the user's own layers."""
     findings: tuple[Finding, ...] = ()
@@ -173,7 +173,7 @@ Description: TypeAlias = Mapping[str, Value]
 
 @dataclass(frozen=True, slots=True)
 class _LayerDescription:
-    """What is read of a description; the paper's layers need none of it."""
+    """Fields of a layer's description; the paper's layers need no description."""
 
     kind: Kind = "continuous"
     long_name: str = ""
@@ -182,7 +182,7 @@ class _LayerDescription:
     classes: tuple[TerrainClass, ...] = ()
     dtype: Literal["uint8", "uint16", "float16", "float32"] = "float32"
     bands: tuple[tuple[float, float], ...] = ()
-    """Of a layer of several bands: the range of each; so are the next two."""
+    """Range of each band of a layer of several bands; so are the next two."""
     pixel_size_m: Annotated[float, Bounds(gt=0)] = 1.0
     own_px: Annotated[int, Bounds(ge=0, le=1024)] = 0
 
@@ -206,7 +206,7 @@ def make_cf_attributes(layer: Layer) -> dict[str, Value]:
 
 
 def describe_layer(layer: Layer) -> Description:
-    """Return a layer as JSON values; of one that its name alone does not tell, also its kind and its classes."""
+    """Return a layer as JSON values, with kind and classes if the name alone does not determine them."""
     known = {"dtype": layer.stored.name, "nodata": layer.nodata, **make_cf_attributes(layer)}
     if layer.name in PAPER_LAYERS:
         return known

@@ -62,7 +62,7 @@ SHARD_PX = 2048
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Attributes:
-    """What a map keeps of itself, as the attribute ``tcpipe_map``."""
+    """Facts that a map stores in its attribute ``tcpipe_map``."""
 
     version: str
     name: str
@@ -72,7 +72,7 @@ class _Attributes:
     layers: tuple[str, ...]
     described: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
     band_grids: Mapping[str, MapGrid] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Of layers of several bands."""
+    """Grids of layers of several bands."""
     factors: tuple[int, ...]
     tile_px: int
     height_reference_m: float
@@ -124,7 +124,7 @@ class MapFile(MapReader):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
 
     def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
-        """Have tiles (row, column) of all layers brought here that are read soon, where they lie in a bucket."""
+        """Fetch tiles (row, column) of all layers that are read soon, if they are in a bucket."""
         for array in self._levels[self._factor].values():
             array.expect(tiles)
 
@@ -157,7 +157,7 @@ def _read_bands(  # noqa: PLR0917
 
 
 def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool = True) -> MapFile:
-    """Open a map for reading; its shards lie beside their descriptions, or are ``fetched``.
+    """Open a map for reading; its shards are in the folders of their descriptions, or are ``fetched``.
 
     `MapError`: there is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were
     written or a file is gone: lost tiles would read as ground without data.
@@ -286,7 +286,7 @@ class MapWriter:
             _place(group, own, f"{name}, {layer_name}")
             self._levels[1][layer_name] = _add_layer(group, layers[layer_name], own, 1)
         self.height_reference_m: float | None = None
-        """What stored heights are above [m]: the floor of the smallest of the first shard that has any."""
+        """Reference of stored heights [m]: the floor of the smallest height of the first shard with heights."""
 
     def write(self, layer: str, row0: int, col0: int, values: Pixels, band: int = 0) -> None:
         """Write a shard of a layer or band; its corner is at a multiple of `SHARD_PX`, no data are NaN in floats and 0 in bytes."""

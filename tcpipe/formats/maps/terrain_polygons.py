@@ -1,8 +1,8 @@
 """Terrain drawn by hand: GeoJSON polygons with a property ``class``, as QGIS saves an annotated orthophoto.
 
 The property is a class name of the class table (case, '_' and '-' do not matter), or a number: a value of the table, as in a raster,
-else an id. Where polygons overlap, the later feature lies on top, as it was drawn. A map pixel has the class of the polygon that its
-centre lies in; ground outside all polygons has no data.
+else an id. Where polygons overlap, the later feature covers the earlier one, as drawn. A map pixel has the class of the polygon that
+contains its centre; ground outside all polygons has no data.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
 
 
 def _find_class(feature: PolygonFeature) -> Any:
-    """Return the property that names a feature's class; None if there is none or it is empty."""
+    """Return the property that names a feature's class; None if it is missing or empty."""
     found = next((value for name, value in feature.properties.items() if name.casefold() == PROPERTY), None)
     return None if found == "" else found
 

@@ -7,7 +7,7 @@ nothing to compare but what the controller corrects, and that leads the body. Th
 antenna that sits ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
 
 The pairs together, in windows of ten minutes, give each sensor's offset and drift from the clock that most of them share. A sensor is
-blamed only where two others agree against it and no pair contradicts; else two differ, and nobody knows which is off.
+blamed only where two others agree against it and no pair contradicts; else two differ, and it is unknown which is wrong.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _compute_lateness(offset: ClockOffset, from_middle_s: Floats | float) -> Flo
 
 
 def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float, Floats]]) -> list[ClockPair]:
-    """Return two sensors compared: in each window where three tell enough, else over the run."""
+    """Return two sensors compared: in each window if three determine the offset, else over the run."""
     found = [(at_s, estimate_lag([products])) for at_s, products in windows] if len(windows) >= _FEWEST_WINDOWS else []
     pairs = [pair for at_s, lag in found if lag and (pair := make_pair(late, against, by, lag, at_s)).determined]
     if len(pairs) >= _FEWEST_WINDOWS:
@@ -222,7 +222,7 @@ def _get_std_s(pair: ClockPair) -> float:
 
 
 def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) -> dict[str, ClockOffset]:
-    """Return offset and drift of each sensor that pairs connect to the reference; without windows that tell it, there is no drift."""
+    """Return offset and drift of each sensor that pairs connect to the reference; no drift unless windows determine it."""
     connected = _find_connected(reference, pairs)
     used = [pair for pair in pairs if pair.late in connected]
     free = [role for role in (*ROLES, DOPPLER) if role in connected and role != reference]
@@ -254,7 +254,7 @@ def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
 
 
 def _find_agreeing(offsets: Mapping[str, ClockOffset]) -> set[str]:
-    """Return the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
+    """Return the sensors near the reference, however certain: a reference clock with a large σ proves no offset."""
     near = {role for role, offset in offsets.items() if abs(offset.offset_s) <= _NOTED_S and not offset.drift_ppm}
     return near - {DOPPLER}
 

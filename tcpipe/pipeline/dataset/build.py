@@ -93,7 +93,7 @@ class BuildResult:
     status: str
     """``done``, ``unchanged``, or, of a dry run, ``planned``."""
     findings: tuple[Finding, ...]
-    """Of the dataset itself, with excluded runs and empty splits."""
+    """Findings of the dataset itself, with excluded runs and empty splits."""
     card: DatasetCard | None = None
     """None for a dry run."""
     exit_code: int = 0

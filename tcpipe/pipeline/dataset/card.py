@@ -194,7 +194,7 @@ PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "mean_abs_yaw_
 
 _FITTED = (*PHYSICS_COLUMNS, "power_watt", "velocity_mps", "terrain_name")
 _MOST_FITTED = 200_000
-"""So many segments of a robot are fitted and compared, evenly taken of more: their power is known to per mille by then."""
+"""Most segments of a robot that are fitted, evenly taken of more: they determine the power to a per mille."""
 
 
 def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -274,7 +273,7 @@ def find_contradictions(
 ) -> tuple[NDArray[np.uint32], list[Finding]]:
     """Return `Quality.MAP_CONTRADICTS_TRACK` or 0 of each patch, shape (N,), and findings on the largest clusters of such patches.
 
-    Slope, cross slope and heights along the middle of patches are compared run by run; a run without heights and attitude has no say.
+    Slope, cross slope and heights along the middle of patches are compared run by run; runs without heights and attitude flag nothing.
     """
     motion = np.stack([to_floats(segments, name)[sampled.kept] for name in _MOTION])
     patches, (rear_m, centre_m, front_m) = sampled.patches, sampled.patches.profile_m.T
@@ -324,8 +323,9 @@ def _find_clusters(rows: NDArray[np.int64], excess: _Rows, sampled: Sampled, map
         slope_rad, height_m = (float(np.abs(part[:, mine]).max()) for part in np.split(excess, 2))
         names, subject = {"place": f"{lon:.6f}, {lat:.6f}"}, Subject("map", maps[sampled.map_index[mine[0]]])
         extent_m = float(np.hypot(*np.ptp(sampled.footprint_xy_m[mine].reshape(-1, 2), axis=0)))
-        sizes: dict[str, Any] = {"sample_count": len(mine), "extent_m": extent_m, "slope_rad": slope_rad}
-        yield make_finding(_CONTRADICTION, subject, names=names, height_m=height_m, **sizes)
+        yield make_finding(
+            _CONTRADICTION, subject, names=names, sample_count=len(mine), extent_m=extent_m, slope_rad=slope_rad, height_m=height_m
+        )  # fmt: skip
 
 
 def find_removed_by_ground(
@@ -372,11 +372,8 @@ def _find_blocked(groups: Sequence[Group], source: MapFile) -> list[Finding]:
     findings = []
     for group in (group for group in groups if group.name in closed and group.driven_m > least * driven_m):
         values = [str(value) for value, number in source.id_by_value.items() if number == closed[group.name]]
-        subject, names, share = (
-            Subject("class", group.name),
-            {"values": ", ".join(values[:3])},
-            group.driven_m / driven_m,
-        )
+        subject, names = Subject("class", group.name), {"values": ", ".join(values[:3])}
+        share = group.driven_m / driven_m
         findings.append(make_finding(_BLOCKED, subject, names=names, driven_m=group.driven_m, driven_fraction=share))
     return findings
 

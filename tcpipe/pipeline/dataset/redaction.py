@@ -1,4 +1,4 @@
-"""Redacted datasets: no names of logs, topics, paths, hosts or users, and all places moved by one offset that is stored nowhere."""
+"""Redacted datasets: no names of logs, topics, paths, hosts or users; all places are moved by one offset, which is not stored."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def test_a_voltage_of_fewer_than_three_levels_is_a_nominal_one(volt):
     found, measured = read(volt), read()
     (finding,) = select_findings(found.findings, "voltage-assumed")
     assert finding.severity == "warning"
-    assert found.gain_std_fraction == pytest.approx(np.hypot(measured.gain_std_fraction, 0.08))
+    assert found.facts.gain_std_fraction == pytest.approx(np.hypot(measured.facts.gain_std_fraction, 0.08))
     assert not select_findings(measured.findings, "voltage-assumed")
 
 
@@ -180,12 +180,12 @@ def test_a_stated_nominal_voltage_is_reported_once():
     source = PowerSource("my_msgs/msg/Current", current="amp", nominal_voltage_volt=24.0)
     found = readings.read_power({"/c": (source.type, {"log_time_ns": TIME_NS, "amp": AMP})}, [source])
     assert len(select_findings(found.findings, "voltage-assumed")) == 1
-    assert found.gain_std_fraction == pytest.approx(np.hypot(0.02, 0.1))
+    assert found.facts.gain_std_fraction == pytest.approx(np.hypot(0.02, 0.1))
 
 
 @pytest.mark.parametrize(("status", "charging"), [(1, True), (2, False), (0, False)])
 def test_a_battery_states_that_it_is_charged(status, charging):
-    assert read(power_supply_status=np.full(COUNT, status)).charging is charging
+    assert read(power_supply_status=np.full(COUNT, status)).facts.charging is charging
 
 
 @pytest.mark.parametrize("amp", [0.0, -1.0])

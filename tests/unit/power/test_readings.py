@@ -55,7 +55,7 @@ def power_watt(found: PowerReadings) -> np.ndarray:
 def test_a_huskys_propulsion_is_battery_voltage_times_both_drivers() -> None:
     found = read_power({"/status": (HUSKY_STATUS, husky_status())}, "husky")
     np.testing.assert_allclose(power_watt(found), VOLT * (2 * AMP + 1.0), rtol=1e-14)
-    assert not found.averaged
+    assert not found.facts.averaged
     assert found.findings == ()
 
 
@@ -85,9 +85,9 @@ def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarr
     columns["measured_currents"][:, 0] += np.where(np.arange(N) == 0, 1e-9, 0)  # a current that moves, if little
     found = read_power({"/power": (CLEARPATH_POWER, columns)}, robot, husky_power=option)
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
-    assert found.averaged == (robot != "husky")  # a Husky's driver asks for the state of the moment
+    assert found.facts.averaged == (robot != "husky")  # a Husky's driver asks for the state of the moment
     assert bool(found.findings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
-    assert [("power-includes-loads", name) for name in found.includes] == [
+    assert [("power-includes-loads", name) for name in found.facts.includes] == [
         (of.code, of.names["loads"]) for of in found.findings
     ]
 
@@ -118,7 +118,7 @@ def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
 def test_older_clearpath_status(type_name: str, fields: dict) -> None:
     found = read_power({"/status": (type_name, TIMES | fields)}, "generic")
     np.testing.assert_allclose(power_watt(found), VOLT * AMP, rtol=1e-14)
-    assert found.averaged
+    assert found.facts.averaged
 
 
 @pytest.mark.parametrize(("recorded", "signs"), [(AMP, ["drawn_positive"]), (-AMP, [])])
@@ -290,7 +290,7 @@ def test_a_type_whose_drawn_current_is_negative_needs_no_recipe_line() -> None:
     topics, known = {"/b": ("my_msgs/msg/Battery", columns)}, [source(sign="drawn_negative")]
     found = readings.read_power(topics, known)
     np.testing.assert_allclose(power_watt(found), VOLT * AMP)
-    assert found.current_sign == "drawn_negative (message type)"
+    assert found.facts.current_sign == "drawn_negative (message type)"
     against = readings.read_power({"/b": ("my_msgs/msg/Battery", columns | {"i": AMP})}, known)
     assert against.findings[0].remedies[0].recipe == {"read": {"current_sign": "drawn_positive"}}
     told = readings.read_power(

@@ -37,7 +37,6 @@ def read(topic=None, clock=None, *, steps=(), power=None, findings=(), timelines
         assignment,
         [topic or source()],
         clocks,
-        {},
         power=power or PowerReadings(),
         sensors={"gnss": SENSOR},
         offset_s={"gnss": 0.25},
@@ -125,7 +124,7 @@ def test_a_rate_is_that_inside_epochs_and_unknown_of_one_row():
 
 
 ODD = make_finding("power-includes-loads", Subject("role", "power"), names={"loads": "computers"})
-POWER = PowerReadings(averaged=True, findings=(ODD,), current_sign="drawn", includes=("computers",))
+POWER = PowerReadings(findings=(ODD,), facts=PowerSign("drawn", averaged=True, includes=("computers",)))
 
 
 def test_notes_that_count_nothing_are_left_out_and_powers_are_told():
