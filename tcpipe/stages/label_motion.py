@@ -264,7 +264,12 @@ def find_label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
         findings.append(_find_low_rate(facts))
     if facts.energy_joule is not None and facts.segments and facts.segments_without_power:
         lost, total = facts.segments_without_power, facts.segments
-        findings.append(make_finding("segments-without-power", _POWER, unlabelled_count=lost, segment_count=total))
+        numbers = {"unlabelled_count": lost, "segment_count": total}
+        findings.append(
+            make_finding("segments-without-power", _POWER, **numbers)
+            if lost < total
+            else make_finding("no-power", _POWER)
+        )
     slips = facts.quality["high_slip"]
     if slips > read_threshold("wheels-slip", "min_segment_fraction") * facts.segments:
         findings.append(make_finding("wheels-slip", _WHEELS, segment_fraction=slips / facts.segments))

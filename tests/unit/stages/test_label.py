@@ -141,6 +141,13 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
     assert "segments-without-power" in codes_of(labelled)
 
 
+def test_energy_is_not_usable_if_power_reaches_no_segment():
+    stamp_ns, volt, amp = record()
+    labelled = label(straight_track(SPEED), power_streams({"drive": (stamp_ns - 10**12, volt, amp)}))
+    assert "no-power" in codes_of(labelled)
+    assert "segments-without-power" not in codes_of(labelled)
+
+
 @pytest.mark.parametrize(
     ("period_s", "averaged", "low"), [(0.1, False, False), (0.12, False, True), (0.5, True, False), (0.6, True, True)]
 )
