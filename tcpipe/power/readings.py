@@ -189,10 +189,11 @@ def _read_charge(columns: Columns) -> Floats | None:
     """Return the charge of a battery message [Ah], shape (N,): its own, else its state of charge times its capacity; None without both."""
     names = ("charge", "percentage", "capacity", "design_capacity")
     values = {name: np.asarray(columns[name], np.float64) for name in names if name in columns}
-    if np.isfinite(values.get("charge", np.nan)).any():
-        return values["charge"]
-    share, capacity_ah = values.get("percentage"), values.get("capacity", values.get("design_capacity"))
-    if share is None or capacity_ah is None or not np.isfinite(share * capacity_ah).any():
+    measured = {name: value for name, value in values.items() if (value > 0.0).any()}  # 0 and NaN: not measured
+    if "charge" in measured:
+        return measured["charge"]
+    share, capacity_ah = measured.get("percentage"), measured.get("capacity", measured.get("design_capacity"))
+    if share is None or capacity_ah is None:
         return None
     return share * capacity_ah / (100.0 if np.nanmax(share) > 1.0 else 1.0)
 

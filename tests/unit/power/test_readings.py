@@ -366,3 +366,12 @@ def test_currents_that_are_not_known_to_be_drawn_are_refused_with_the_reason(typ
     found = read_power({"/motors": (type_name, TIMES)}, "generic")
     assert reasons(found) == ["no-battery-current"]
     assert found.findings[0].names["type"] == type_name
+
+
+@pytest.mark.parametrize("unmeasured", [0.0, np.nan])
+def test_the_state_of_charge_is_used_where_the_charge_is_not_measured(unmeasured):
+    missing = np.full(N, unmeasured)
+    left = 1.0 - np.cumsum(AMP) * 0.05 / 3600.0 / 0.02
+    columns = battery(VOLT, -AMP) | {"percentage": left, "charge": missing, "capacity": missing}
+    power = read_power({"/b": (BATTERY_STATE, columns | {"design_capacity": np.full(N, 0.02)})}, "husky")
+    assert power.charge_ratio == pytest.approx(1.0, abs=0.05)
