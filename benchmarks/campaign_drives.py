@@ -39,7 +39,7 @@ from tcpipe.stages.read import read_run
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import Finding
+from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding
 from tcpipe.tables.levels import LabelledSegments, Streams, Track
 
 Readings = Mapping[str, Reading]
@@ -356,7 +356,7 @@ def _rms(values: np.ndarray) -> float:
 
 def said_of(findings: Iterable[Finding]) -> list[str]:
     """Return the findings as lines with their codes."""
-    return [format_finding(finding) for finding in dict.fromkeys(findings)]
+    return [format_finding(finding) for finding in dict.fromkeys(findings) if finding.code != WITNESSES_OF_LABEL]
 
 
 def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fault, *, max_std_m: float) -> Outcome:

@@ -57,13 +57,13 @@ def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float] | 
 
     Halts beyond what the hardware takes, by more than the prior, leave a range of offsets, all as likely. On a slope the drives may take
     more, so that the low halts count. Where halts differ, the zero moved, and it is unknown which halt is right. Without a known range an
-    offset smaller than the current at rest cannot be seen: half of that current is its standard deviation, up to a threshold.
+    offset smaller than the current at rest cannot be seen: half of that current is its standard deviation.
     """
     if not rest_amp.size:
         return prior_amp
     least, most = summarize_rest(rest_amp)
     if rest_range_amp is None:
-        return max(min(abs(least) / 2.0, read_threshold("current-offset", "max_unseen_std_amp")), prior_amp)
+        return max(least / 2.0, prior_amp)
     first, last = least - rest_range_amp[1], least - rest_range_amp[0]
     std = prior_amp
     if first > prior_amp or last < -prior_amp:

@@ -94,14 +94,22 @@ def estimate_energy_noise(
     return EnergyNoise(rate, current, voltage)
 
 
+_USUAL_DELAY_S = 0.03
+"""σ of the delay of power where clocks are synchronised [s]: a period of 20 Hz or less."""
+
+
 def estimate_delay_variance(
     rails: list[Rail], start_ns: Stamps, end_ns: Stamps, delay_s: float, std_s: float, *, rule: Rule
 ) -> Floats:
     """Return the mean square of what a delay of power changes of each span's energy [J²], shape (M,); 0 where it is unknown.
 
     The energies of two spans in a row change by opposite amounts at their border: over a path the error averages out. The mean is over
-    the normal distribution of the delay (``delay_s``, ``std_s`` [s]), by Gauss and Hermite's three nodes.
+    the normal distribution of the delay (``delay_s``, ``std_s`` [s]), by Gauss and Hermite's three nodes. A delay inside 2σ is weighted
+    with the usual delay of a synchronised driver.
     """
+    if abs(delay_s) < 2.0 * std_s:
+        weight = _USUAL_DELAY_S**2 / (_USUAL_DELAY_S**2 + std_s**2)
+        delay_s, std_s = weight * delay_s, weight**0.5 * std_s
     stamped = integrate_energy(rails, start_ns, end_ns, rule=rule)
     squares = []
     for node_s in delay_s + std_s * np.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]):

@@ -136,8 +136,8 @@ def label_segments(
     for segment_rows, finding in find_unpowered_motion(table, needed_watt, physics, masked.info, start_ns):
         quality[segment_rows] |= np.uint32(Quality.UNPOWERED)
         unpowered.append(finding)
-    column = table.schema.get_field_index("quality")
-    table = table.set_column(column, table.schema.field(column), pa.array(quality))
+    columns = {name: table[name] for name in table.column_names}
+    table = LABELLED_SEGMENTS.table(**columns | {"quality": quality})
     distance_by_reason_m, velocity = segments.distance_by_reason_m, config.velocity
     facts = make_label_facts(
         table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics

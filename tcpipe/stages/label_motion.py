@@ -264,9 +264,8 @@ def find_label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
         findings.append(_find_low_rate(facts))
     if facts.energy_joule is not None and facts.segments and facts.segments_without_power:
         lost, total = facts.segments_without_power, facts.segments
-        numbers = {"unlabelled_count": lost, "segment_count": total}
         findings.append(
-            make_finding("segments-without-power", _POWER, **numbers)
+            make_finding("segments-without-power", _POWER, unlabelled_count=lost, segment_count=total)
             if lost < total
             else make_finding("no-power", _POWER)
         )

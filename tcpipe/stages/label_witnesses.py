@@ -92,7 +92,7 @@ def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> 
         missing = [f"contradicted by {', '.join(each.witness for each in contradicting)}"]
     share, limit = facts.power.side_share if facts.power else None, read_threshold(_SIDE, "min_share_fraction")
     if share is not None and not limit <= share <= 1.0 - limit:
-        yield make_finding(_SIDE, _POWER, share_fraction=min(share, 1.0 - share))
+        yield make_finding(_SIDE, _POWER, share_fraction=max(min(share, 1.0 - share), 0.0))
     energy, max_jpm = _summarize(table, "energy", "joule", "jpm"), read_threshold(_LARGE, "max_mean_jpm")
     if not contradicting and energy["mean_jpm"] > max_jpm:
         yield make_finding(_LARGE, _POWER, mean_jpm=energy["mean_jpm"], max_jpm=max_jpm)
@@ -111,7 +111,8 @@ def _make_implausible(worst: _Comparison, comparisons: list[_Comparison]) -> Fin
     """Return the finding that a witness contradicts the scale of power; only a warning where another witness confirms it."""
     bound, limit = ("largest", worst.high) if worst.ratio > worst.high else ("smallest", worst.low)
     scale = worst.find_scale()
-    is_remedy = scale != 1.0 and all(each.low < each.ratio * scale < each.high for each in comparisons)
+    is_clear = worst.excess > np.log(read_threshold(IMPLAUSIBLE, "min_unit_excess_ratio"))
+    is_remedy = is_clear and scale != 1.0 and all(each.low < each.ratio * scale < each.high for each in comparisons)
     return make_finding(
         IMPLAUSIBLE,
         _POWER,

@@ -75,12 +75,12 @@ def list_second_meters(
     ]
 
 
-_STRAIGHT_RADPS, _MOVING_MPS = 0.05, 0.2
-"""Largest turn rate and smallest speed of straight driving."""
+_STRAIGHT_RADPS, _MOVING_MPS, _STILL_MPS = 0.05, 0.2, 0.01
+"""Largest turn rate and smallest speed of straight driving, largest speed at rest."""
 
 
 def add_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> PowerReadings:
-    """Return the power with the share of one side in the current in straight driving, if both sides and an odometry are known."""
+    """Return the power with the share of one side in the current of straight driving, above that at rest, if an odometry is known."""
     motion = _choose_odometry(streams)
     if power.facts is None or power.sides is None or motion is None:
         return power
@@ -91,7 +91,11 @@ def add_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> Pow
         for name in ("velocity_x_mps", "angular_velocity_z_radps")
     )
     is_straight = (speed_mps > _MOVING_MPS) & (turn_radps < _STRAIGHT_RADPS)
-    share = compute_side_share(power.sides.first_amp, power.sides.second_amp, is_straight)
+    sides = [
+        amp - (np.median(rest_amp) if (rest_amp := amp[(speed_mps < _STILL_MPS) & np.isfinite(amp)]).size else 0.0)
+        for amp in (power.sides.first_amp, power.sides.second_amp)
+    ]
+    share = compute_side_share(sides[0], sides[1], is_straight)
     return replace(power, facts=replace(power.facts, side_share=share))
 
 

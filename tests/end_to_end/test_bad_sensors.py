@@ -206,7 +206,8 @@ def test_an_imu_that_nothing_places_is_refused_and_its_mounting_proposed(tmp_pat
     places = [
         proposed(finding)
         for finding in labelled.info.report.findings
-        if any("read.extrinsics" in of.recipe for of in finding.remedies)
+        if finding.code != "sensor-not-placed"  # prints ? for what must be measured
+        and any("read.extrinsics" in remedy.recipe for remedy in finding.remedies)
     ]
     values = reduce(merged, places)
     assert values == reduce(merged, reversed(places))  # no two findings propose different values for one key

@@ -30,8 +30,8 @@ def test_warthog_on_grass_follows_fixes_that_come_late():
     watt, time_s = to_floats(table, "power_watt"), to_integers(table, "stamp_ns") * 1e-9
     measured = np.isfinite(
         watt
-    )  # both drives are read at 1 Hz: what lies before the first reading and after the last is not known
-    assert np.count_nonzero(~measured) < 40
+    )  # both drives are read at 1 Hz, and begin with rows of 0 V: power is unknown before the first reading and after the last
+    assert np.count_nonzero(~measured) < 50
     energy_joule = np.trapezoid(watt[measured], time_s[measured])
     assert energy_joule == pytest.approx(69_365.3, rel=0.005)
     assert "stamp-jitter" in {of.code for of in track.info.report.findings}

@@ -10,7 +10,6 @@ from simulated_streams import streams_of
 
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.checking import from_values
 from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, read_truth, simulate
 from tcpipe.simulation.route import Wander
@@ -117,17 +116,6 @@ def test_the_delay_of_power_is_in_the_uncertainty(drive, delay_s):
     for finding in found.values():
         (remedy,) = finding.remedies
         assert remedy.recipe["read.time_offset_s"]["power"] == pytest.approx(-delay_s, abs=0.06)
-
-
-def test_the_line_that_a_finding_suggests_removes_it_and_keeps_the_uncertainty(drive):
-    for fault in ("offset of 1 A", "gain + 10 %"):
-        change, code = FAULTS[fault]
-        before = label(drive, change)
-        (remedy,) = find_codes(before)[code].remedies
-        after = label(drive, change, from_values(Recipe, dict(remedy.recipe), where="suggested"))
-        assert not find_codes(after)
-        std = [to_floats(of.table, "energy_std_joule") for of in (before, after)]
-        assert std[1] == pytest.approx(std[0], rel=0.02)
 
 
 def test_motion_with_the_power_of_rest_is_named_with_its_span_and_a_line_that_drops_it(drive):

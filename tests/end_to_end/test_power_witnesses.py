@@ -84,10 +84,11 @@ def test_half_a_side_is_in_the_uncertainty(drive, tmp_path):
     assert np.mean(error < 2.0 * to_floats(segments, "energy_std_joule")) > 0.9
 
 
-def test_one_side_without_current_is_not_usable(drive, tmp_path):
+@pytest.mark.parametrize("rest_amp", [0.0, 0.4])
+def test_one_side_without_current_is_not_usable(drive, tmp_path, rest_amp):
     def remove_side(columns):
         currents = columns["measured_currents"].copy()
-        currents[:, 1] = 0.02 * np.random.default_rng(1).standard_normal(len(currents))
+        currents[:, 1] = rest_amp + 0.02 * np.random.default_rng(1).standard_normal(len(currents))
         return {"measured_currents": currents}
 
     result, found = ingest_drive(drive.changed("power", remove_side), tmp_path)

@@ -374,4 +374,4 @@ def test_the_state_of_charge_is_used_where_the_charge_is_not_measured(unmeasured
     left = 1.0 - np.cumsum(AMP) * 0.05 / 3600.0 / 0.02
     columns = battery(VOLT, -AMP) | {"percentage": left, "charge": missing, "capacity": missing}
     power = read_power({"/b": (BATTERY_STATE, columns | {"design_capacity": np.full(N, 0.02)})}, "husky")
-    assert power.charge_ratio == pytest.approx(1.0, abs=0.05)
+    assert power.facts.charge_ratio == pytest.approx(1.0, abs=0.05)

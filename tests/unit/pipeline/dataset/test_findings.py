@@ -108,7 +108,7 @@ def built(tmp_path_factory):
 def test_they_stand_in_the_commands_answer_the_card_and_what_is_opened(built):
     result, place = built
     assert "warning: 2 of 2 runs: Most of the drive was commanded below" in str(result)
-    assert "verdict: time usable with care; position and energy usable" in str(result)
+    assert "verdict: position · usable\nverdict: time · usable with care\nverdict: energy · usable" in str(result)
     card = open_dataset(place).card
     assert (card.flagged_samples.samples, card.flagged_samples.share) == (5, 0.125)
     (flagged,) = select_findings(card.findings, "samples-flagged")
