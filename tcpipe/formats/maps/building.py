@@ -17,10 +17,11 @@ from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.integrity import write_checksums
-from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open, make_table_command
+from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
 from tcpipe.formats.maps.layer_building import Raster, RasterLayer, Tally, iterate_shards, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
+from tcpipe.formats.maps.raster_commands import make_table_command
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold

@@ -28,7 +28,7 @@ import rasterio
 import rasterio.shutil
 from numpy.typing import NDArray
 from pyproj import CRS
-from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.features import rasterize
 from rasterio.io import MemoryFile
@@ -37,6 +37,7 @@ from rasterio.windows import Window
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
+from tcpipe.formats.maps.raster_commands import describe_colours, suggest_bytes
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.layers import LUMA_RGB, MAX_BANDS
 from tcpipe.terrain.target_grid import MapGrid
@@ -100,8 +101,8 @@ _MAX_OPEN = 32
 _MAX_BLOCK_BYTES = 256_000_000
 """Largest block that is decoded at one time: a tile or a strip of a raster [byte]."""
 
-_LOOKED_AT_PX, _MAX_COLOURS = 2048, 32
-"""Longest side of a raster whose colours are counted [px], and most of them that are proposed as classes."""
+_LOOKED_AT_PX = 2048
+"""Longest side of a raster whose colours are counted [px]."""
 
 _MAX_STATISTICS_BYTES = 16_000_000
 
@@ -389,7 +390,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         palette = dataset.colorinterp[0] == ColorInterp.palette
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
             some = dataset.read(plain, out_shape=(len(plain), 512, 512), masked=True).compressed()
-            how = suggest_bytes(dataset, path, float(some[np.isfinite(some)].max(initial=0.0)) or 1.0)
+            how = suggest_bytes(dataset.nodata, path, float(some[np.isfinite(some)].max(initial=0.0)) or 1.0)
             raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected 8-bit or 16-bit unsigned; scale it: {how}")
         if None not in rgb:
             more = make_finding("ortho-bands-unused", subject, names={**file, "bands": names})
@@ -425,21 +426,7 @@ def _describe_colours(dataset: Any, path: Path, bands: Sequence[int]) -> str:
         red, green, blue = dataset.read(bands, out_shape=shape).astype(np.int64)
     except RasterioError as error:
         raise MapError(f"{path}: cannot be read; the file is damaged: {describe_error(error)}") from error
-    values, counts = np.unique((red << 16) + (green << 8) + blue, return_counts=True)
-    names = {value: f"#{value:06x}" for value in sorted(values[np.argsort(-counts)][:_MAX_COLOURS].tolist())}
-    r, g, b = (f"(read 1 {band} 'int32')" for band in bands)
-    return (
-        f"{path}: has bands of red, green and blue, expected one of class values; make each colour a value: rio calc --not-masked "
-        f'"(+ (* 65536 {r}) (* 256 {g}) {b})" {shlex.quote(str(path))} classes.tif --dtype int32; write a table of the commonest of '
-        f"{len(values)} colours: {make_table_command(names)}; fill in each ? and use --terrain classes.tif --classes classes.csv"
-    )
-
-
-def make_table_command(names: Mapping[int, str]) -> str:
-    """Return the shell command that writes a class table of named values; each ``?`` has to be filled in before the table is read."""
-    rows = [f"{value},{number},{name},?" for number, (value, name) in enumerate(names.items(), 1)]
-    quoted = " ".join(f'"{row}"' for row in ("value,id,name,traversable", *rows))
-    return f'printf "%s\\n" {quoted} > classes.csv'
+    return describe_colours((red << 16) + (green << 8) + blue, path, bands)
 
 
 def _fits_half(dataset: Any, bands: tuple[int, ...], scale: tuple[float, float]) -> bool:
@@ -477,27 +464,6 @@ def _read_scaling(
         )
     metres = _METRES[name] if unit else _find_vertical_unit_m(dataset, path)
     return (scale * metres, offset * metres), ()
-
-
-def suggest_bytes(dataset: Any, path: Path, highest: float) -> str:
-    """Return the command that writes an orthophoto with 8 bits: values from 0 to ``highest`` as 1 to 255, no data as 0."""
-    text = f"(where (> (read 1) {highest:.6g}) 255 (+ 1 (* {254.0 / highest:.6g} (read 1))))"
-    options = [] if dataset.nodata is None else ["--co", "nodata=0"]
-    if options and not np.isnan(dataset.nodata):  # NaN becomes 0 by itself
-        text = f"(where (== (read 1) {dataset.nodata:.9g}) 0 {text})"
-    files = [str(path), str(path.with_name(f"{path.stem}-8bit.tif"))]
-    return shlex.join(["rio", "calc", "--not-masked", "--dtype", "uint8", *options, text, *files])
-
-
-def suggest_nodata(dataset: Any, tile: Tile, value: float) -> str:
-    """Return the command that declares a value as no data; none if a mask, a palette, or nodata of several bands prevents it."""
-    nodata = None if dataset.nodata is None or np.isnan(dataset.nodata) else f"{dataset.nodata:.9g}"
-    is_masked = MaskFlags.per_dataset in dataset.mask_flag_enums[0] or (nodata and dataset.count > 1)
-    if is_masked or "palette" in tile.kind:
-        return ""
-    raw, copy = f"{(value - tile.scale[1]) / tile.scale[0]:.9g}", tile.path.with_stem(f"{tile.path.stem}-nodata")
-    changed = ["calc", "--not-masked", f"(where (== (read 1) {raw}) {nodata} (read 1))", str(tile.path), str(copy)]
-    return shlex.join(["rio", *(changed if nodata else ["edit-info", "--nodata", raw, str(tile.path)])])
 
 
 def _find_vertical_unit_m(dataset: Any, path: Path) -> float:

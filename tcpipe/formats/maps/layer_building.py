@@ -23,12 +23,10 @@ from tcpipe.formats.maps.geotiff import (
     OpenFile,
     Tile,
     Use,
-    make_table_command,
     read_tile,
     read_window,
-    suggest_bytes,
-    suggest_nodata,
 )
+from tcpipe.formats.maps.raster_commands import make_table_command, suggest_bytes, suggest_nodata
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.layers import Layer, Pixels
@@ -368,7 +366,10 @@ class RasterLayer:
         for sign, plateau in self.tally.plateaus.items():
             if plateau.is_isolated(least):
                 value, share = sign * plateau.value, plateau.counts[0] / plateau.total
-                commands = [suggest_nodata(file, tile, value) for file, tile in zip(files, tiles, strict=False)]
+                commands = [
+                    "" if "palette" in tile.kind else suggest_nodata(file, tile.path, tile.scale, value)
+                    for file, tile in zip(files, tiles, strict=False)
+                ]
                 remedies = [Remedy("nodata", command=command) for command in commands if command]
                 named = names | {"value": f"{value:.6g}"}
                 yield make_finding(_ISOLATED, subject, names=named, remedies=remedies, pixel_fraction=share)
@@ -376,7 +377,7 @@ class RasterLayer:
         if self.layer.name == "ortho" and "uint16" in tiles[0].kind and counts.any():
             low, high = np.searchsorted(np.cumsum(counts) / counts.sum(), (_TAIL, 1.0 - _TAIL)).tolist()
             if (share := (high - low + 1) / 255.0) < read_threshold(_NARROW, "min_range_fraction"):
-                command = suggest_bytes(files[0], tiles[0].path, (high + 1.5) / tiles[0].scale[0])
+                command = suggest_bytes(files[0].nodata, tiles[0].path, (high + 1.5) / tiles[0].scale[0])
                 remedies = [Remedy("scale", command=command)]
                 yield make_finding(_NARROW, subject, names=names, remedies=remedies, range_fraction=share)
 
