@@ -209,13 +209,12 @@ def test_a_range_is_drawn_in_the_histogram_or_typed(opened):
 
 def test_patches_and_rows_are_sorted_and_turned_page_by_page(opened):
     opened.select_option("#run", label="south")
-    power, run, std, off = (column(opened, name) for name in ("power", "run", "power_std", "residual"))
+    power, run, std = (column(opened, name) for name in ("power", "run", "power_std"))
     chosen = [i for i, of in enumerate(run) if of == 1]
     for option, key in {
         "w, largest first": lambda i: -power[i],
         "w, smallest first": lambda i: power[i],
         "σ of w": lambda i: -std[i],
-        "|w beyond physics|": lambda i: -abs(off[i]),
     }.items():
         opened.select_option("#sort", option)
         wanted = sorted(chosen, key=lambda i: (key(i), i))
