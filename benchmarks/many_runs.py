@@ -121,8 +121,8 @@ def timed(what: str, act: Callable[[], T]) -> T:
     return found
 
 
-def once(chosen: SelectedRuns) -> int:
-    return len(remove_duplicates(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()}).runs)
+def once(store: Store, chosen: SelectedRuns) -> int:
+    return len(remove_duplicates(store, chosen.runs, chosen.logs).runs)
 
 
 def ingest_new_logs(directory: Path, count: int) -> None:
@@ -155,7 +155,7 @@ def main() -> None:
         )
         assert found.counts == {"done": count}, found.counts
         chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
-        assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) >= count
+        assert timed(f"each drive once, {again}", lambda chosen=chosen: once(store, chosen)) >= count
         assert not timed(
             f"prune --dry-run, {again}", lambda: prune(store=store.root, recipe=Recipe(), dry_run=True)
         ).removed
