@@ -53,13 +53,13 @@ class Floor:
 
     pairs: int
     places: int
-    """Blocks of ground that the pairs lie in."""
+    """Number of blocks of ground that contain the pairs."""
     std: float
     std_low: float | None
     """None where there are too few places for an interval."""
     std_high: float | None
     share_of_variance: float
-    """Of the label's own variance; no model explains more than the rest."""
+    """Share of the label's variance; a model can explain at most the rest."""
 
 
 def find_repeated_pairs(

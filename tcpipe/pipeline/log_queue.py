@@ -47,7 +47,7 @@ class LogQueue:
         self._log, self._tasks, self._broken = log, tasks, broken
         self._planned, self._decide = log.state, make_planner(log.state, broken=broken)
         self.steps = self.plan(range(len(tasks)))
-        """What the logs need as the call begins."""
+        """Steps that the logs need when the call begins."""
         todo = [at for at, step in self.steps.items() if step.is_todo]
         self._units = [
             [todo[at] for at in unit] for unit in group_possible_duplicates([tasks[at].source for at in todo])

@@ -173,7 +173,7 @@ _MAX_HALF_SHARE = 0.36
 
 
 def estimate_missing_std_fraction(side_share: float | None) -> float:
-    """Return σ of the gain for what one side may lack: half a side cannot be told, because sound robots have shares of 0.13 to 0.50."""
+    """Return σ of the gain for what one side may lack: half a side cannot be detected, because sound robots have shares of 0.13 to 0.50."""
     share = 0.5 if side_share is None else min(side_share, 1.0 - side_share)
     return (1.0 - 2.0 * share) / 3.0**0.5 if share < _MAX_HALF_SHARE else 0.0
 
