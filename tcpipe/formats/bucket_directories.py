@@ -28,10 +28,11 @@ from tcpipe.formats.atomic import make_lasting_scratch
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
 from tcpipe.formats.commits import State
+from tcpipe.formats.file_checks import find_changed_files
 from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import Place, find_changed_files, open_place
+from tcpipe.formats.place import Place, open_place
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
@@ -81,7 +82,7 @@ class FetchedShards:
 
     def fetch_file(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
-        return self.place.local(self._name(path), self._checksum(path))
+        return self.place.fetch(self._name(path), self._checksum(path), proved=False)
 
     def is_complete(self) -> bool:
         """Return whether each file is there, and as large as it was."""
@@ -255,7 +256,7 @@ def _make_subdirectory(directory: Path, url: str) -> Path:
 def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
     """Link or copy the cached content of a file to where it is wanted."""
     to.parent.mkdir(parents=True, exist_ok=True)
-    held = place.proved(name, checksum)
+    held = place.fetch(name, checksum)
     with suppress(FileExistsError):
         try:
             os.link(held, to)
