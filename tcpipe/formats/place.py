@@ -142,6 +142,11 @@ class Place:
 
         return sorted(self._do(prefix, lambda path: _walk_files(path, prefix, but), list_objects))
 
+    def list(self, folder: str = "") -> "Sequence[str]":
+        """Return the names directly in a folder."""
+        folders, files = self._list(folder)
+        return sorted([*folders, *files])
+
     def folders(self, prefix: str = "") -> list[str]:
         """Return the first parts of all names of more parts below ``prefix/``, sorted: the folders that lie there."""
         return self._list(prefix)[0]
@@ -259,7 +264,7 @@ class Place:
 
     def map(self, function: Callable[[T], U], items: Sequence[T]) -> list[U]:
         """Return what a function gives for each item, one after another; where it asks a bucket some at once."""
-        return run_side_by_side(function, items) if self.path is None else list(map(function, items))
+        return run_side_by_side(function, items) if self.path is None else [*map(function, items)]
 
     def clear(self) -> None:
         """Remove what killed writers left as temporaries."""
