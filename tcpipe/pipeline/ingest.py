@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
-from tcpipe.execution import run_all
+from tcpipe.execution import refuse_import_of_script, run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here
 from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State, Superseded
@@ -96,6 +96,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one log or path stands
     in its result.
     """
+    refuse_import_of_script(options.jobs)
     measure = start_stopwatch()
     ruling, shard = resolve_recipe(options.recipe), options.shard
     robot = options.robot or ruling.robot
