@@ -87,8 +87,9 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             )
             if as_json:
                 print_json_line(convert_record(result, LogLine))
-            elif not quiet or result.status != "unchanged" or result.is_new_problem:
-                for line in _list_outcome(result, options.store, several=several):
+            else:
+                is_silent = quiet and result.status == "unchanged" and not result.is_new_problem
+                for line in () if is_silent else _list_outcome(result, options.store, several=several):
                     shown.result(line)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
@@ -106,10 +107,10 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 
 def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
     """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
-    from tcpipe.cost.labels import format_budget
     from tcpipe.formats.finding_lines import (
         describe_finding,
         describe_power,
+        format_budget,
         format_findings,
         format_verdict,
         list_verdict,
