@@ -11,6 +11,7 @@ import math
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,15 +24,15 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.bucket_directories import FetchedShards
-from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
+from tcpipe.formats.documents import State
 from tcpipe.formats.geojson import regions_to_json
-from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
 from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.run_documents import LogOrigin, MapDocument
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
 from tcpipe.pipeline.explain import flatten_recipe
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
 class Inputs:
     """Runs, their entries of the card, the maps, the hash over all inputs, and findings."""
 
-    runs: tuple[RunDirectory, ...]
+    runs: tuple[StoredRun, ...]
     sources: tuple[RunSource, ...]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap."""
@@ -73,20 +74,19 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
     except DatasetError as error:
         problems += error.problems
     try:
-        names = choose_maps(store, options.map_names)
+        records = choose_maps(store, state, options.map_names)
     except DatasetError as error:
         problems += error.problems
     if problems:
         raise DatasetError(*problems)
-    once = remove_duplicates(store, chosen.runs, chosen.logs)
-    runs = once.runs
-    documents = tuple(store.map_document(name) for name in names)
-    maps = partial(_map_files, store, documents)
+    once = remove_duplicates(chosen.runs)
+    runs, names = once.runs, tuple(record.name for record in records)
+    maps = partial(_map_files, store, records)
     map_sha256 = tuple(
-        _map_digest(name, path) if fetched is None else _digest_of(document.checksums, document.zarr)
-        for name, document, (path, fetched) in zip(names, documents, maps(), strict=True)
+        _map_digest(record.name, path) if fetched is None else _digest_of(record.files, f"{record.name}.zarr")
+        for record, (path, fetched) in zip(records, maps(), strict=True)
     )
-    sources = tuple(_make_source(run, chosen.logs[run.run_id]) for run in runs)
+    sources = tuple(map(_make_source, runs))
     fingerprint = digest(
         {
             "versions": [__version__, TABLES_VERSION],
@@ -105,7 +105,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
     return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings)
 
 
-def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
+def _refuse_without_segments(runs: Sequence[StoredRun]) -> None:
     if any(run.facts.segments for run in runs):
         return
     lost_m = Counter[str]()
@@ -120,7 +120,7 @@ def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
     )
 
 
-def _map_files(store: Store, maps: Sequence[MapDocument]) -> tuple[tuple[Path, FetchedShards | None], ...]:
+def _map_files(store: Store, maps: Sequence[StoredMap]) -> tuple[tuple[Path, FetchedShards | None], ...]:
     return tuple(map(store.map_at, maps))
 
 
@@ -153,9 +153,9 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
     )
 
 
-def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
+def choose_maps(store: Store, state: State, names: Sequence[str]) -> tuple[StoredMap, ...]:
     """Return the maps to sample: the named ones in their order, or the only one."""
-    maps = store.maps()
+    maps = state.maps
     if not maps:
         raise DatasetError(f"{store.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
     unknown = [name for name in names if name not in maps]
@@ -166,12 +166,13 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
             f"{store.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map, or several; the first has "
             "priority where they overlap"
         )
-    return tuple(dict.fromkeys(names)) or (maps[0],)
+    return tuple(maps[name] for name in dict.fromkeys(names)) or tuple(maps.values())
 
 
-def _make_source(run: RunDirectory, log: LogOrigin) -> RunSource:
+def _make_source(run: StoredRun) -> RunSource:
     """Return the card's entry of a run."""
-    named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
+    log = run.facts.log
+    named = {"sha256": log.sha256, "segments_sha256": run.facts.tables["segments.parquet"].sha256}
     return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
 
 
@@ -254,7 +255,7 @@ Mask = NDArray[np.bool_]
 class UniqueRuns:
     """Runs of which each drive is there once: ``again`` marks, by run, the segments that an earlier one in ``runs`` has too."""
 
-    runs: tuple[RunDirectory, ...]
+    runs: tuple[StoredRun, ...]
     again: Mapping[str, Mask]
     findings: tuple[Finding, ...]
 
@@ -268,14 +269,14 @@ class _SegmentPositions:
     lonlat_deg: NDArray[np.float64]
 
 
-def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[str, LogOrigin]) -> UniqueRuns:
+def remove_duplicates(runs: Sequence[StoredRun]) -> UniqueRuns:
     """Return the runs, by id, without second logs of a drive, and findings; of two, the first by id stays.
 
-    ``runs`` are all of one recipe; ``logs`` are by run.
+    ``runs`` are all of one recipe.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
     start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T
-    robot, kept = np.array([run.facts.robot for run in runs]), dict[int, RunDirectory]()
+    robot, kept = np.array([run.facts.robot for run in runs]), dict[int, StoredRun]()
 
     @lru_cache(maxsize=_WAYS)
     def way(index: int) -> _SegmentPositions:
@@ -285,7 +286,7 @@ def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[
     findings: list[Finding] = []
     by_sha256: dict[str, str] = {}
     for index, run in enumerate(runs):
-        twin = by_sha256.setdefault(logs[run.run_id].sha256, run.run_id)
+        twin = by_sha256.setdefault(run.facts.log.sha256, run.run_id)
         if twin != run.run_id:
             findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
@@ -294,12 +295,12 @@ def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[
         for earlier in np.flatnonzero((apart_ns <= _SAME_TIME_NS) & (robot[:index] == run.facts.robot)).tolist():
             if earlier in kept:
                 shared = _find_shared(way(index), way(earlier))
-                is_one = _is_one_drive(store, (run, kept[earlier])) if shared.any() else False
+                is_one = _is_one_drive((run, kept[earlier])) if shared.any() else False
                 if is_one:
                     twice |= shared
                     others.append(kept[earlier].run_id)
                 elif is_one is None:
-                    findings.append(_find_overlap(run, kept[earlier], int(shared.sum()), logs))
+                    findings.append(_find_overlap(run, kept[earlier], int(shared.sum())))
         if twice.any():
             findings.append(_find_twice(run, int(twice.sum()), others))
         if twice.all() and len(twice):
@@ -309,7 +310,7 @@ def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[
     return UniqueRuns(tuple(kept.values()), again, tuple(findings))
 
 
-def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Finding:
+def _find_twice(run: StoredRun, duplicates: int, others: Sequence[str]) -> Finding:
     return make_finding(
         "drive-recorded-twice",
         Subject("run", run.run_id),
@@ -319,9 +320,9 @@ def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Fi
     )
 
 
-def _find_overlap(run: RunDirectory, other: RunDirectory, shared: int, logs: Mapping[str, LogOrigin]) -> Finding:
+def _find_overlap(run: StoredRun, other: StoredRun, shared: int) -> Finding:
     """Return the question whether two runs are of one drive, with a command for each answer."""
-    own, others = (shlex.join(map(str, logs[each.run_id].paths)) for each in (run, other))
+    own, others = (shlex.join(each.facts.log.paths) for each in (run, other))
     remedies = (
         Remedy("two_robots", command=f"tcpipe ingest {own} --tag robot={run.run_id}"),
         Remedy("one_drive", command=f"tcpipe ingest {others} {own} --tag robot={other.run_id}"),
@@ -335,13 +336,13 @@ _COMPARED_ROLES = ("gnss", "pose", "wheel_odometry", "visual_odometry", "imu")
 _MIN_EQUAL_FRACTION, _MIN_VALUES = 0.5, 3
 
 
-def _is_one_drive(store: Store, pair: tuple[RunDirectory, RunDirectory]) -> bool | None:
+def _is_one_drive(pair: tuple[StoredRun, StoredRun]) -> bool | None:
     """Return whether two runs at one time and place are of one drive, None if that is unknown.
 
     One sensor with equal values proves one drive, other values of topics of one name prove two; else the tag ``robot`` decides.
     """
-    files = [store.find_stream_files(run.run_id) for run in pair]
-    sensors = [run.facts.log.sensors if run.facts.log else {} for run in pair]
+    files = [_find_streams(run) for run in pair]
+    sensors = [run.facts.sensors for run in pair]
     for role in (role for role in _COMPARED_ROLES if all(role in found for found in files)):
         fraction = _compute_equal_fraction([read_table(found[role]) for found in files])
         if fraction >= _MIN_EQUAL_FRACTION:
@@ -351,6 +352,13 @@ def _is_one_drive(store: Store, pair: tuple[RunDirectory, RunDirectory]) -> bool
             return False
     tags = [run.facts.tags.get("robot") for run in pair]
     return tags[0] == tags[1] if any(tags) else None
+
+
+def _find_streams(run: StoredRun) -> dict[str, Path]:
+    """Return the files of the streams of a run; none where one is not as it was written."""
+    with suppress(StoreError):
+        return run.stream_files()
+    return {}
 
 
 def _compute_equal_fraction(streams: Sequence[pa.Table]) -> float:
@@ -377,7 +385,7 @@ def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
     return facts.start_ns, facts.end_ns
 
 
-def _read_positions(run: RunDirectory) -> _SegmentPositions:
+def _read_positions(run: StoredRun) -> _SegmentPositions:
     names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
     table = run.table("segments", names)
     middle = [
