@@ -10,7 +10,7 @@ import json
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -25,16 +25,23 @@ from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
+from tcpipe.formats.dataset_inputs import (
+    Change,
+    DatasetInputs,
+    ExclusionInputs,
+    RunInputs,
+    compare_records,
+    format_value,
+)
 from tcpipe.formats.geojson import regions_to_json
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
-from tcpipe.formats.json_files import convert_record, digest, to_plain
+from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.store import Store
 from tcpipe.tables.arrays import encode_rows, number_column
 from tcpipe.tables.columns import to_floats, to_integers
@@ -47,21 +54,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Runs, their entries of the card, the maps, the hash over all inputs, and findings."""
+    """Runs, their entries of the card, the maps, the record of all inputs, and findings."""
 
     runs: tuple[RunDirectory, ...]
     sources: tuple[RunSource, ...]
-    map_names: tuple[str, ...]
-    """In order of priority where maps overlap."""
     maps: MapPlaces
-    map_sha256: tuple[str, ...]
-    """Over the checksums of each map's files."""
+    made_from: DatasetInputs
+    digest: str
+    """Of ``made_from``."""
     again: Mapping[str, NDArray[np.bool_]]
     """By run: segments that another run has too."""
-    digest: str
     chosen: SelectedRuns
     findings: tuple[Finding, ...]
     """On the choice of runs."""
+
+    @property
+    def map_names(self) -> tuple[str, ...]:
+        """In order of priority where maps overlap."""
+        return self.made_from.map_names
 
 
 def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
@@ -87,22 +97,33 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
         for name, document, (path, fetched) in zip(names, documents, maps(), strict=True)
     )
     sources = tuple(_make_source(run, chosen.logs[run.run_id]) for run in runs)
-    fingerprint = digest(
-        {
-            "versions": [__version__, TABLES_VERSION],
-            "recipe": options.recipe,
-            "runs": [{key: value for key, value in to_plain(run).items() if key != "samples"} for run in sources],
-            "maps": list(zip(names, map_sha256, strict=True)),
-            "region": options.region,
-            "format": options.file_format,
-            "covariates": [(table.name, table.checksum) for table in options.covariates],
-            "excluded": [(ids.name, ids.checksum, ids.reason) for ids in options.exclusions],
-            "kept_split": None if options.earlier is None else _hash_table(options.earlier),
-        }
-    )
-    fingerprint = digest(("redacted", fingerprint)) if options.redact else fingerprint
+    made_from = _describe_inputs(options, sources, dict(zip(names, map_sha256, strict=True)))
     findings = (*chosen.findings, *once.findings)
-    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings)
+    return Inputs(runs, sources, maps, made_from, made_from.digest, once.again, chosen, findings)
+
+
+def _describe_inputs(options: BuildOptions, runs: Sequence[RunSource], maps: Mapping[str, str]) -> DatasetInputs:
+    regions = {} if options.regions is None else regions_to_json(options.regions)
+    return DatasetInputs(
+        versions={"tcpipe": __version__, "tables": TABLES_VERSION},
+        recipe=options.recipe,
+        runs={run.run_id: _describe_run(run) for run in runs},
+        robots=tuple(sorted({run.robot for run in runs})),
+        tags=dict(sorted(options.tags.items())),
+        maps=maps,
+        map_names=tuple(maps),
+        region=None if options.regions is None else {kind: digest(polygon) for kind, polygon in regions.items()},
+        covariates={table.name: table.checksum.sha256 for table in options.covariates},
+        exclusions={ids.name: ExclusionInputs(ids.checksum.sha256, ids.reason) for ids in options.exclusions},
+        kept_split=None if options.earlier is None else _hash_table(options.earlier),
+        file_format=options.file_format,
+        redact=options.redact,
+    )
+
+
+def _describe_run(run: RunSource) -> RunInputs:
+    facts = digest([run.findings, run.energy_budget, run.driven_m])
+    return convert_record(run, RunInputs, facts_sha256=facts, tags=run.tags or {})
 
 
 def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
@@ -183,59 +204,58 @@ def _hash_table(table: pa.Table) -> str:
     return found.hexdigest()
 
 
-_LONGEST_VALUE = 80
+_OPTIONS = {
+    "robots": "--robot",
+    "tags": "--tag",
+    "map_names": "--map",
+    "region": "--split",
+    "covariates": "--covariates",
+    "exclusions": "--exclude",
+    "kept_split": "--keep-split",
+    "file_format": "--format",
+    "redact": "--redact",
+}
+"""Options of a build, by the field of `DatasetInputs` that each rules."""
 
 
 def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> list[str]:
     """Return a line with both values for each option of a build that differs from those of the dataset it would replace."""
-    if card.redaction is not None or options.redact:
-        if bool(card.redaction) != options.redact:
-            return [_format_difference("--redact", bool(card.redaction), options.redact)]
+    was, now = card.made_from, inputs.made_from
+    if was.redact and now.redact:
         return ["--redact: a redacted dataset omits its maps, region, tags and recipe, so that they cannot be compared"]
-    return [
-        _format_difference(name, was, now) for name, was, now in _iterate_options(card, options, inputs) if was != now
-    ]
-
-
-def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> Iterator[tuple[str, object, object]]:
-    """Yield each option with its value in the card and its value now."""
-    was, now = flatten_recipe(card.recipe), flatten_recipe(options.recipe)
-    keys = sorted({*was, *now} - {"robot"})  # the robot of the runs counts, whoever named it
-    yield from ((f"recipe {key}", was.get(key), now.get(key)) for key in keys)
-    yield "--robot", card.robots, tuple(sorted({run.robot for run in inputs.sources})) if card.robots else ()
-    yield "--tag", dict(card.run_tags or {}), dict(options.tags)
-    yield "--map", tuple(entry.name for entry in card.maps), inputs.map_names
-    regions = None if options.regions is None else regions_to_json(options.regions)
-    yield "--split", _format_region(card.split.region), _format_region(regions)
-    yield (
-        "--covariates",
-        tuple(table.name for table in card.covariates),
-        tuple(table.name for table in options.covariates),
+    names = ("redact",) if was.redact or now.redact else ("recipe", *_OPTIONS)
+    lines = (
+        _format_option(change, was, now)
+        for change in compare_records(was, now)
+        if change.path[0] in names and _is_option(change, options)
     )
-    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in options.exclusions)
-    yield "--format", card.format, options.file_format
-    if not options.keeps_own_split:
-        yield "--keep-split", card.split.kept is not None, options.earlier is not None
+    return list(dict.fromkeys(lines))
 
 
-def _format_region(region: Mapping[str, object] | None) -> str | None:
-    """Return the kinds of a region's polygons and a digest of them."""
-    return None if region is None else f"{' and '.join(region)} ({digest(to_plain(region))[:8]})"
+def _is_option(change: Change, options: BuildOptions) -> bool:
+    """Return whether a change is of an option: a file may have other content, and the robot of the runs counts, whoever named it."""
+    if change.path[0] in ("covariates", "exclusions", "kept_split"):
+        is_own = change.path[0] == "kept_split" and options.keeps_own_split
+        return not is_own and None in (change.was, change.now)
+    return change.path != ("recipe", "robot")
 
 
-def _format_difference(name: str, was: object, now: object) -> str:
-    return f"{name}: {_format_value(was)} in the dataset, {_format_value(now)} now"
+def _format_option(change: Change, was: DatasetInputs, now: DatasetInputs) -> str:
+    field = change.path[0]
+    if field == "recipe":
+        return f"recipe {change.name}: {format_value(change.was)} in the dataset, {format_value(change.now)} now"
+    values = (_format_field(field, each) for each in (was, now))
+    return f"{_OPTIONS[field]}: {{}} in the dataset, {{}} now".format(*values)
 
 
-def _format_value(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, Mapping):
-        value = [f"{key}={item}" for key, item in value.items()]
-    if isinstance(value, list | tuple):
-        value = ", ".join(map(str, value))
-    text = "none" if value in (None, "") else str(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}… ({digest(text)[:8]})"
+def _format_field(field: str, record: DatasetInputs) -> str:
+    """Return the value of an option without the content of files: their names, whether there is one, the kinds of a region's polygons."""
+    value = getattr(record, field)
+    if field == "region" and value is not None:
+        value = f"{' and '.join(value)} ({digest(value)[:8]})"
+    elif field in ("covariates", "exclusions"):
+        value = tuple(value)
+    return format_value(value is not None if field == "kept_split" else value)
 
 
 _SAME_TIME_NS = 1_000_000_000
