@@ -29,7 +29,7 @@ from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.file_checks import find_changed_files
 from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
-from tcpipe.formats.object_storage import is_bucket, is_url
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, open_place
 
 LOG, State = "log", object

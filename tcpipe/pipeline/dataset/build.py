@@ -30,7 +30,7 @@ from tcpipe.formats.place import open_place
 from tcpipe.formats.store_records import Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
-from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options
+from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.generations import write_generation
@@ -181,6 +181,7 @@ def _build(
         result = _make_result(place, "unchanged", job.known, job.left_out, reported)
         call.result |= {"exit_code": result.exit_code, "counts": {"unchanged": 1}}
         return result, job.inputs
+    prove_maps(call.store, job.inputs.map_records)
     from tcpipe.pipeline.dataset.writing import write_dataset  # noqa: PLC0415  slow to import, and often nothing is to be built
 
     output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
