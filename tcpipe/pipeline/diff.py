@@ -239,10 +239,12 @@ def _describe_run(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[st
     """Yield what differs in a run; of a run with other segments all but its tags follows from them."""
     run_id, *key = change.path[1:]
     was, now = a.made_from.runs.get(run_id), b.made_from.runs.get(run_id)
-    if was is None or now is None:
+    if (one := now or was) is not None and None in (was, now):
         which, card = ("added", b) if was is None else ("removed", a)
-        run = next(run for run in card.runs if run.run_id == run_id)
-        yield f"log: {which} {', '.join(run.logs)} (run {run_id}, {run.samples} samples)"
+        samples = sum(run.samples for run in card.runs if run.run_id == run_id)
+        yield f"log: {which} {', '.join(one.logs)} (run {run_id}, {samples} samples)"
+    elif was is None or now is None:
+        return
     elif key[0] == "tags":
         yield f"tags: run {run_id} {'.'.join(key[1:])} {format_value(change.was)} → {format_value(change.now)}"
     elif was.segments_sha256 != now.segments_sha256:
@@ -253,8 +255,6 @@ def _describe_run(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[st
             else "the same log and recipe, ingested again"
         )
         yield f"log: run {run_id} has other segments: {again}"
-    elif key[0] == "facts_sha256":
-        yield f"log: run {run_id} has other findings or another energy budget"
     else:
         yield f"log: run {run_id} {key[0]} {format_value(change.was)} → {format_value(change.now)}"
 

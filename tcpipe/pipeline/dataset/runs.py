@@ -43,7 +43,7 @@ class SelectedRuns:
 def choose_runs(
     store: Store, recipe: Recipe, *, state: State, robot: str | None, tags: Mapping[str, str], prove: bool = True
 ) -> SelectedRuns:
-    """Return the runs with all of the tags, their files compared with their manifests if ``prove``; two robots are pooled only on request."""
+    """Return the runs with all of the tags, verified if ``prove``; two robots are pooled only on request."""
     found, key = store.runs(state), ingest_key(recipe)
     mine = [run for run in found if run.facts.ingest_key == key]
     if not mine:
