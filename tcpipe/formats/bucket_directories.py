@@ -26,14 +26,13 @@ import google_crc32c
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import make_lasting_scratch
 from tcpipe.formats.cache import fetch_cached, is_cached
-from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
-from tcpipe.formats.commits import State
 from tcpipe.formats.file_checks import find_changed_files
 from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
-from tcpipe.formats.object_storage import is_bucket, is_url
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, open_place
 
+LOG, State = "log", object
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
 _UNLISTED = ("report.html",)
@@ -154,12 +153,7 @@ def find_newest(url: str, cards: Sequence[str]) -> FoundCard | None:
 
     The number of requests does not depend on the number of generations.
     """
-    place = open_place(url)
-    commit = read_newest_commit(place) if is_bucket(url) else None
-    if commit is None or not commit.entries.generations:
-        return _find_at(place, cards)
-    newest = commit.entries.generations[-1]
-    return _find_at(place.below(newest.folder), [newest.card] if newest.card in cards else [])
+    return _find_at(open_place(url), cards)
 
 
 def _find_at(place: Place, cards: Sequence[str]) -> FoundCard | None:

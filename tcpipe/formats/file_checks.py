@@ -1,4 +1,4 @@
-"""Comparisons of files at a place with checksums that a document lists (ADR-28)."""
+"""Comparisons of files at a place with checksums that a document lists (ADR-36)."""
 
 from __future__ import annotations
 

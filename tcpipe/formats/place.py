@@ -1,4 +1,4 @@
-"""Files of a store or of an output, in a directory or below the URL of a bucket (ADR-28).
+"""Files of a store or of an output, in a directory or below the URL of a bucket (ADR-36).
 
 A name is relative, with ``/`` between its parts. A file appears whole (on disk: synced) or not at all; a folder appears whole on disk, and
 file by file in a bucket: readers look into a folder only after a document that names it. Nothing here needs locks, clocks or put-if-absent.

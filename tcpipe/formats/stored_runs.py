@@ -1,78 +1,68 @@
-"""Finished ingestions in a store: their documents and tables, each verified when it is read."""
+"""Runs in a store: their manifests and tables, each verified when it is read."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import TypeAlias
 
 import pyarrow as pa
 
-from tcpipe.errors import StoreError
-from tcpipe.formats.commits import State
-from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.integrity import Checksum, compute_checksums
-from tcpipe.formats.parquet import read_range, read_table, write_table
+from tcpipe.errors import StoreError, TableError
+from tcpipe.formats.documents import BLOBS, read_record
+from tcpipe.formats.json_files import parse_typed, to_plain
+from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.place import Place
-from tcpipe.formats.recipe_toml import read_key
-from tcpipe.formats.run_documents import Manifest, name_folder, read_as_at
-from tcpipe.tables.findings import judge_again
-from tcpipe.tables.levels import MaskedTrack, Streams
+from tcpipe.formats.runs import Run, RunFacts, StreamInfo, restore_repeated
+from tcpipe.tables.levels import TABLES_VERSION, MaskedTrack, Streams, add_metadata, read_metadata
 
-FilesState: TypeAlias = tuple[tuple[int, int], ...]
-"""Size [byte] and modification time [ns] of each file of an ingestion."""
+STREAMS = "streams"
+"""Folder of the streams in a folder of payload."""
 
 
 @dataclass(frozen=True, slots=True)
-class RunDirectory:
-    """One finished ingestion: a run under one recipe."""
+class StoredRun:
+    """A run under one recipe whose tables are in a store."""
 
-    run_id: str
-    recipe_id: str
-    runs: Place
-    """``runs/`` of the store."""
+    place: Place
+    """The store."""
     facts: RunFacts
-    """Facts in the log of commits, enough to select the run."""
-    files_state: FilesState = ()
-    """Distinguishes its files from what is written under their names later."""
+    document: str
+    """Name of its manifest in the store."""
 
     @property
-    def place(self) -> Place:
-        """``runs/<run_id>/<recipe_id>``."""
-        return self.runs.below(f"{self.run_id}/{self.recipe_id}")
+    def run_id(self) -> str:
+        """Name of the run."""
+        return self.facts.run_id
 
     @property
-    def manifest(self) -> Manifest:
-        """The whole manifest, with the run's tags as they are now; `StoreError` if it is not as it was written."""
-        manifest = _read_manifest(self.place, self.facts.manifest, self.files_state)
-        if (manifest.run_id, manifest.recipe_id) != (self.run_id, self.recipe_id):
-            what = f"is of {manifest.run_id}/{manifest.recipe_id}, but is stored in {self.run_id}/{self.recipe_id}"
-            raise StoreError(f"{self.place.where(self.facts.manifest)}: {what}")
-        return replace(manifest, tags=self.facts.tags)
+    def recipe_id(self) -> str:
+        """Name of the recipe."""
+        return self.facts.recipe_id
 
     @property
-    def streams_key(self) -> str:
-        """Names the read settings of the streams that it was made from, as ``run.json`` has it while these are there."""
-        manifest = self.manifest
-        key = read_key(manifest.recipe, manifest.robot_requested, definitions=manifest.message_definitions)
-        return f"{key}-{manifest.tcpipe_version}"
+    def name(self) -> str:
+        """Name of the run under this recipe, as messages and commands have it."""
+        return f"{self.run_id}/{self.recipe_id}"
 
     @property
-    def where(self) -> str:
-        """Path or URL of its place."""
-        return self.place.where()
+    def manifest(self) -> Run:
+        """The whole record; `StoreError` if it is not as it was written."""
+        return restore_repeated(_read_manifest(self.place, self.document), self.facts)
 
-    def checksum(self, name: str) -> Checksum:
-        """Return what the manifest has of ``track.parquet`` and such."""
-        return self.manifest.checksums[self._name(name)]
+    @property
+    def folder(self) -> Place:
+        """The place of its tables."""
+        return self.place.below(f"{BLOBS}/{self.facts.blob}")
 
     def file(self, name: str) -> Path:
-        """Return ``track.parquet`` and such on this machine, proved; `StoreError` if it is not as it was written."""
-        return self.place.proved(self._name(name), self.checksum(name))
+        """Return ``track.parquet`` and such on this machine, verified; `StoreError` if it is not as it was written."""
+        checksum = self.facts.tables.get(name)
+        if checksum is None:
+            raise StoreError(f"run {self.name}: its manifest lists no {name}; ingest the log again with --force")
+        return self.folder.fetch(name, checksum)
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
@@ -88,114 +78,57 @@ class RunDirectory:
         return MaskedTrack(self.table("track"), self.manifest.info)
 
     def rejections(self) -> pa.Table:
-        """Read the measurements that the filter refused (schema REJECTIONS)."""
+        """Read the measurements that the filter rejected (schema REJECTIONS)."""
         return self.table("rejections")
 
-    def _name(self, name: str) -> str:
-        found = next((file for file in self.manifest.checksums if PurePosixPath(file).name == name), None)
+    def stream_files(self) -> dict[str, Path]:
+        """Return the files of L1 on this machine by role, verified; `StoreError` if one is not as it was written."""
+        return find_stream_files(self.place, self.facts)
+
+    def streams(self) -> Streams:
+        """Read L1; `StoreError` where it is not there or not as it was written."""
+        found = read_streams(self.place, self.facts)
         if found is None:
-            raise StoreError(f"{self.where}: its manifest lists no {name}; ingest the log again")
+            raise StoreError(f"run {self.name}: its streams cannot be read; ingest the log again with --force")
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """A file of an ingestion that is gone, or has another size."""
-
-    where: str
-    expected_bytes: int
-    size_bytes: int | None = None
-
-    def __str__(self) -> str:
-        """Return it as one line."""
-        how = (
-            "is missing" if self.size_bytes is None else f"has {self.size_bytes} bytes, expected {self.expected_bytes}"
-        )
-        return f"{self.where}: {how}; ingest the log again"
-
-
-@dataclass(frozen=True, slots=True)
-class Ingestions:
-    """Finished ingestions of a store, or of one of its runs, by run and recipe."""
-
-    state: State
-    finished: tuple[RunDirectory, ...]
-    """Those whose files are there and that count."""
-    lost: Mapping[tuple[str, str], Lost]
-    """Those of which a file is gone or has another size."""
-    outdated: Mapping[str, RunFacts]
-    """By run, of those that are finished in other data-model versions only: the last."""
-    rows: Mapping[tuple[str, str], RunFacts]
-    """All that are there, those of superseded runs too."""
-
-    @property
-    def damaged(self) -> dict[tuple[str, str], str]:
-        """Lost files, as lines."""
-        return {key: str(lost) for key, lost in self.lost.items()}
-
-    @property
-    def superseded(self) -> dict[str, str]:
-        """Runs whose log was completed or repaired, and the run that took their place."""
-        return self.state.superseded
-
-
-def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunFacts, Lost | None, FilesState]]:
-    """Yield each row with the first of its files that is gone or has another size, and with the state of its files.
-
-    ``place`` is ``runs/``. On disk each file is looked at; in a bucket there is one request for every thousand objects below it.
-    """
-    rows = list(rows)
-    find = make_file_finder(place, rows)
-    for row in rows:
-        states, lost = list[tuple[int, int]](), None
-        for name, size_bytes in row.files.items():
-            seen = find(f"{row.run_id}/{name}")
-            if seen is None or seen[0] != size_bytes:
-                lost = Lost(place.where(f"{row.run_id}/{name}"), size_bytes, seen and seen[0])
-                break
-            states.append(seen)
-        yield row, lost, tuple(states)
-
-
-def make_file_finder(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
-    """Return a function that finds the size [byte] and modification time [ns] of a file of the runs of rows; None without a file."""
-    return _find_on_disk(place.path) if place.path else _find_listed(place, rows)
-
-
-def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
-    def find(name: str) -> tuple[int, int] | None:
-        try:
-            seen = os.stat(f"{root}/{name}")  # noqa: PTH116  of ten thousands
-        except OSError:
-            return None
-        return seen.st_size, seen.st_mtime_ns
-
-    return find
-
-
-def _find_listed(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
-    """Return it from a listing of the run, or of all."""
-    run_ids = {row.run_id for row in rows}
-    found = place.entries(run_ids.pop() if len(run_ids) == 1 else "") if rows else []
-    return {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}.get
-
-
 @lru_cache(maxsize=64)
-def _read_manifest(place: Place, name: str, state: FilesState) -> Manifest:
-    """Return a manifest while the files of its ingestion are in this state; judged by this version's catalogue."""
-    del state
-    manifest = read_as_at(place, name, Manifest)
-    return replace(manifest, verdict=judge_again(manifest.verdict, manifest.info.report.findings))
+def _read_manifest(place: Place, document: str) -> Run:
+    return read_record(place, document, Run)
 
 
-def add_span(row: RunFacts, place: Place, manifest: Manifest) -> RunFacts:
-    """Return a row with when its segments begin and end, from the statistics of their file; without where it has none."""
-    name = row.segments_file.removeprefix(f"runs/{row.run_id}/{row.recipe_id}/")
-    with suppress(StoreError):
-        if row.segments:
-            path = place.local(name, manifest.checksums[name])
-            return replace(row, start_ns=read_range(path, "start_ns")[0], end_ns=read_range(path, "end_ns")[1])
-    return row
+def find_stream_files(place: Place, row: RunFacts) -> dict[str, Path]:
+    """Return the files of L1 of a run on this machine by role, verified."""
+    folder = place.below(f"{BLOBS}/{row.streams_blob}")
+    return {PurePosixPath(name).stem: folder.fetch(name, checksum) for name, checksum in sorted(row.streams.items())}
+
+
+def write_streams(directory: Path, streams: Streams, *, key: str) -> None:
+    """Write L1 into a directory; ``key`` identifies the settings of reading."""
+    (directory / STREAMS).mkdir()
+    for role, table in streams.tables.items():
+        read_with = key, streams.robot, streams.gnss_crs, streams.power_averaged
+        info = StreamInfo(*read_with, report=streams.report, sensor=streams.sensors[role])
+        write_table(add_metadata(table, to_plain(info)), directory / STREAMS / f"{role}.parquet")
+
+
+def read_streams(place: Place, row: RunFacts) -> Streams | None:
+    """Return the streams of a run; None where they are not there, not as they were written, or of another version."""
+    tables, infos = dict[str, pa.Table](), dict[str, StreamInfo]()
+    try:
+        for role, path in find_stream_files(place, row).items():
+            table = read_table(path)
+            infos[role] = info = parse_typed(read_metadata(table), StreamInfo, path)
+            if info.key != row.read_key or info.data_model_version != TABLES_VERSION:
+                return None
+            tables[role] = table.replace_schema_metadata(None)
+        if not tables:
+            return None
+        sensors = {role: each.sensor for role, each in infos.items()}
+        return Streams(tables, sensors, info.robot, info.gnss_crs, info.power_averaged, info.report)
+    except (TableError, StoreError):
+        return None
 
 
 @contextmanager
@@ -205,23 +138,6 @@ def convert_run_errors(where: str, directory: Path) -> Iterator[None]:
         yield
     except StoreError as error:
         raise StoreError(*(problem.replace(str(directory), where) for problem in error.problems)) from error.__cause__
-
-
-def put_tables(place: Place, tables: Mapping[str, pa.Table], *, folder: str = "") -> dict[str, Checksum]:
-    """Put tables as Parquet into a directory named after their content; return the files."""
-    with place.workshop() as directory:
-        with convert_run_errors(place.where(folder), directory):
-            for name, table in tables.items():
-                write_table(table, directory / f"{name}.parquet")
-        checksums = compute_checksums(directory)
-        prefix = f"{folder}{name_folder(checksums)}"
-        place.put_files(prefix, directory)
-    return subdirectory(prefix, checksums)
-
-
-def subdirectory(prefix: str, checksums: Mapping[str, Checksum]) -> dict[str, Checksum]:
-    """Return checksums by the names that their files have where ``prefix`` lies."""
-    return {f"{prefix}/{name}": checksum for name, checksum in checksums.items()}
 
 
 _LENT = ("imu", "wheel_odometry", "visual_odometry")
@@ -252,15 +168,7 @@ class _LentTables(Mapping[str, pa.Table]):
         return len(self._held) + len(self._files)
 
 
-def lend_streams(place: Place, streams: Streams, stored: Mapping[str, Checksum]) -> Streams:
-    """Return L1 with large tables that are read at each access, and not kept in memory between accesses.
-
-    In a bucket they are held: each time they would be fetched.
-
-    ``stored`` has the files of L1 in the ``place`` of the run.
-    """
-    if place.path is None:
-        return streams
-    files = {PurePosixPath(name).stem: place.local(name, checksum) for name, checksum in stored.items()}
+def lend_streams(streams: Streams, files: Mapping[str, Path]) -> Streams:
+    """Return L1 with large tables that are read from ``files`` at each access, and not kept in memory between accesses."""
     held = {role: table for role, table in streams.tables.items() if role not in _LENT}
     return replace(streams, tables=_LentTables(held, {role: path for role, path in files.items() if role in _LENT}))

@@ -1,57 +1,31 @@
-"""Calls: writing their commits (process, time), which calls have begun or were killed, what calls took, and estimates from that."""
+"""Calls on a store: the record of each call, which calls are open or were killed, what calls took, and estimates from that."""
 
 from __future__ import annotations
 
 import logging
 import os
 import resource
+import secrets
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tcpipe import __version__
-from tcpipe.errors import StoreError
+from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.execution import read_cluster_cpu_s
-from tcpipe.formats.commit_log import Stamp, refresh
-from tcpipe.formats.commits import Begun, CallRecord, Entries, Kind, Problem, Process, State
-from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.json_files import convert_record, digest
-from tcpipe.store import Store
+from tcpipe.formats.documents import State, parse_name
+from tcpipe.formats.json_files import to_plain
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.store_records import Call, Problem, Process
+from tcpipe.store import Store, is_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 
-
-@dataclass(slots=True)
-class LogWriter:
-    """The commits of one call: ``state`` is what the log says after the last of them."""
-
-    store: Store
-    state: State
-
-    def refresh(self) -> None:
-        """Read what others have committed."""
-        self.state = refresh(self.store.place, self.state)
-
-    def commit(self, kind: Kind, entries: Entries | Callable[[State], Entries]) -> None:
-        """Write a commit, unless it adds nothing; `StoreError` where it cannot be written."""
-        make = entries if callable(entries) else lambda _: entries
-        stamp = Stamp(identify_process(), datetime.now(UTC).isoformat(timespec="milliseconds"))
-        self.state = self.store.commit(self.state, stamp, kind, make)
-
-
-def open_log(store: Store) -> LogWriter:
-    """Return what writes into the log of a store, from what it says now on."""
-    return LogWriter(store, store.state())
-
-
-def is_committed(row: RunFacts, state: State) -> bool:
-    """Return whether the log has an ingestion as it lies in its directory."""
-    known = state.runs.get((row.run_id, row.recipe_id))
-    return known is not None and (known.files, known.tags) == (row.files, row.tags)
+logger = logging.getLogger("tcpipe")
 
 
 def identify_process() -> Process:
@@ -85,88 +59,145 @@ def _read_text(path: str) -> str:
     return ""
 
 
-logger = logging.getLogger("tcpipe")
-
-_LONGEST_S = 86_400.0
-"""After so long a call of a machine that cannot be asked from here counts as killed: calls are made every night."""
-_DIGITS = 32
-
-
 @dataclass(frozen=True, slots=True)
-class BegunCall(Begun):
+class OpenCall:
     """A call that has begun and not ended."""
 
-    name: str = ""
+    name: str
     """By which it is acknowledged."""
-    state: Literal["running", "perhaps running", "killed"] = "killed"
-    """``perhaps`` where its process cannot be looked at from here."""
+    state: Literal["running", "perhaps running", "killed"]
+    """``perhaps running`` where its process cannot be looked at from here."""
+    call: Call
 
     def __str__(self) -> str:
         """Return it as one line."""
-        at = f" on {self.process.host} (process {self.process.pid})" if self.process else ""
-        return f"{self.command} of {self.begin[:19]} UTC{at}"
+        process = self.call.process
+        at = f" on {process.host} (process {process.pid})" if process else ""
+        return f"{self.call.command} of {self.call.begin[:19]} UTC{at}"
 
     @property
     def problem(self) -> Problem:
         """That it was killed, as far as that is known."""
-        code = "call-killed" if self.process and is_alive(self.process) is False else "call-lost"
-        names = {"command": self.command, "begin": self.begin[:19]}
-        names |= {"host": self.process.host, "pid": str(self.process.pid)} if self.process else {}
+        process = self.call.process
+        code = "call-killed" if process and is_alive(process) is False else "call-lost"
+        names = {"command": self.call.command, "begin": self.call.begin[:19]}
+        names |= {"host": process.host, "pid": str(process.pid)} if process else {}
         remedy = Remedy("acknowledge", command=f"tcpipe acknowledge {self.name}")
         return Problem(make_finding(code, Subject("call", self.name), names=names, remedies=[remedy]), self.name)
 
 
-@dataclass(slots=True)
-class OpenCall:
-    """A call that runs: what its last commit adds, and of which kind that is."""
+_LONGEST_S = 86_400.0
+"""After so long a call of a machine that cannot be asked from here is reported as lost: calls are made every night."""
+CALL_PREFIX = "call-"
 
-    end: Entries = field(default_factory=Entries)
-    kind: Kind = "ended"
+
+def list_open_calls(state: State) -> list[OpenCall]:
+    """Return the calls that have begun and not ended, the earliest first."""
+    return [
+        OpenCall(f"{CALL_PREFIX}{key}", _find_state(call), call)
+        for key, call in reversed(state.calls)
+        if call.exit_code is None
+    ]
+
+
+def _find_state(call: Call) -> Literal["running", "perhaps running", "killed"]:
+    alive = None if call.process is None else is_alive(call.process)
+    if alive is not None:
+        return "running" if alive else "killed"
+    age_s = time.time() - datetime.fromisoformat(call.begin).timestamp()
+    return "perhaps running" if abs(age_s) < _LONGEST_S else "killed"  # abs: a clock that is far ahead
+
+
+@dataclass(slots=True)
+class RunningCall:
+    """A call that runs: the state when it began, to which it adds what it writes, and its record."""
+
+    store: Store
+    state: State
+    key: str
+    call: Call
+    begun: bool = False
+    """Whether its first document is written: in a new store only when there is something to write."""
     is_whole: bool = True
-    """Whether all of its work is done, so that calls that were to do the same end with it."""
+    """Whether all of its work is done, so that killed calls that were to do the same are closed."""
+    result: dict[str, Any] = field(default_factory=dict)
+    """Values of its record when it ends: exit code, counts and such."""
+
+    def begin(self) -> None:
+        """Write the first document of the call, unless it is written."""
+        if not self.begun:
+            self.begun = True
+            self.put(self.call)
+
+    def put(self, call: Call) -> None:
+        """Write the record of the call; a store that cannot be written to goes without."""
+        try:
+            self.store.put(self.state, "calls", self.key, call)
+        except StoreError as error:
+            logger.debug("%s", error)
 
 
 @contextmanager
-def commit_call(log: LogWriter, command: str, works_on: Sequence[str], *, options: object = None) -> Iterator[OpenCall]:
-    """Commit that a call begins, and in the end that it ended; one that is killed, or ended by a signal, has no end.
+def record_call(
+    store: Store, command: str, works_on: Iterable[str], options: object = None, *, jobs: int = 1
+) -> Iterator[RunningCall]:
+    """Record that a call begins, before the store is scanned, and how it ends; a call that is killed or interrupted has no end.
 
-    When it ends well, calls that were to do the same, and do not run, end with it. A store that cannot be written goes without.
+    When it ends well, killed calls that were to do the same are closed.
 
-    ``works_on`` are logs and folders, or the dataset, in full; ``options`` what else distinguishes its work from that of another call.
+    ``works_on`` are logs and folders, or the output, in full; ``options`` distinguish its work from that of another call.
     """
-    call, opened, begun = make_call(command, works_on, options), OpenCall(), list[int]()
-    done = find_settled_calls(log.state, call)
+    begin_s, cpu_s = time.monotonic(), _read_cpu_s()
+    names = [name for file in store.place.list("calls") if (name := parse_name("calls", file)) is not None]
+    turn = 1 + max((int(name.key[:8], 16) for name in names), default=0)
+    call = Call(
+        command=command, version=__version__, works_on=tuple(works_on), options=to_plain(options or {}),
+        process=identify_process(), begin=datetime.now(UTC).isoformat(timespec="milliseconds"), jobs=jobs,
+    )  # fmt: skip
+    running = RunningCall(store, State(), f"{turn:08x}{secrets.token_hex(4)}", call)
+    if is_store(store.root):
+        running.begin()
+    running.state = store.scan()
+
+    def end() -> None:
+        took = {"wall_s": round(time.monotonic() - begin_s, 3), "cpu_s": round(_read_cpu_s() - cpu_s, 3)}
+        if running.begun:
+            running.put(replace(call, **{"exit_code": 0, **took, **running.result}))
+
     try:
-        log.commit("begun", Entries(begun=(call,)))
-        begun = [log.state.number]
-    except StoreError as error:
-        logger.info("%s", error)
-    try:
-        yield opened
-    except Exception:
-        _end(log, "ended", Entries(ended=tuple(begun)))
+        yield running
+    except Exception as error:
+        lines = error.problems if isinstance(error, TcpipeError) else (f"{type(error).__name__}: {error}",)
+        running.result |= {"exit_code": getattr(error, "exit_code", 1), "message": "\n".join(lines)}
+        end()
         raise
-    _end(log, opened.kind, replace(opened.end, ended=(*begun, *(done if opened.is_whole else ()))))
+    end()
+    if running.is_whole:
+        _close_killed_calls(running)
 
 
-def _end(log: LogWriter, kind: Kind, entries: Entries) -> None:
-    try:
-        log.commit(kind, entries)
-    except StoreError as error:
-        logger.warning("%s: so the store has no record of how this call ended", error.problems[0])
+def _close_killed_calls(running: RunningCall) -> None:
+    """Write the end of killed calls whose work this call has done.
+
+    A call counts as killed only if a listing that is made after its process was seen dead shows no end of it.
+    """
+    dead = [open_call for open_call in list_open_calls(running.state) if open_call.state == "killed"]
+    mine = [
+        each for each in dead if _is_done_by(each.call, running.call) and each.name != f"{CALL_PREFIX}{running.key}"
+    ]
+    for each in mine:
+        close_call(running.store, running.state, each, f"its work was done by {CALL_PREFIX}{running.key}")
 
 
-def make_call(command: str, works_on: Sequence[str], options: object = None) -> Begun:
-    """Return what a commit has of a call that begins."""
-    return Begun(command, __version__, tuple(works_on), digest(options)[:_DIGITS])
+def close_call(store: Store, state: State, killed: OpenCall, message: str) -> None:
+    """Write the end of a killed call, unless it has written it itself meanwhile."""
+    key = killed.name.removeprefix(CALL_PREFIX)
+    if not any(file.startswith(f"{key}.") and not file.startswith(f"{key}.1.") for file in store.place.list("calls")):
+        with suppress(StoreError):
+            store.put(state, "calls", key, replace(killed.call, exit_code=1, message=message))
 
 
-def find_settled_calls(state: State, call: Begun) -> list[int]:
-    """Return the numbers of the calls that do not run and whose work another call does."""
-    return [begun.number for begun in list_begun_calls(state) if begun.state != "running" and _is_done_by(begun, call)]
-
-
-def _is_done_by(call: Begun, other: Begun) -> bool:
+def _is_done_by(call: Call, other: Call) -> bool:
     """Return whether another call does all that this one was to do."""
     same = (call.command, call.options) == (other.command, other.options)
     return same and all(is_below(entry, other.works_on) for entry in call.works_on)
@@ -177,23 +208,12 @@ def is_below(entry: str, folders: Sequence[str]) -> bool:
     return any(entry == folder or entry.startswith(f"{folder.rstrip('/')}/") for folder in folders)
 
 
-def list_begun_calls(state: State) -> list[BegunCall]:
-    """Return the calls that have begun and not ended, by when they began."""
-    return [
-        convert_record(call, BegunCall, name=f"call-{number}", state=_find_state(call))
-        for number, call in sorted(state.begun.items())
-    ]
+def list_ended_calls(state: State) -> list[Call]:
+    """Return the calls that have ended, the latest first."""
+    return [call for _, call in state.calls if call.exit_code is not None]
 
 
-def _find_state(call: Begun) -> Literal["running", "perhaps running", "killed"]:
-    alive = None if call.process is None else is_alive(call.process)
-    if alive is not None:
-        return "running" if alive else "killed"
-    age_s = time.time() - datetime.fromisoformat(call.begin).timestamp()
-    return "perhaps running" if abs(age_s) < _LONGEST_S else "killed"  # abs: a clock that is far ahead
-
-
-INGEST, BUILD = "ingest", "build-dataset"
+INGEST, BUILD, ADD_MAP, PRUNE, ACKNOWLEDGE = "ingest", "build-dataset", "add-map", "prune", "acknowledge"
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,18 +247,7 @@ class Estimate:
         return f"{amount}: about {format_duration(self.wall_s)} and {format_bytes(self.written_bytes)} ({self.source})"
 
 
-def start_stopwatch() -> Callable[[CallRecord], CallRecord]:
-    """Return what adds to a call when it began, which is now, and what it took until then."""
-    begin, running_s, cpu_s = datetime.now(UTC), time.monotonic(), _read_cpu_s()
-    return lambda call: replace(
-        call,
-        begin=begin.isoformat(timespec="milliseconds"),
-        wall_s=round(time.monotonic() - running_s, 3),
-        cpu_s=round(_read_cpu_s() - cpu_s, 3),
-    )
-
-
-def estimate(calls: Sequence[CallRecord], command: str, amount: int, *, jobs: int) -> Estimate:
+def estimate(calls: Sequence[Call], command: str, amount: int, *, jobs: int) -> Estimate:
     """Return what work will take: by the calls that did the like, or by what was measured elsewhere.
 
     What was measured counts as one more call, of as much work as takes as long as a call alone: few samples tell little of a million.
@@ -255,9 +264,9 @@ def estimate(calls: Sequence[CallRecord], command: str, amount: int, *, jobs: in
     return Estimate(unit, amount, rates.call_s + rates.cpu_s * amount / jobs, int(rates.written_bytes * amount), source)
 
 
-def stored_bytes(store: Store, run_ids: Sequence[str]) -> int:
-    """Return what runs take in the store [byte]."""
-    return sum(entry.size_bytes for run_id in run_ids for entry in store.runs_place.entries(run_id))
+def count_bytes(rows: Iterable[RunFacts]) -> int:
+    """Return the size of the tables and streams of runs [byte]."""
+    return sum(checksum.size_bytes for row in rows for checksum in (*row.tables.values(), *row.streams.values()))
 
 
 def format_duration(seconds: float) -> str:
@@ -276,7 +285,7 @@ def format_bytes(count: float) -> str:
     return f"{count:.0f} B"
 
 
-def _parse_amount(call: CallRecord) -> int:
+def _parse_amount(call: Call) -> int:
     return call.done_bytes if call.command == INGEST else call.counts.get("samples", 0)
 
 

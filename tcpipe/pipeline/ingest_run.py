@@ -2,97 +2,130 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
-from tcpipe.formats.commit_log import read_state_here
-from tcpipe.formats.commits import State
-from tcpipe.formats.index_files import KnownLog, RunFacts
+from tcpipe.formats.documents import State, make_key, make_run_key, read_record
+from tcpipe.formats.integrity import compute_checksums
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.logs.log_joining import AnyLog, open_logs
-from tcpipe.formats.parquet import return_freed_memory
+from tcpipe.formats.parquet import add_segments_metadata, return_freed_memory, write_table
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, make_recipe_id, read_key
-from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
-from tcpipe.formats.stored_runs import lend_streams
+from tcpipe.formats.runs import Counts, LogOrigin, Recording, Run, RunFacts, TopicCount, list_physics_terms
+from tcpipe.formats.store_records import Tags
+from tcpipe.formats.stored_runs import (
+    STREAMS,
+    convert_run_errors,
+    find_stream_files,
+    lend_streams,
+    read_streams,
+    write_streams,
+)
 from tcpipe.logs.topics import split_notes
-from tcpipe.pipeline.calls import is_committed
 from tcpipe.pipeline.log_sources import LogSource, find_damaged_log, find_total_loss
 from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
-from tcpipe.store import Store
-from tcpipe.tables.findings import Subject, judge, make_finding, read_threshold
-from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, MaskedTrack, Streams, Track, add_findings
+from tcpipe.store import Store, name_run
+from tcpipe.tables.arrays import encode_rows
+from tcpipe.tables.columns import to_integers
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.levels import (
+    DATA_MODEL_VERSION,
+    RESULTS_VERSION,
+    LabelledSegments,
+    MaskedTrack,
+    Streams,
+    Track,
+    add_findings,
+    add_metadata,
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Ingested:
-    """Result of ingesting a log: the log at that time, and the facts of its run for the commit."""
+    """Result of ingesting a log: the log at that time, and the hash of its content in the result."""
 
     source: LogSource
     result: IngestResult
-    rows: tuple[RunFacts, ...] = ()
 
 
 def ingest_one(task: IngestTask) -> Ingested:
     """Ingest one run from its log as that is now; every error becomes its result, so that one log never costs the others."""
     return_freed_memory()
     task = replace(task, source=task.source.now())
-    hashed, rows = list[str](), list[RunFacts]()
+    hashed = list[str]()
     young = check_age(task)
     if young is not None:
         return Ingested(task.source, young)
     with set_task(task.source.name):
-        result = mark_reported(task, partial(_ingest, hashed=hashed, rows=rows))
+        result = mark_reported(task, partial(_ingest, hashed=hashed))
     if task.source.has_changed():
         note = "changed during the check; will be ingested when its recording has ended"
         return Ingested(task.source, IngestResult(task.source.name, "waiting", notes=(note,)))
-    return Ingested(task.source, replace(result, sha256=hashed[0]) if hashed else result, tuple(rows))
+    return Ingested(task.source, replace(result, sha256=hashed[0]) if hashed else result)
 
 
-def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> IngestResult:
-    """Ingest one run; what its log hashes to is left in ``hashed``, also on failure, and what is to be committed in ``rows``."""
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """The streams of a log, and findings on the log."""
+
+    streams: Streams
+    damage: tuple[Finding, ...]
+    notes: tuple[Finding, ...]
+    stored: RunFacts | None = None
+    """The run of which these are the stored streams; None of streams that were read now."""
+
+
+def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
+    """Ingest one run; the hash of its log is left in ``hashed``, also on failure."""
     store, source = Store(task.store), task.source
-    state = read_state_here(store.place)
+    state = store.scan()
     with ExitStack() as stack:
         opened = None if source.sha256 else _open_log(task, stack)
         sha256 = _find_hash(state, opened) if opened else str(source.sha256)
         hashed.append(sha256)
-        run_id = state.find_run(sha256) or store.name_run(source.stem, sha256)
-        before = store.known_run(run_id)
-        same_as = find_twin(before, source)
-        if before and not task.force and (made := _find_made_before(store, run_id, task)):
-            rows += () if is_committed(made, state) else _read_rows(store, state, run_id, made.recipe_id)
-            return make_result(source, "done" if rows else "unchanged", made, sha256, same_as=same_as)
-        log = opened or _open_log(task, stack)
+        known = [row for row in state.runs.values() if row.log.sha256 == sha256]
+        same_as = next((twin for row in known if (twin := find_twin(row, source))), None)
+        made = None if task.force else next((row for row in known if task.is_made_by(row)), None)
+        if made is not None and (not made.blob or state.has_payload(made)):
+            tag_log(store, state, sha256, task.tags)
+            return make_result(source, "unchanged", made, sha256, same_as=same_as)
+        log, run_id = opened or _open_log(task, stack), name_run(state, source.stem, sha256)
+        directory = stack.enter_context(store.place.workshop())
+        stack.enter_context(convert_run_errors(store.place.where(), directory))
         step("reading")
-        streams, known = _read(store, run_id, before, log, task, sha256=sha256)
-        tags = before.tags if before else next((row.tags for row in state.find_rows(run_id)), {})
-        known = replace(known, tags={**tags, **task.tags})
-        if not known.streams:
-            known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
-        store.write_run_json(run_id, known)
-        streams = lend_streams(store.runs_place.below(run_id), streams, known.streams)
+        key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{RESULTS_VERSION}"
+        read = _find_stored_streams(store, state, known, task, key) or _read(log, task)
+        if read.stored is None:
+            write_streams(directory, read.streams, key=key)
+            files = {path.stem: path for path in (directory / STREAMS).iterdir()}
+        else:
+            files = find_stream_files(store.place, read.stored)
+        read = replace(read, streams=lend_streams(read.streams, files))
         return_freed_memory()
-        manifest = _fuse_and_label(store, run_id, streams, known, task)
-    rows += _read_rows(store, state, run_id, manifest.recipe_id)
-    (made,) = (row for row in rows if row.recipe_id == manifest.recipe_id)
-    return make_result(source, "done", made, sha256, same_as=same_as)
+        track, masked, labelled = run_stages(read.streams, task.recipe.ingest, run_id=run_id)
+        run = make_run(task, log, read, track, labelled, sha256=sha256, key=key)
+        _write_tables(directory, run, track, masked, labelled)
+        run = _put_run(store, state, run, directory, read.stored)
+        tag_log(store, state, sha256, task.tags)
+    row = next(row for row in state.runs.values() if row.blob == run.blob)
+    return make_result(source, "done", row, sha256, same_as=same_as)
 
 
-def _find_made_before(store: Store, run_id: str, task: IngestTask) -> RunFacts | None:
-    """Return an ingestion that is there as it would be made now, after setting its tags; also one that a killed call did not commit."""
-    made = next((row for row in store.read_rows(run_id).values() if task.is_made_by(row)), None)
-    if made is not None and store.tag_run(run_id, task.tags):
-        return store.read_rows(run_id)[made.recipe_id]
-    return made
-
-
-def _read_rows(store: Store, state: State, run_id: str, recipe_id: str) -> list[RunFacts]:
-    """Return what is to be committed of a run: the ingestion under a recipe, and those that were committed before, with the tags of now."""
-    return [row for key, row in store.read_rows(run_id).items() if key == recipe_id or (run_id, key) in state.runs]
+def tag_log(store: Store, state: State, sha256: str, given: Mapping[str, str]) -> None:
+    """Add tags to those of a log, unless it has them."""
+    before = state.find_tags(sha256)
+    if not given.items() <= before.items():
+        store.put(state, "tags", make_key(sha256), Tags(sha256, {**before, **given}))
 
 
 def _find_hash(state: State, log: AnyLog) -> str:
@@ -103,10 +136,12 @@ def _find_hash(state: State, log: AnyLog) -> str:
     """
     outline, sha256 = log.outline, log.sha256()
     for row in state.runs.values() if outline else ():
-        other = row.log and row.log.source.sha256
-        only_index = outline in (sha256, other)  # where both are hashed as a whole, their hashes distinguish them
-        if other and row.log and row.log.outline == outline and only_index and not row.damage:
-            return other
+        only_index = outline in (
+            sha256,
+            row.log.sha256,
+        )  # where both are hashed as a whole, their hashes distinguish them
+        if row.log.outline == outline and only_index and not row.damage:
+            return row.log.sha256
     return sha256
 
 
@@ -117,32 +152,28 @@ def _open_log(task: IngestTask, stack: ExitStack) -> AnyLog:
     return log
 
 
-def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> Manifest:
-    track, masked, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id)
-    manifest = make_manifest(task, known, streams, track, labelled)
-    settled = (lambda _: False) if task.force else task.is_made_by
-    return store.write_run(manifest, track=track, masked=masked, labelled=labelled, settled=settled)
-
-
-def find_twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
+def find_twin(known: RunFacts, source: LogSource) -> str | None:
     """Return where else the same recording was ingested from, if it was."""
-    return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
+    return None if known.log.paths == source.origins else " + ".join(known.log.paths)
 
 
-def _read(
-    store: Store, run_id: str, before: RunJson | None, log: AnyLog, task: IngestTask, *, sha256: str
-) -> tuple[Streams, RunJson]:
-    """Return L1 and what is known of its log; from the store what was made with the same read settings."""
+def _find_stored_streams(
+    store: Store, state: State, known: Iterable[RunFacts], task: IngestTask, key: str
+) -> _Read | None:
+    """Return the streams of a run of the same log that were made with the same settings; None where there are none."""
+    for row in known:
+        if not task.force and row.read_key == key and row.streams_blob in state.blobs:
+            streams = read_streams(store.place, row)
+            if streams is not None:
+                document = state.names["runs", make_run_key(row.log.sha256, row.recipe_id)]
+                return _Read(streams, row.damage, read_record(store.place, document, Run).notes, row)
+    return None
+
+
+def _read(log: AnyLog, task: IngestTask) -> _Read:
+    """Return L1 of a log."""
     from tcpipe.stages.read import find_read_config, read_run  # noqa: PLC0415  kernels load only when there is work
 
-    key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
-    if before and before.message_definitions == task.definitions and not task.force:
-        cached = store.read_streams(run_id, key=key)
-        if cached is not None:
-            known = make_run_json(task, log, cached, sha256)
-            return cached, replace(
-                known, damage=before.damage, notes=before.notes, streams=before.streams, streams_key=key
-            )
     damage, _ = split_notes(log.findings)
     if lost := find_total_loss(log.topics.values(), damage):
         raise LogError(*lost, findings=damage)
@@ -151,53 +182,104 @@ def _read(
     )
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
-    damage, notes = split_notes(log.findings)
-    known = make_run_json(task, log, streams, sha256)
-    return streams, replace(known, damage=damage, notes=notes, streams_key=key)
+    return _Read(streams, *split_notes(log.findings))
 
 
-def make_run_json(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) -> RunJson:
-    """Return what is known of a log that was read; its damage, notes and tags are to be added."""
-    by_index = sha256 == log.outline or (log.is_known_by_outline and sha256 == log.sha256())
-    return RunJson(
-        source=LogOrigin(task.source.origins, sha256, log.size_bytes, "index" if by_index else "log"),
-        robot=streams.robot,
-        topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
-        sensors=streams.sensors,
-        message_definitions=task.definitions,
-        report=streams.report,
-        outline=log.outline or "",
-    )
-
-
-def make_manifest(
-    task: IngestTask, known: RunJson, streams: Streams, track: Track, labelled: LabelledSegments
-) -> Manifest:
-    """Return what became of a run; ``known`` gives tags and damage."""
-    info, count = labelled.info, labelled.table.num_rows
+def make_run(
+    task: IngestTask, log: AnyLog, read: _Read, track: Track, labelled: LabelledSegments, *, sha256: str, key: str
+) -> Run:
+    """Return the record of a run whose tables are not in the store yet."""
+    info, table, streams = labelled.info, labelled.table, read.streams
     subject = Subject("run", info.run_id)
-    found = find_damaged_log(known.damage, subject)
-    if 0 < count < read_threshold("few-segments", "min_segments_count"):
-        found = (*found, make_finding("few-segments", subject, segments_count=count))
+    found = find_damaged_log(read.damage, subject)
+    if 0 < table.num_rows < read_threshold("few-segments", "min_segments_count"):
+        found = (*found, make_finding("few-segments", subject, segments_count=table.num_rows))
     info = add_findings(info, found, info.report.facts)
-    messages = {role: table.num_rows for role, table in streams.tables.items()}
-    return Manifest(
+    label, messages = info.report.facts.label, {role: rows.num_rows for role, rows in streams.tables.items()}
+    by_index = sha256 == log.outline or (log.is_known_by_outline and sha256 == log.sha256())
+    return Run(
         run_id=info.run_id,
         recipe_id=make_recipe_id(task.recipe, streams.robot),
         data_model_version=DATA_MODEL_VERSION,
+        results_version=RESULTS_VERSION,
         tcpipe_version=__version__,
         ingest_key=ingest_key(task.recipe),
-        recipe=task.recipe.ingest,
+        read_key=key,
         robot=streams.robot,
-        tags=known.tags,
-        counts=Counts(count, track.table.num_rows, track.rejections.num_rows, messages),
-        distance_by_reason_m=labelled.distance_by_reason_m,
-        verdict=judge(info.report.findings),
-        damage=known.damage,
-        info=info,
         robot_requested=task.robot,
         message_definitions=task.definitions,
+        log=LogOrigin(task.source.origins, sha256, log.size_bytes, "index" if by_index else "log", log.outline or ""),
+        recording=_describe_recording(streams),
+        sensors=streams.sensors,
+        segments=table.num_rows,
+        start_ns=int(to_integers(table, "start_ns")[0]) if table.num_rows else None,
+        end_ns=int(to_integers(table, "end_ns")[-1]) if table.num_rows else None,
+        distance_by_reason_m=labelled.distance_by_reason_m,
+        findings=info.report.findings,
+        damage=read.damage,
+        energy_budget=None if label is None else label.energy_budget,
+        idle_watt=None if label is None else label.physics.idle_watt,
+        physics=list_physics_terms(label),
+        blob="",
+        tables={},
+        streams_blob="",
+        streams={},
+        recipe=task.recipe.ingest,
+        counts=Counts(table.num_rows, track.table.num_rows, track.rejections.num_rows, messages),
+        info=info,
+        topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
+        notes=read.notes,
+        read_report=streams.report,
     )
+
+
+_FIRST_ROWS = 20
+_IDENTIFYING = ("gnss", "pose", "imu", "wheel_odometry", "visual_odometry")
+"""Sensors whose values seldom repeat."""
+
+
+def _describe_recording(streams: Streams) -> Recording | None:
+    """Return when a log was recorded, and a hash of the first measurements of its sensors of motion."""
+    tables = {role: table for role, table in streams.tables.items() if table.num_rows}
+    if not tables:
+        return None
+    stamps = [to_integers(table, "stamp_ns") for table in tables.values()]
+    found = hashlib.sha256()
+    for role in _IDENTIFYING:
+        if role in tables:
+            names = [field.name for field in tables[role].schema if field.type in (pa.float64(), pa.int64())]
+            found.update(b"".join([role.encode(), *encode_rows(tables[role].slice(0, _FIRST_ROWS), names)]))
+    first_ns, last_ns = min(int(each.min()) for each in stamps), max(int(each.max()) for each in stamps)
+    return Recording(first_ns, last_ns, sum(table.num_rows for table in tables.values()), found.hexdigest()[:16])
+
+
+def _write_tables(directory: Path, run: Run, track: Track, masked: MaskedTrack, labelled: LabelledSegments) -> None:
+    metadata = {
+        "run_id": run.run_id, "recipe_id": run.recipe_id, "datum": to_plain(run.info.datum), "robot": run.robot,
+    }  # fmt: skip
+    tables = {
+        "track": masked.table,
+        "segments": add_segments_metadata(labelled.table, run.info.datum),
+        "rejections": track.rejections,
+    }
+    for name, table in tables.items():
+        write_table(add_metadata(table, metadata), directory / f"{name}.parquet")
+
+
+def _put_run(store: Store, state: State, run: Run, directory: Path, stored: RunFacts | None) -> Run:
+    """Put the files of a run into the store, then its manifest; ``stored`` has streams that are there already."""
+    files = compute_checksums(directory)
+    streams = {name: checksum for name, checksum in files.items() if name.startswith(f"{STREAMS}/")}
+    blob = store.put_blob(directory)
+    run = replace(
+        run,
+        blob=blob,
+        tables={name: checksum for name, checksum in files.items() if name not in streams},
+        streams_blob=blob if stored is None else stored.streams_blob,
+        streams=streams if stored is None else stored.streams,
+    )
+    store.put_run(state, run)
+    return run
 
 
 def run_stages(

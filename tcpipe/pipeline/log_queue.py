@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
-from tcpipe.pipeline.calls import LogWriter
 from tcpipe.pipeline.log_sources import (
     LogSource,
     add_hashes,
@@ -16,7 +15,7 @@ from tcpipe.pipeline.log_sources import (
     plan_rounds,
 )
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import IngestTask, Step, make_planner
+from tcpipe.pipeline.plan import IngestTask, Step
 from tcpipe.recipe import Recipe
 
 
@@ -36,45 +35,23 @@ def make_tasks(
 Item: TypeAlias = tuple[int, IngestTask]
 
 
-class LogQueue:
-    """The logs of a call.
+def iterate_rounds(steps: Sequence[Step]) -> Iterator[Iterable[Item]]:
+    """Yield logs to ingest side by side, then those that hold the same recording as one of them.
 
-    Logs that may be the same recording are a unit, so that the first of them names the run. ``broken`` are runs and recipes of which files
-    are gone.
+    Logs that may be the same recording are a unit, so that the first of them names the run.
     """
+    todo = [at for at, step in enumerate(steps) if step.is_todo]
+    units = group_possible_duplicates([steps[at].task.source for at in todo])
+    later = list[Item]()
 
-    def __init__(self, log: LogWriter, tasks: Sequence[IngestTask], broken: Container[tuple[str, str]]) -> None:
-        self._log, self._tasks, self._broken = log, tasks, broken
-        self._planned, self._decide = log.state, make_planner(log.state, broken=broken)
-        self.steps = self.plan(range(len(tasks)))
-        """Steps that the logs need when the call begins."""
-        todo = [at for at, step in self.steps.items() if step.is_todo]
-        self._units = [
-            [todo[at] for at in unit] for unit in group_possible_duplicates([tasks[at].source for at in todo])
-        ]
-
-    def plan(self, indices: Iterable[int]) -> dict[int, Step]:
-        """Return what logs need now."""
-        if self._planned is not self._log.state:
-            self._planned, self._decide = self._log.state, make_planner(self._log.state, broken=self._broken)
-        return {at: self._decide(self._tasks[at]) for at in indices}
-
-    @property
-    def is_done(self) -> bool:
-        """Whether no log was to be done as the call began."""
-        return not self._units
-
-    def iterate_rounds(self) -> Iterator[Iterable[Item]]:
-        """Yield logs to ingest side by side, then those that hold the same recording as one of them."""
-        later = list[Item]()
-        yield self._take(later)
-        yield later
-
-    def _take(self, later: list[Item]) -> Iterator[Item]:
-        for unit in self._units:
-            todo = [(at, step.task) for at, step in self.plan(unit).items() if step.is_todo]
-            hashed = add_hashes([task.source for _, task in todo])
-            items = [(index, replace(task, source=source)) for (index, task), source in zip(todo, hashed, strict=True)]
+    def take() -> Iterator[Item]:
+        for unit in units:
+            indices = [todo[at] for at in unit]
+            hashed = add_hashes([steps[at].task.source for at in indices])
+            items = [(at, replace(steps[at].task, source=source)) for at, source in zip(indices, hashed, strict=True)]
             now, after = plan_rounds(hashed)
-            later += [items[at] for at in after]
+            later.extend(items[at] for at in after)
             yield from (items[at] for at in now)
+
+    yield take()
+    yield later

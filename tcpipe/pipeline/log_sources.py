@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from tcpipe.errors import LogError, StoreError, TcpipeError, clean_line
-from tcpipe.formats.commits import LogSnapshot, find_lineage
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, find_logs, is_log_file, list_logs_below
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
 from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files, walk_folders
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
+from tcpipe.formats.store_records import LogSnapshot
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -78,11 +78,6 @@ class LogSource:
     def files_digest(self) -> str:
         """What stands for the log's content where that cannot be had: a hash (hex) over names, sizes and times."""
         return digest({"log": self.origins, "files": self.files})
-
-    @property
-    def lineage(self) -> str:
-        """What identifies the place of the log."""
-        return find_lineage(self.origins)
 
     def sighting(self, sha256: str) -> LogSnapshot:
         """Return what is remembered of the log as it is now."""
@@ -210,9 +205,9 @@ def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple
 
 
 def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[int]:
-    """Return which logs are dealt to share ``(i, n)``, i from 1: in turn, by their names in the folder given, wherever that is mounted."""
+    """Return which logs belong to share ``(i, n)``, i from 1, by a hash of their names in the folder given, wherever that is mounted."""
     index, count = shard
-    return sorted(range(len(sources)), key=lambda at: sources[at].place)[index - 1 :: count]
+    return [at for at, source in enumerate(sources) if int(digest(source.place)[:8], 16) % count == index - 1]
 
 
 def make_definitions_key(directory: Path | None) -> str:
@@ -313,18 +308,11 @@ def _stat_files(path: Path) -> list[os.stat_result]:
     return [seen] if stat.S_ISREG(seen.st_mode) else []
 
 
-def is_there(sighting: LogSnapshot) -> bool:
-    """Tell whether a log that was seen lies where it was, unchanged; in object storage nobody looks, and it is taken to be there."""
-    if any(is_url(origin) for origin in sighting.log):
-        return True
-    return _list_file_states([Path(origin) for origin in sighting.log]) == sighting.size_and_time
-
-
-def recall_hash(source: LogSource, seen: Sequence[LogSnapshot]) -> LogSource:
-    """Return the source with its hash; where nothing is known of these sizes and times, or two different things, without."""
+def recall_hash(source: LogSource, seen: LogSnapshot | None) -> LogSource:
+    """Return the source with its hash, where it was seen with these sizes and times."""
     dated = bool(source.files) and all(time_ns for _, time_ns in source.files)  # not every server tells the time
-    found = {sighting.sha256 for sighting in seen if dated and sighting.size_and_time == source.files}
-    return replace(source, sha256=found.pop()) if len(found) == 1 else source
+    is_same = dated and seen is not None and seen.size_and_time == source.files
+    return replace(source, sha256=seen.sha256) if is_same and seen is not None else source
 
 
 def _hash_source(source: LogSource) -> LogSource:

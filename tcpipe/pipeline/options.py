@@ -77,11 +77,14 @@ class IngestOptions:
         ),
     )
     retry_failed: bool = option(False, Option("Try logs again that failed before."))
+    existing_store: bool = option(False, Option("Fail if there is no store, so that an unmounted one is not replaced."))
     force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
     on_found: Callable[[Mapping[str, int]], None] | None = None
     """Called once with the size [byte] of every log by its name."""
     on_result: Callable[[IngestResult], None] | None = None
     """Called as each log ends, in the order of ending."""
+    on_note: Callable[[str], None] | None = None
+    """Called with a line that is said before the first result: that the store is new."""
 
 
 Files: TypeAlias = "str | Path | Sequence[str | Path]"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 import traceback
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,16 +13,16 @@ from typing import Literal, TypeAlias, TypeVar, get_args
 
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, clean_line, hide_secrets
-from tcpipe.formats.commits import CallRecord, Failure, State
+from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import describe_finding
-from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.run_documents import Manifest
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.store_records import Call, Failure
 from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
-from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
+from tcpipe.pipeline.problems import find_problems, make_failure
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding, Verdict, select_problems
+from tcpipe.tables.levels import DATA_MODEL_VERSION, RESULTS_VERSION
 
 R = TypeVar("R")
 
@@ -48,19 +48,19 @@ class IngestTask:
     retry_failed: bool = False
     min_age_s: float = 0.0
 
-    def is_made_by(self, made: RunFacts | Manifest) -> bool:
-        """Tell whether an ingestion of this content is as it would be made now."""
+    def is_made_by(self, made: RunFacts) -> bool:
+        """Return whether a run of this content is as it would be made now; a damaged log is read again by each version."""
         same_robot = made.robot_requested == self.robot or (self.robot is not None and made.robot == self.robot)
-        same_version = made.tcpipe_version == __version__ and made.message_definitions == self.definitions
-        return made.ingest_key == ingest_key(self.recipe) and same_version and same_robot
+        same_version = (made.data_model_version, made.results_version) == (DATA_MODEL_VERSION, RESULTS_VERSION)
+        same_version &= made.tcpipe_version == __version__ or not made.damage
+        same_settings = made.ingest_key == ingest_key(self.recipe) and made.message_definitions == self.definitions
+        return same_version and same_settings and same_robot
 
     @property
     def failure_key(self) -> str:
-        """What identifies a failure because of the log's content: the same content, treated in the same way, fails again."""
-        how = {"version": __version__, "ingest_key": ingest_key(self.recipe), "robot": self.robot}
-        return digest(
-            {**how, "content": self.source.sha256 or self.source.files_digest, "message_definitions": self.definitions}
-        )[:32]
+        """Key of a failure because of the content of the log: the same content, treated in the same way, fails again."""
+        content = self.source.sha256 or self.source.files_digest
+        return make_key(content, __version__, ingest_key(self.recipe), self.robot, self.definitions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,70 +211,71 @@ class _Known:
     """A state by content."""
 
     state: State
+    acknowledged: Collection[str]
     made: Mapping[str, list[RunFacts]]
     failures: Mapping[str, list[Failure]]
     passing: Mapping[str, str]
-    broken: Iterable[str]
 
 
-def make_planner(state: State, *, broken: Container[tuple[str, str]] = ()) -> Callable[[IngestTask], Step]:
-    """Return what finds out what a log needs that is to be ingested now."""
-    made, failures, names = dict[str, list[RunFacts]](), dict[str, list[Failure]](), set[str]()
-    for key, row in state.runs.items():
-        if key in broken:
-            names.add(row.run_id)
-        elif row.log is not None:
-            made.setdefault(row.log.source.sha256, []).append(row)
+def make_planner(state: State) -> Callable[[IngestTask], Step]:
+    """Return a function that finds what a log needs, if it is to be ingested now."""
+    made, failures = dict[str, list[RunFacts]](), dict[str, list[Failure]]()
+    for row in state.runs.values():
+        made.setdefault(row.log.sha256, []).append(row)
     for failure in state.failed.values():
         failures.setdefault(failure.content, []).append(failure)
-    known = _Known(state, made, failures, list_transient_failures(state.calls), names)
+    passing = list_transient_failures([call for _, call in state.calls])
+    known = _Known(state, state.acknowledged, made, failures, passing)
     return partial(_decide, known=known, now_ns=time.time_ns())
 
 
-def plan(tasks: Iterable[IngestTask], state: State, *, broken: Container[tuple[str, str]] = ()) -> tuple[Step, ...]:
-    """Return what each log needs; parameters as those of `make_planner`."""
-    return tuple(map(make_planner(state, broken=broken), tasks))
+def plan(tasks: Iterable[IngestTask], state: State) -> tuple[Step, ...]:
+    """Return what each log needs."""
+    return tuple(map(make_planner(state), tasks))
 
 
-def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:
+def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:  # noqa: PLR0911  one for each state
     if not task.force:
-        task = replace(task, source=recall_hash(task.source, known.state.seen.get(task.source.lineage, ())))
+        task = replace(task, source=recall_hash(task.source, known.state.find_seen(task.source.origins)))
     source, sha256 = task.source, None if task.force else task.source.sha256
     made = known.made.get(sha256, []) if sha256 else []
     current = next((row for row in made if task.is_made_by(row)), None)
-    if current is not None and task.tags.items() <= current.tags.items():
-        return _stand(task, current, known.state)
+    is_there = current is not None and (not current.blob or known.state.has_payload(current))
+    if current is not None and is_there and task.tags.items() <= current.tags.items():
+        return _stand(task, current, known)
     failed = None if task.force or task.retry_failed else known.state.failed.get(task.failure_key)
     if failed is not None:
-        acknowledged = is_acknowledged([make_failure(failed.content, failed.log)], known.state)
+        is_acknowledged = make_failure(failed.content, failed.log).key in known.acknowledged
         cause = _remove_name("".join(failed.problems[:1]), task)
-        state: LogState = "quarantined" if acknowledged else "failed_permanent"
+        state: LogState = "quarantined" if is_acknowledged else "failed_permanent"
         return Step(task, state, cause, failure=failed, findings=failed.findings)
     if check_age(task, now_ns):
         return Step(task, "growing", has_failed=_describe_content(task) in known.failures)
     if source.name in known.passing:
         return Step(task, "failed_transient", _remove_name(known.passing[source.name], task))
     if current is not None:
-        return Step(task, "outdated", "its tags change")
-    return (
-        Step(task, "outdated", _describe_outdated(made[-1], task))
-        if made
-        else Step(task, "pending", _describe_pending(task, known), has_failed=_describe_content(task) in known.failures)
-    )
+        return Step(
+            task, *(("outdated", "its tags change") if is_there else ("pending", "the files of its run are missing"))
+        )
+    if made:
+        return Step(task, "outdated", _describe_outdated(made[-1], task))
+    return Step(task, "pending", _describe_pending(task, known), has_failed=_describe_content(task) in known.failures)
 
 
 def _describe_content(task: IngestTask) -> str:
     return task.source.sha256 or task.source.files_digest
 
 
-def _stand(task: IngestTask, made: RunFacts, state: State) -> Step:
+def _stand(task: IngestTask, made: RunFacts, known: _Known) -> Step:
     """Return the step of a log that is in the store as it would be made now."""
+    if not made.blob:
+        return Step(task, "superseded", "its run was pruned; --force ingests it again", made)
     if made.superseded_by:
         return Step(task, "superseded", "superseded by a longer log", made)
     problems = find_problems(made)
     if not problems:
         return Step(task, "done", made=made)
-    if is_acknowledged(problems, state):
+    if all(problem.key in known.acknowledged for problem in problems):
         return Step(task, "done", f"{made.defect}, acknowledged", made)
     findings = tuple(problem.finding for problem in problems)
     cause = describe_finding((*made.damage, *findings)[0])
@@ -283,15 +284,12 @@ def _stand(task: IngestTask, made: RunFacts, state: State) -> Step:
 
 def _describe_pending(task: IngestTask, known: _Known) -> str:
     """Return why a log that was seen before is to be ingested; "" of a new one."""
-    sha256 = task.source.sha256
     if before := known.failures.get(_describe_content(task)):
-        acknowledged = is_acknowledged([make_failure(failure.content, failure.log) for failure in before], known.state)
-        return f"{_describe_failure(before, task)}{', acknowledged' if acknowledged else ''}; to be tried again"
+        is_acknowledged = all(make_failure(each.content, each.log).key in known.acknowledged for each in before)
+        return f"{_describe_failure(before, task)}{', acknowledged' if is_acknowledged else ''}; to be tried again"
     if task.force:
         return "to be ingested again if present"
-    if sha256 and any(run_id.endswith(f"-{sha256[:8]}") for run_id in known.broken):
-        return "files of its run are missing"
-    return "its content has changed" if task.source.lineage in known.state.seen and not sha256 else ""
+    return "its content has changed" if known.state.find_seen(task.source.origins) and not task.source.sha256 else ""
 
 
 def _describe_failure(before: Sequence[Failure], task: IngestTask) -> str:
@@ -307,13 +305,15 @@ def _describe_outdated(made: RunFacts, task: IngestTask) -> str:
     """Return in which an ingestion differs from what would be made now."""
     if made.ingest_key != ingest_key(task.recipe):
         return f"made under another recipe ({made.recipe_id})"
-    if made.tcpipe_version != __version__:
-        return f"made by tcpipe {made.tcpipe_version}"
+    if made.results_version != RESULTS_VERSION:
+        return f"made with version {made.results_version} of the results, which now are version {RESULTS_VERSION}"
+    if made.damage and made.tcpipe_version != __version__:
+        return f"its damaged log was read by tcpipe {made.tcpipe_version}"
     return "made for another robot, or with other message definitions"
 
 
-def list_transient_failures(calls: Sequence[CallRecord]) -> dict[str, str]:
-    """Return the logs whose latest failure may pass, and what that was."""
+def list_transient_failures(calls: Sequence[Call]) -> dict[str, str]:
+    """Return the logs whose latest failure may pass, and what it was; ``calls`` begin with the latest."""
     found: dict[str, str] = {}
     for call in reversed(calls):
         found.update(call.failed)

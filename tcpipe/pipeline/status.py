@@ -8,37 +8,42 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
+from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.errors import UsageError, clean_lines
-from tcpipe.formats.atomic import check_local_output, make_scratch_directory
-from tcpipe.formats.commits import CallRecord, Problem
-from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, group_findings, list_verdict
-from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.object_storage import format_path, is_url, make_absolute
+from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.documents import State
+from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_finding, group_findings
+from tcpipe.formats.object_storage import format_path, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.store_records import Call, Problem
 from tcpipe.pipeline.calls import (
     INGEST,
-    BegunCall,
     Estimate,
+    OpenCall,
     estimate,
     format_duration,
     is_below,
-    list_begun_calls,
+    list_ended_calls,
+    list_open_calls,
 )
+from tcpipe.pipeline.ingest import CallOptions
 from tcpipe.pipeline.log_queue import make_tasks
 from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, LogState, Step, plan
+from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.power.witnesses import compare_batteries
+from tcpipe.recipe import Recipe
 from tcpipe.robust import estimate_robust_std
-from tcpipe.store import Store, open_store
+from tcpipe.store import open_store
 from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding, read_threshold
 
 _MOST_NAMES = 3
@@ -69,9 +74,11 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """Where the logs of a store's sources stand."""
+    """Where the logs of a store's sources and its outputs stand."""
 
     store: str
+    to_do_now: str
+    """What somebody should do now, as one line."""
     sources: tuple[str, ...]
     counts: Mapping[LogState, int]
     """Logs by state."""
@@ -80,36 +87,31 @@ class Status:
     to_do: Estimate | None
     """Estimate for the next ingest; None if nothing is to do."""
     problems: tuple[Finding, ...]
-    """Sources that cannot be read, runs that are not complete, logs that wait for too long, calls that were killed, damaged commits."""
+    """Sources that cannot be read, runs that are not complete, logs that wait for too long, calls that were killed, damaged documents,
+    outputs that are out of date or whose last call failed."""
     gone: tuple[str, ...]
     """Sources that cannot be read and that only calls before the latest ingest were given."""
     superseded_runs: int
-    begun: tuple[BegunCall, ...]
-    """Calls that have begun and not ended: they run, perhaps run, or were killed without an acknowledgement."""
-    history: tuple[CallRecord, ...]
+    open_calls: tuple[OpenCall, ...]
+    """Calls that have begun and not ended."""
+    history: tuple[Call, ...]
     """The latest calls, the last one first."""
-    verdict: Verdict
-    """On the runs under the ruling recipe together; of each code the worst finding is a reason."""
     runs: int
     """Under the ruling recipe."""
     findings: Mapping[str, int]
     """Number of runs with each warning and error, by code, the worst first."""
-    losses: tuple[StoreLoss, ...]
-    """The ten largest, over the runs under the ruling recipe."""
     exit_code: int
-    """3 where somebody should look at a log or a run, else 0."""
+    """3 where somebody should look at a log, a run or an output, else 0."""
 
     def __str__(self) -> str:
         """Return the lines as one text."""
         said = ", ".join(f"{count} {_format_words(state)}" for state, count in self.counts.items()) or "no logs"
-        lines = [f"{self.store}: {said}", *(str(group) for group in self.groups)]
+        lines = [self.to_do_now, f"{self.store}: {said}", *(str(group) for group in self.groups)]
         lines += [f"to do: {self.to_do}"] if self.to_do else []
         lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
-        lines += [f"{call.state}: {call}" for call in self.begun if call.state != "killed"]
-        lines += [f"verdict: {line}" for line in list_verdict(self.verdict)] if self.runs else []
+        lines += [f"{call.state}: {call}" for call in self.open_calls if call.state != "killed"]
         lines += [f"  {format_count(code, count, self.runs)}" for code, count in [*self.findings.items()][:MOST_LINES]]
-        lines += ["losses:", *map(format_loss, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
         return clean_lines([*lines, *(_format_call(call) for call in self.history[:_MOST_CALLS])])
 
@@ -117,62 +119,109 @@ class Status:
 def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     """Return what a call of ingest with these options would find; with ``create`` the store need not be there.
 
-    Without logs: those that the latest calls of ingest were given. A log that was written more recently than ``min_age_s`` is growing.
+    Without logs: those that the latest calls of ingest were given, with the options of these calls. A log that was written more recently
+    than ``min_age_s`` is growing.
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or nothing is known of its sources.
     """
-    ruling, store = resolve_recipe(options.recipe), options.store
-    opened = Store(store if is_url(store) else check_local_output(store)) if create else open_store(store)
-    state = opened.state()
-    begun, given = list_begun_calls(state), [str(log) for log in options.logs]
-    sources = [format_path(log) for log in given]
-    ingests = [(call.begin, call.logs) for call in state.calls if call.logs]
-    ingests += [(call.begin, call.works_on) for call in begun if call.command == INGEST]
-    asked = list(dict.fromkeys(log for _, logs in sorted(ingests, reverse=True) for log in logs))
-    lately: Sequence[str] = sources or (max(ingests)[1] if ingests else ())
-    given = given or asked
+    ruling = resolve_recipe(options.recipe)
+    opened = open_store(options.store, create=create)
+    state, given = opened.scan(), [str(log) for log in options.logs]
+    asked = _list_asked(state)
     if not given and not state.calls:
         raise UsageError(f"{opened.root}: no earlier call of ingest is known; give the logs or their folders")
-    with make_scratch_directory() as staging:
-        found = find_sources(given, as_one=options.as_one, staging=staging, tables=ruling.tables)
-    runs, shard = opened.ingestions(state=state), options.shard
-    tasks = make_tasks(found.sources, options, opened.root, ruling)
-    tasks = tasks if shard is None else [tasks[at] for at in select_shard(found.sources, shard)]
-    steps = plan(tasks, state, broken=runs.lost if opened.place.path else ())
-    problems = [*state.problems, *find_incomplete_runs(runs)]
-    problems += [call.problem for call in begun if call.state == "killed"]
-    if (
-        not create
-        and all(call.state == "killed" for call in begun)
-        and all(is_below(make_absolute(log), asked) for log in given)
-    ):
+    tasks, missing = _find_tasks(options, asked, opened.root, ruling)
+    steps = plan(tasks, state)
+    open_calls, acknowledged = list_open_calls(state), state.acknowledged
+    killed = [call for call in open_calls if call.state == "killed"]
+    lately = given or next(iter(asked.values()), ((), CallOptions()))[0]
+    problems = [*state.problems, *find_incomplete_runs(state), *(call.problem for call in killed)]
+    if not create and len(killed) == len(open_calls) and all(is_below(make_absolute(log), [*asked]) for log in given):
         problems += _find_waiting(steps)
-    problems += [make_missing(path, state) for path in found.problems if path in lately]
-    problems = [problem for problem in problems if problem.key not in state.acknowledged]
-    acknowledged = {call.name for call in begun if call.problem.key in state.acknowledged}
+    problems += [make_missing(path, state) for path in missing if path in lately]
+    problems += [] if create else find_stale_outputs(state)
+    problems = [problem for problem in problems if problem.key not in acknowledged]
     groups, waiting = tuple(_iterate_groups(steps)), [step for step in steps if step.is_todo]
-    current = [run.facts for run in runs.finished if run.facts.ingest_key == ingest_key(ruling)]
+    current = [run.facts for run in opened.runs(state) if run.facts.ingest_key == ingest_key(ruling)]
     by_code = group_findings((run.run_id, run.findings) for run in current)
-    trouble = problems or any(group.state in TROUBLE for group in groups)
+    calls = list_ended_calls(state)
+    size_bytes = sum(step.task.source.size_bytes for step in waiting)
     return Status(
         store=str(opened.root),
-        sources=tuple(sources),
+        to_do_now=_describe_first(problems, groups),
+        sources=tuple(format_path(log) for log in given),
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
-        to_do=estimate(state.calls, INGEST, sum(step.task.source.size_bytes for step in waiting), jobs=options.jobs)
-        if waiting
-        else None,
+        to_do=estimate(calls, INGEST, size_bytes, jobs=options.jobs) if waiting else None,
         problems=tuple(problem.finding for problem in problems),
-        gone=tuple(chain(*(lines for path, lines in found.problems.items() if path not in lately))),
-        superseded_runs=len(state.superseded),
-        begun=tuple(call for call in begun if call.state != "killed" or call.name not in acknowledged),
-        history=state.calls,
-        verdict=judge_runs(current, find_changes(current)),
+        gone=tuple(chain(*(lines for path, lines in missing.items() if path not in lately))),
+        superseded_runs=sum(bool(row.superseded_by) for row in state.runs.values()),
+        open_calls=tuple(call for call in open_calls if call.problem.key not in acknowledged),
+        history=tuple(calls[:_LATEST_CALLS]),
         runs=len(current),
         findings={group.code: len(group.of) for group in by_code if group.severity != "note"},
-        losses=find_largest_losses(run.distance_by_reason_m for run in current),
-        exit_code=3 if trouble else 0,
+        exit_code=3 if problems or any(group.state in TROUBLE for group in groups) else 0,
     )
+
+
+_LATEST_CALLS = 50
+Asked: TypeAlias = Mapping[str, tuple[tuple[str, ...], CallOptions]]
+"""By log or folder that was given to ingest: all that the latest such call was given, and its options; the latest call first."""
+
+
+def _list_asked(state: State) -> Asked:
+    asked = dict[str, tuple[tuple[str, ...], CallOptions]]()
+    for _, call in state.calls:
+        if call.command == INGEST and call.exit_code != UsageError.exit_code:
+            how = CallOptions(**call.options)  # type: ignore[arg-type]  # written by ingest
+            for log in call.works_on:
+                asked.setdefault(log, (call.works_on, how))
+    return asked
+
+
+def _find_tasks(
+    options: IngestOptions, asked: Asked, root: Path | str, recipe: Recipe
+) -> tuple[list[IngestTask], dict[str, tuple[str, ...]]]:
+    """Return the tasks of the logs given, or of those of earlier calls with the options of these; and what holds no log."""
+    logs = [str(log) for log in options.logs]
+    calls = dict(asked.values())
+    groups = [(logs, options)] if logs else []
+    for works_on, how in [] if logs else calls.items():
+        mine = [log for log in works_on if asked[log][0] == works_on]
+        robot = options.robot or how.robot
+        again = replace(options, robot=robot, as_one=how.as_one, message_definitions=how.message_definitions)
+        groups.append((mine, again))
+    tasks, missing = list[IngestTask](), dict[str, tuple[str, ...]]()
+    for mine, again in groups:
+        with make_scratch_directory() as staging:
+            found = find_sources(mine, as_one=again.as_one, staging=staging, tables=recipe.tables)
+        missing |= found.problems
+        new = make_tasks(found.sources, again, root, recipe)
+        tasks += new if options.shard is None else [new[at] for at in select_shard(found.sources, options.shard)]
+    return tasks, missing
+
+
+def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str:
+    """Return what to do now: the first problem, else the first trouble with logs, else what is to be ingested."""
+    if problems:
+        more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
+        return f"to do now: {format_finding(problems[0].finding)}{more}"
+    for group in groups:
+        if group.state in TROUBLE:
+            return (
+                f"to do now: look at {len(group.logs)} logs that are {_format_words(group.state)}, or acknowledge them"
+            )
+    waiting = sum(len(group.logs) for group in groups if group.state in TO_DO)
+    return f"to do now: tcpipe ingest ({waiting} logs)" if waiting else "nothing to do"
+
+
+def find_stale_outputs(state: State) -> Iterator[Problem]:
+    """Yield the outputs whose last call failed, or that would be made of something else now."""
+    for output in state.outputs.values():
+        subject = Subject("dataset", output.where)
+        if output.exit_code not in (0, 3):
+            names = {"message": output.message.partition("\n")[0], "at": output.at[:19]}
+            yield Problem(make_finding("output-failed", subject, names=names), f"{output.where} {output.at}")
 
 
 def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
@@ -210,11 +259,12 @@ def _format_words(state: LogState) -> str:
     return _IN_WORDS.get(state, state)
 
 
-def _format_call(call: CallRecord) -> str:
+def _format_call(call: Call) -> str:
     """Return a call as one line."""
     said = ", ".join(f"{count} {what}" for what, count in call.counts.items() if count) or "nothing"
     times = f"{format_duration(call.wall_s)}, CPU {format_duration(call.cpu_s)}"
-    return f"  {call.begin[:19]} {call.command}: {said}; {times}, exit code {call.exit_code}"
+    why = f": {call.message.partition(chr(10))[0]}" if call.exit_code and call.message else ""
+    return f"  {call.begin[:19]} {call.command}: {said}; {times}, exit code {call.exit_code}{why}"
 
 
 _CHANGE = "run-to-run-change"

@@ -24,6 +24,9 @@ DATA_MODEL_VERSION = "4.0"
 
 TABLES_VERSION = "4.0"  # in which a table last changed
 
+RESULTS_VERSION = 1
+"""Raised when the same log and recipe give other values in a table: runs of an earlier one are ingested again."""
+
 
 def describe_other_data_model(where: str, version: str) -> str:
     """Return the error on a store, dataset or map that another data model wrote."""

@@ -1,0 +1,375 @@
+"""The documents of a store, and the state that they describe together.
+
+::
+
+    runs/0123456789abcdef.2.fedcba9876543210.json    kind / key . number . digest; written once and never changed
+    blobs/5f0c6a7be1d29c04/segments.parquet          payload in a folder with a random name; a document names the folder
+    index.parquet                                    cache of what documents say, by name; it may be deleted
+
+Rules (ADR-36):
+
+1. Bytes whose sha256 does not begin with the digest in their name are no document: they are damaged, or half copied.
+2. For each kind and key the document with the highest number counts; of several with this number, the one with the smallest digest.
+   A writer uses 1 + the highest number that it saw.
+3. The payload is written first, into a folder with a fresh random name; then the document that names the folder.
+4. A call writes number 1 of its document before it scans, and number 2 when it ends.
+5. The state is a function of the documents: `scan` computes it, and nothing else is stored.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import logging
+import secrets
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.cache import fetch_cached
+from tcpipe.formats.json_files import digest, parse_typed_json, to_compact_json, to_json
+from tcpipe.formats.place import Place
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.store_records import Call, Failure, LogSnapshot, Output, Problem, StoredMap, Tags, find_lineage
+from tcpipe.tables.findings import Subject, make_finding
+
+logger = logging.getLogger("tcpipe")
+
+Kind: TypeAlias = Literal["calls", "runs", "failed", "tags", "seen", "acknowledged", "maps", "outputs"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+"""In the order in which they are listed: calls first, so that a call that ends later is seen as open."""
+BLOBS = "blobs"
+INDEX = "index.parquet"
+_RECORDS: Mapping[Kind, type] = {
+    "calls": Call, "runs": RunFacts, "failed": Failure, "tags": Tags, "seen": LogSnapshot, "acknowledged": Problem, "maps": StoredMap,
+    "outputs": Output,
+}  # fmt: skip
+_HEX = 16
+_UNREAD = 16
+_UNREAD_SHARE = 50
+"""The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
+
+T = TypeVar("T")
+
+
+class Name(NamedTuple):
+    """The name of a document."""
+
+    kind: Kind
+    key: str
+    number: int
+    digest: str
+
+    def __str__(self) -> str:
+        """Return the name in the store."""
+        return f"{self.kind}/{self.key}.{self.number}.{self.digest}.json"
+
+
+def parse_name(kind: Kind, file: str) -> Name | None:
+    """Return the parts of a name in the folder of a kind; None for a file that is no document."""
+    parts = file.split(".")
+    is_document = (
+        len(parts) == 4 and parts[3] == "json" and parts[1].isdecimal() and len(parts[0]) == len(parts[2]) == _HEX
+    )
+    return Name(kind, parts[0], int(parts[1]), parts[2]) if is_document else None
+
+
+def make_key(*parts: object) -> str:
+    """Return the key of a document about something."""
+    return digest(parts)[:_HEX]
+
+
+def make_run_key(sha256: str, recipe_id: str) -> str:
+    """Return the key of the run of a content under a recipe."""
+    return make_key(sha256, recipe_id)
+
+
+def make_blob_name() -> str:
+    """Return the name of a folder that nobody else writes to."""
+    return secrets.token_hex(_HEX // 2)
+
+
+@dataclass(slots=True)
+class State:
+    """What the documents of a store say: by kind and key the record that counts, and the names of what does not count."""
+
+    facts: dict[Kind, dict[str, Any]] = field(default_factory=lambda: {kind: {} for kind in KINDS})
+    names: dict[tuple[Kind, str], str] = field(default_factory=dict)
+    """Names of the documents that count."""
+    highest: dict[tuple[Kind, str], int] = field(default_factory=dict)
+    """The highest number of each kind and key, also of damaged documents."""
+    beaten: list[str] = field(default_factory=list)
+    """Names of the documents that do not count."""
+    damaged: list[str] = field(default_factory=list)
+    """Names of documents that are not as they were written."""
+    blobs: frozenset[str] = frozenset()
+    """Folders of payload that are there."""
+    is_new: bool = True
+    """Whether there is no document at all."""
+    read: int = 0
+    """Documents that the index did not hold."""
+    _joined: dict[str, RunFacts] | None = None
+
+    @property
+    def runs(self) -> dict[str, RunFacts]:
+        """Runs by key, with tags and supersession; those that are superseded or pruned too."""
+        if self._joined is None:
+            self._joined = _join_runs(self.facts)
+        return self._joined
+
+    @property
+    def failed(self) -> dict[str, Failure]:
+        """Failures by key."""
+        return self.facts["failed"]
+
+    @property
+    def acknowledged(self) -> set[str]:
+        """Keys of the problems that a person has acknowledged."""
+        return {problem.key for problem in self.facts["acknowledged"].values()}
+
+    @property
+    def maps(self) -> dict[str, StoredMap]:
+        """Maps by name, sorted."""
+        found = {each.name: each for each in self.facts["maps"].values()}
+        return {name: found[name] for name in sorted(found)}
+
+    @property
+    def outputs(self) -> dict[str, Output]:
+        """Outputs by path or URL, sorted."""
+        found = {each.where: each for each in self.facts["outputs"].values()}
+        return {where: found[where] for where in sorted(found)}
+
+    @property
+    def calls(self) -> list[tuple[str, Call]]:
+        """Calls with their keys, the latest first."""
+        return sorted(self.facts["calls"].items(), reverse=True)
+
+    @property
+    def problems(self) -> list[Problem]:
+        """Documents that are damaged."""
+        return [
+            Problem(make_finding("document-damaged", Subject("file", name)), name, (name,))
+            for name in sorted(self.damaged)
+        ]
+
+    def list_rows(self, run_id: str | None = None) -> list[RunFacts]:
+        """Return the runs by run and recipe, or those of one run: one for each recipe."""
+        rows = (row for row in self.runs.values() if run_id in (None, row.run_id))
+        return sorted(rows, key=lambda row: (row.run_id, row.recipe_id))
+
+    def has_payload(self, row: RunFacts) -> bool:
+        """Return whether the folders of a run are there; what is in them is read by `tcpipe verify`."""
+        return row.blob in self.blobs and (not row.streams or row.streams_blob in self.blobs)
+
+    def find_run_id(self, sha256: str) -> str | None:
+        """Return the run of a content; None where there is none."""
+        return min((row.run_id for row in self.runs.values() if row.log.sha256 == sha256), default=None)
+
+    def find_seen(self, log: tuple[str, ...]) -> LogSnapshot | None:
+        """Return the log as it was when it was seen last; None of a new one."""
+        found: LogSnapshot | None = self.facts["seen"].get(make_key(find_lineage(log)))
+        return found
+
+    def find_tags(self, sha256: str) -> Mapping[str, str]:
+        """Return the tags of a log."""
+        found: Tags | None = self.facts["tags"].get(make_key(sha256))
+        return {} if found is None else found.tags
+
+    def add_run(self, row: RunFacts) -> None:
+        """Add a run that a worker has written after the scan."""
+        self.facts["runs"][make_run_key(row.log.sha256, row.recipe_id)] = row
+        self.blobs |= {row.blob, row.streams_blob}
+        self._joined = None
+
+    def add(self, name: Name, record: object) -> None:
+        """Add a document that was written after the scan."""
+        key = name.kind, name.key
+        self.beaten += [self.names[key]] if key in self.names else []
+        self.highest[key] = max(name.number, self.highest.get(key, 0))
+        self.facts[name.kind][name.key], self.names[key] = record, str(name)
+        self.is_new = False
+        if name.kind == "runs":
+            row = cast("RunFacts", record)
+            self.blobs |= {row.blob, row.streams_blob}
+        if name.kind in ("runs", "tags"):
+            self._joined = None
+
+
+def _join_runs(facts: Mapping[Kind, Mapping[str, Any]]) -> dict[str, RunFacts]:
+    """Return the runs with the tags of their logs, and with the run that supersedes them.
+
+    Of runs of one robot and recipe that begin with the same measurements the longest recording counts.
+    """
+    longest, joined = dict[tuple[object, ...], RunFacts](), dict[str, RunFacts]()
+    tags: Mapping[str, Tags] = facts["tags"]
+    tags_by_log = {each.log: each.tags for each in tags.values()}
+    for row in facts["runs"].values():
+        if (beginning := _find_beginning(row)) is not None:
+            other = longest.get(beginning)
+            longest[beginning] = row if other is None or _rank_recording(row) > _rank_recording(other) else other
+    for key, row in facts["runs"].items():
+        beginning = _find_beginning(row)
+        winner = row if beginning is None else longest[beginning]
+        by = None if winner.log.sha256 == row.log.sha256 else winner.run_id
+        its_tags = tags_by_log.get(row.log.sha256, {})
+        is_settled = row.superseded_by == by and row.tags == its_tags
+        joined[key] = row if is_settled else replace(row, superseded_by=by, tags=its_tags)
+    return joined
+
+
+def _find_beginning(row: RunFacts) -> tuple[object, ...] | None:
+    if row.recording is None:
+        return None
+    return row.robot, row.ingest_key, row.recording.first_ns, row.recording.beginning
+
+
+def _rank_recording(row: RunFacts) -> tuple[int, int, bool, str]:
+    recording = row.recording
+    assert recording is not None  # noqa: S101  the callers have seen its beginning
+    return recording.last_ns, recording.rows, not row.damage, row.log.sha256
+
+
+_DECODED: dict[str, dict[str, object]] = {}
+"""Records that this process has read, of the place that it read last, by the names of their documents."""
+
+
+def scan(place: Place) -> State:
+    """Return what the documents of a store say now."""
+    where = place.where()
+    if where not in _DECODED:
+        _DECODED.clear()
+        _DECODED[where] = {}
+    has_collector = gc.isenabled()
+    gc.disable()  # the records have no cycles: to search ten thousand of them again and again takes as long as to read them
+    try:
+        return _scan(place, _DECODED[where])
+    finally:
+        if has_collector:
+            gc.enable()
+
+
+def _scan(place: Place, decoded: dict[str, object]) -> State:
+    state, turn = State(), dict[tuple[Kind, str], list[Name]]()
+    for kind in KINDS:
+        for file in place.list(kind):
+            if (name := parse_name(kind, file)) is not None:
+                turn.setdefault((kind, name.key), []).append(name)
+    state.blobs, state.is_new = frozenset(place.list(BLOBS)), not turn
+    for key, names in turn.items():
+        names.sort(key=lambda name: (-name.number, name.digest))
+        state.highest[key] = names[0].number
+    all_decoded = all(str(names[0]) in decoded for names in turn.values())
+    indexed, fresh = dict[str, bytes]() if all_decoded else _read_index(place), dict[str, bytes]()
+    while turn:  # once, and again where the document that should count is damaged
+        fresh |= _decode(place, [names[0] for names in turn.values()], indexed, decoded)
+        damaged = dict[tuple[Kind, str], list[Name]]()
+        for key, (name, *others) in turn.items():
+            if str(name) in decoded:
+                state.facts[name.kind][name.key], state.names[key] = decoded[str(name)], str(name)
+                state.beaten += map(str, others)
+            else:
+                state.damaged.append(str(name))
+                damaged |= {key: others} if others else {}
+        turn = damaged
+    state.read = len(fresh)
+    if len(fresh) > _UNREAD + len(indexed) // _UNREAD_SHARE:
+        names_that_count = state.names.values()
+        facts = {
+            name: indexed.get(name) or fresh.get(name) or to_compact_json(decoded[name]) for name in names_that_count
+        }
+        _write_index(place, facts)
+    return state
+
+
+def _decode(
+    place: Place, names: Iterable[Name], indexed: Mapping[str, bytes], decoded: dict[str, object]
+) -> dict[str, bytes]:
+    """Add records of documents to ``decoded``, and return those that are not in the index as the index has them."""
+    unread, fresh = list[Name](), dict[str, bytes]()
+    for name in names:
+        if (text := str(name)) in decoded:
+            continue
+        if text in indexed:
+            decoded[text] = parse_typed_json(indexed[text], _RECORDS[name.kind], place.where(text))
+        else:
+            unread.append(name)
+    found: list[bytes | None] = place.map(lambda name: _read_document(place, name), unread)
+    for name, data in zip(unread, found, strict=True):
+        if data is not None:
+            record: object = parse_typed_json(data, _RECORDS[name.kind], place.where(str(name)))
+            decoded[str(name)], fresh[str(name)] = record, to_compact_json(record)
+    return fresh
+
+
+def _read_document(place: Place, name: Name) -> bytes | None:
+    """Return the bytes of a document; None where they are not as they were written."""
+    try:
+        data = place.read(str(name))
+    except StoreError as error:
+        logger.debug("%s", error)
+        return None
+    return data if data is not None and _hash_bytes(data) == name.digest else None
+
+
+def _hash_bytes(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:_HEX]
+
+
+def _read_index(place: Place) -> dict[str, bytes]:
+    for read in (lambda: place.read(INDEX), lambda: _find_own_index(place).read_bytes()):
+        with suppress(pa.ArrowException, KeyError, StoreError, OSError):
+            if data := read():
+                table = pq.ParquetFile(pa.BufferReader(data)).read()
+                return dict(zip(table["name"].to_pylist(), table["facts"].to_pylist(), strict=True))
+    return {}
+
+
+def _write_index(place: Place, rows: Mapping[str, bytes]) -> None:
+    sink = pa.BufferOutputStream()
+    columns = [pa.array([*rows], pa.string()), pa.array([*rows.values()], pa.binary())]
+    pq.write_table(pa.Table.from_arrays(columns, ["name", "facts"]), sink, compression="zstd")
+    data = sink.getvalue().to_pybytes()
+    try:
+        place.put(INDEX, data)
+    except StoreError:  # a reader that may not write here keeps it in its own cache
+        with suppress(StoreError, OSError):
+            _find_own_index(place).write_bytes(data)
+
+
+def _find_own_index(place: Place) -> Any:
+    return fetch_cached(f"index of {place.where()}", lambda path: path.write_bytes(b""))
+
+
+def put_document(place: Place, state: State, kind: Kind, key: str, record: object, *, facts: object = None) -> str:
+    """Write the record that counts from now on for a kind and key, add it to the state, and return the name of its document.
+
+    ``facts`` is the part of the record that `scan` returns, if it is not the record itself.
+    """
+    data = to_json(record).encode()
+    name = Name(kind, key, state.highest.get((kind, key), 0) + 1, _hash_bytes(data))
+    place.put(str(name), data)
+    state.add(name, record if facts is None else facts)
+    return str(name)
+
+
+def read_record(place: Place, name: str, cls: type[T]) -> T:
+    """Return the whole record in a document; `StoreError` where it is gone or not as it was written."""
+    kind, _, file = name.partition("/")
+    parsed = parse_name(cast("Kind", kind), file)
+    data = None if parsed is None else _read_document(place, parsed)
+    if data is None:
+        raise StoreError(
+            f"{place.where(name)}: is missing or has changed since it was written; 'tcpipe verify' lists all"
+        )
+    return parse_typed_json(data, cls, place.where(name))
+
+
+def find_strange_files(place: Place) -> Iterable[str]:
+    """Yield the names in the folders of documents that are no documents."""
+    for kind in KINDS:
+        yield from (f"{kind}/{file}" for file in place.list(kind) if parse_name(kind, file) is None)
