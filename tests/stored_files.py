@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from tcpipe.formats.run_documents import find_highest_numbers, name_document
+
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.store import Store
 

@@ -11,12 +11,12 @@ import numpy as np
 import pyarrow as pa
 import pyproj
 from map_worlds import World
+from tcpipe.formats.commits import Entries, Superseded
+from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 
 from tcpipe import __version__
-from tcpipe.formats.commits import Entries, Superseded
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
-from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.pipeline.calls import open_log
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store

@@ -1,48 +1,26 @@
-"""Directories with a sealed card (datasets, models, cost maps) in a bucket, fetched to this machine (ADR-30).
-
-What is built to a URL lies in folders, one for each build; a log of commits says which is the newest (ADR-30)::
-
-    log/0000000002.json                         the commit of the second build
-    generations/0000000002-1f0c8a3be2d94c57/    its files: the number of its commit, and the digest of its card
-
-What lies at a URL without a log, as a copy put it there, is read as it is.
-"""
+"""Directories with a sealed card (datasets, models, cost maps) in a bucket, fetched to this machine (ADR-30)."""
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import google_crc32c
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import make_lasting_scratch
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.file_checks import find_changed_files
-from tcpipe.formats.integrity import Checksum, Checksums
-from tcpipe.formats.json_files import parse_json, parse_typed
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.place import Place
+from tcpipe.formats.published_outputs import UNLISTED, read_listed_files, require_card
 
-LOG, State = "log", object
-CARDS = ("dataset.json", "model.json", "cost-map.json")
-"""Documents that prove all files beside them."""
-_UNLISTED = ("report.html",)
-"""Files next to a card that does not list them, since they are written from it."""
-REPORT_PATCHES = "report-patches"
-"""Folder beside a dataset's page, of pictures that it shows: unlisted too."""
-GENERATIONS = "generations"
-"""Folder of the builds at a URL."""
-_DIGEST_HEX = 16
-_GENERATION = re.compile(rf"({GENERATIONS}/(\d{{10}})-[0-9a-f]{{{_DIGEST_HEX}}})/")
 _CRC_BYTES = 4
 
 
@@ -129,83 +107,10 @@ def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool
     card = require_card(url)
     root = _make_subdirectory(_make_copy_directory(url, card.data), url)
     (root / card.name).write_bytes(card.data)
-    for unlisted in _UNLISTED:
+    for unlisted in UNLISTED:
         if (page := card.place.read(unlisted)) is not None:
             (root / unlisted).write_bytes(page)
-    return root, _fetch_others(card.place, root, _read_checksums(card), by_range)
-
-
-def has_card(url: str) -> bool:
-    """Return whether a directory with a card lies at a URL."""
-    return find_newest(url, CARDS) is not None
-
-
-class FoundCard(NamedTuple):
-    """A card, its name, and the place of its files."""
-
-    place: Place
-    name: str
-    data: bytes
-
-
-def find_newest(url: str, cards: Sequence[str]) -> FoundCard | None:
-    """Return the card of the newest generation at a URL; None for another kind than ``cards``, or without a build.
-
-    The number of requests does not depend on the number of generations.
-    """
-    return _find_at(open_place(url), cards)
-
-
-def _find_at(place: Place, cards: Sequence[str]) -> FoundCard | None:
-    found = (FoundCard(place, name, data) for name in cards if (data := place.read(name)) is not None)
-    return next(found, None)
-
-
-def find_unlisted_files(url: str) -> list[str]:
-    """Return what lies at a URL and is listed by no card there, but for what earlier generations and builds that go on may hold."""
-    place = open_place(url)
-    state = read_state(place)
-    cards = [card for card in (find_newest(url, CARDS), _find_at(place, CARDS)) if card is not None]
-    listed = {card.place.where(name) for card in cards for name in (*_read_checksums(card), *_UNLISTED, card.name)}
-    others = [entry.name for entry in place.entries() if place.where(entry.name) not in listed]
-    return [place.where(name) for name in others if not _is_expected(name, state)]
-
-
-def _is_expected(name: str, state: State) -> bool:
-    newest = state.generations[-1].folder if state.generations else None
-    found = _GENERATION.match(name)
-    is_of_others = found is not None and found[1] != newest and not is_left_over(name, state)
-    return is_of_others or f"/{REPORT_PATCHES}/" in f"/{name}" or (name.startswith(f"{LOG}/") and state.number > 0)
-
-
-def name_generation(number: int, card: bytes) -> str:
-    """Return the folder of the generation of a commit: of two calls only those that put the same card share one."""
-    return f"{GENERATIONS}/{number:010}-{hashlib.sha256(card).hexdigest()[:_DIGEST_HEX]}"
-
-
-def is_left_over(name: str, state: State) -> bool:
-    """Return whether a file is of a generation that is not kept, and that no commit to come can name; none is while a commit is damaged."""
-    found = _GENERATION.match(name)
-    if found is None or state.problems:
-        return False
-    return int(found[2]) <= state.number and found[1] not in {generation.folder for generation in state.generations}
-
-
-def require_card(url: str, cards: Sequence[str] = CARDS) -> FoundCard:
-    """Return what `find_newest` does; `UsageError` where there is no card."""
-    found = find_newest(url, cards)
-    if found is None:
-        raise UsageError(f"{url}: there is no dataset, model or cost map here: none of {', '.join(cards)}")
-    return found
-
-
-def _read_checksums(card: FoundCard) -> Mapping[str, Checksum]:
-    """Return the files that a card lists; `StoreError` where one of them is not beside it."""
-    where = card.place.where(card.name)
-    checksums = parse_typed(parse_json(card.data, Path(where)), Checksums, Path(where)).checksums
-    if outside := [file for file in checksums if file.startswith("/") or ".." in file.split("/")]:
-        raise StoreError(f"{where}: names {outside[0]!r}, which is not in its directory")
-    return checksums
+    return root, _fetch_others(card.place, root, read_listed_files(card), by_range)
 
 
 def fetch_files(

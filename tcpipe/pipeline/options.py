@@ -145,7 +145,7 @@ class BuildDatasetOptions:
     """Which runs and maps a dataset is made from, and how."""
 
     out: str | Path = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
-    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a generation."""
+    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a folder of its own."""
     _: KW_ONLY
     split: str | Path | None = option(
         None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")

@@ -10,7 +10,6 @@ from pathlib import Path, PurePosixPath
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
-from tcpipe.formats.bucket_directories import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.commit_log import COMMIT, LOG, SNAPSHOT, make_snapshot_name, read_snapshot, refresh
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard
@@ -18,9 +17,10 @@ from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
 from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
-from tcpipe.formats.object_storage import is_bucket, is_url
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_row_count, read_table
 from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.published_outputs import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import (
     COPY_MARK,
@@ -151,8 +151,6 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     yield from (
         f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)
     )
-    if is_bucket(path):
-        yield from (line for line in _verify_log(open_place(path)) if isinstance(line, str))
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
         yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 

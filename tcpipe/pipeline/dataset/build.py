@@ -12,7 +12,7 @@ from pathlib import Path
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
 from tcpipe.execution import refuse_import_of_script
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
-from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -26,14 +26,13 @@ from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
-from tcpipe.formats.place import open_place
+from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
 from tcpipe.formats.store_records import Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
@@ -184,7 +183,7 @@ def _build(
     prove_maps(call.store, job.inputs.map_records)
     from tcpipe.pipeline.dataset.writing import write_dataset  # noqa: PLC0415  slow to import, and often nothing is to be built
 
-    output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
+    output = write_output(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
     with output as directory:
         card = write_dataset(directory, job.inputs, job.marks, options.jobs)
@@ -262,7 +261,7 @@ def _find_left_out(
 
 def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     """Return the card of the dataset at a URL, if there is one, and whether it is intact."""
-    open_place(url).check()
+    check_kind(url, CARD)
     if (found := find_newest(url, [CARD])) is None:
         return None, False
     with _name_remedy(url):

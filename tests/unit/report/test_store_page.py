@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from page_reading import data_of
 from synthetic_store import add_run, lanes, open_world, segments, supersede
+from tcpipe.formats.commits import CallRecord, Entries, Failure
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.commits import CallRecord, Entries, Failure
 from tcpipe.formats.place import open_place
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.calls import open_log

@@ -218,7 +218,7 @@ def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
         assert tree(here / "folder") == before
 
 
-def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_generation(here, monkeypatch):
+def test_in_a_bucket_the_differences_are_named_too_and_force_builds_beside_it(here, monkeypatch):
     (here / "served" / "sets").mkdir(parents=True)
     shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
     with object_store(here / "served") as (environment, _):
@@ -231,8 +231,8 @@ def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_gen
         assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
         assert build_dataset("s3://sets/ds", **usual(here, map_name="yard", force=True)).status == "done"
         build_dataset(here / "dataset", **usual(here, map_name="yard", force=True))
-        (generation,) = (here / "served" / "sets" / "ds" / "generations").iterdir()
-        assert read_card(generation) == read_card(here / "dataset")
+        (build,) = (here / "served" / "sets" / "ds" / "builds").iterdir()
+        assert read_card(build) == read_card(here / "dataset")
 
 
 def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
