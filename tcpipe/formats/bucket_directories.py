@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -32,7 +30,7 @@ class FetchedShards:
     root: Path
     checksums: Mapping[str, Checksum]
     proves: bool = False
-    """Whether a shard is held against its checksum before a piece of it is read: each is read whole once, until its ETag changes."""
+    """Whether the checksum of a shard is computed before a piece of it is read: once, until its ETag changes."""
     _proved: set[str] = field(default_factory=set)
 
     def size(self, path: Path) -> int:
@@ -40,7 +38,7 @@ class FetchedShards:
         return self._checksum(path).size_bytes
 
     def read(self, path: Path, offset: int, size: int) -> bytes:
-        """Return a piece of a shard that ends with the CRC-32C of the rest; of which the cache holds another it is fetched anew."""
+        """Return a piece of a shard that ends with the CRC-32C of the rest; an altered copy in the cache is fetched again."""
         self._prove({self._name(path)})
         for _ in range(2):
             held = self._held(path, offset, size)
@@ -51,7 +49,7 @@ class FetchedShards:
         return data
 
     def prefetch(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
-        """Have pieces (shard, offset, size) cached that are read soon, fetched side by side."""
+        """Fetch pieces (shard, offset, size) that are read soon into the cache, side by side."""
         pieces = list(pieces)
         self._prove({self._name(path) for path, *_ in pieces})
         absent = [piece for piece in pieces if not is_cached(self._key(*piece))]
@@ -62,12 +60,12 @@ class FetchedShards:
         return self.place.fetch(self._name(path), self._checksum(path), proved=False)
 
     def is_complete(self) -> bool:
-        """Return whether each file is there, and as large as it was."""
+        """Return whether each file exists with its size."""
         sizes = {entry.name: entry.size_bytes for entry in self.place.entries()}
         return all(sizes.get(name) == checksum.size_bytes for name, checksum in self.checksums.items())
 
     def _prove(self, names: set[str]) -> None:
-        """Raise `StoreError` where a shard is not what its card says."""
+        """Raise `StoreError` if a shard differs from its checksum."""
         if not self.proves or names <= self._proved:
             return
         if wrong := find_changed_files(self.place, self.checksums, sorted(names - self._proved)):
@@ -92,9 +90,9 @@ class FetchedShards:
 
 
 def fetch_directory(path: str | Path) -> Path:
-    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs.
+    """Return a directory of this machine: the one that is named, or a copy, for this process, of the files that a card in a bucket lists.
 
-    `UsageError`: there is no card at the URL; `StoreError`: it cannot be read, or a file is not as the card says.
+    `UsageError`: there is no card at the URL; `StoreError`: it cannot be read, or a file differs from its checksum.
     """
     return fetch_directory_by_range(path, by_range=lambda _: False)[0]
 
@@ -105,7 +103,7 @@ def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool
         return Path(path), None
     url = str(path).rstrip("/")
     card = require_card(url)
-    root = _make_subdirectory(_make_copy_directory(url, card.data), url)
+    root = _make_copy_directory(url, card.data)
     (root / card.name).write_bytes(card.data)
     for unlisted in UNLISTED:
         if (page := card.place.read(unlisted)) is not None:
@@ -116,48 +114,37 @@ def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool
 def fetch_files(
     place: Place, checksums: Mapping[str, Checksum], *, by_range: Callable[[str], bool]
 ) -> tuple[Path, FetchedShards | None]:
-    """Return a directory of this machine in which files of a place lie but those that are ``by_range``, and where these are read.
+    """Return a directory of this machine with the files of a place but those that are ``by_range``, and where these are read.
 
-    A directory holds all of them: it is returned itself, with None. `StoreError` where a file cannot be had as its checksum says.
+    A directory has all of them: it is returned itself, with None. `StoreError`: a file is missing or differs from its checksum.
     """
     if place.path is not None:
         return place.path, None
-    copies = _make_copy_directory(place.where(), repr(sorted(checksums.items())).encode())
-    root = _make_subdirectory(copies, place.where())
+    root = _make_copy_directory(place.where(), repr(sorted(checksums.items())).encode())
     return root, _fetch_others(place, root, checksums, by_range)
 
 
 def _fetch_others(
     place: Place, root: Path, checksums: Mapping[str, Checksum], by_range: Callable[[str], bool]
 ) -> FetchedShards:
-    """Bring what is not read ``by_range`` of a place's files below ``root``; return where the others are read."""
-    absent = [
-        (name, checksum) for name, checksum in checksums.items() if not (by_range(name) or (root / name).exists())
-    ]
-    place.map(lambda arguments: _fetch_one(place, *arguments, root / arguments[0]), absent)
+    """Copy the files of a place that are not ``by_range`` to ``root``; return where the others are read."""
+
+    def fetch(name: str) -> None:
+        held, path = place.fetch(name, checksums[name]), root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.hardlink_to(held)
+        except OSError:
+            shutil.copyfile(held, path)
+
+    place.map(fetch, [name for name in checksums if not (by_range(name) or (root / name).exists())])
     return FetchedShards(place, root, checksums)
 
 
 @cache
-def _make_copy_directory(url: str, card: bytes) -> Path:
-    """Return a directory for a card at a URL, which goes when the process ends."""
-    del url, card
-    return make_lasting_scratch()
-
-
-def _make_subdirectory(directory: Path, url: str) -> Path:
-    """Return the folder for a copy of a URL in a directory, named so that messages about its files show their origin."""
-    path = directory.joinpath(*(part for part in url.split("/") if part not in ("", "..")))
+def _make_copy_directory(url: str, version: bytes) -> Path:
+    """Return a directory that is removed when the process ends; its path ends with the URL, for messages about its files."""
+    del version
+    path = make_lasting_scratch().joinpath(*(part for part in url.split("/") if part not in ("", "..")))
     path.mkdir(parents=True, exist_ok=True)
     return path
-
-
-def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
-    """Link or copy the cached content of a file to where it is wanted."""
-    to.parent.mkdir(parents=True, exist_ok=True)
-    held = place.fetch(name, checksum)
-    with suppress(FileExistsError):
-        try:
-            os.link(held, to)
-        except OSError:
-            shutil.copyfile(held, to)

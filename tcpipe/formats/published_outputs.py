@@ -115,14 +115,15 @@ def write_output(url: str, card: str) -> Iterator[Path]:
     numbers = (int(found[1]) for name in place.list() if (found := _POINTER.fullmatch(name)))
     place.put(f"current.{max(numbers, default=0) + 1}.{_hash(data)}.json", data)
     entries = place.entries()
-    place.map(place.delete, _find_expired(entries, _read_pointers(place, entries)))
+    pointers = list(_iterate_pointers(place, [entry.name for entry in entries]))
+    place.map(place.delete, _find_expired(entries, pointers))
 
 
 def find_unlisted_files(url: str) -> list[str]:
     """Return the files at a URL that no card there lists, without those of replaced builds and of builds that may be going on."""
     place = open_place(url)
     entries = place.entries()
-    pointers = _read_pointers(place, entries)
+    pointers = list(_iterate_pointers(place, [entry.name for entry in entries]))
     builds = [_find_card(place.below(pointer.folder), [pointer.card]) for pointer in pointers[:1]]
     cards = [card for card in (*builds, _find_card(place, CARDS)) if card is not None]
     listed = {card.place.where(name) for card in cards for name in (*read_listed_files(card), *UNLISTED, card.name)}
@@ -149,10 +150,6 @@ def _iterate_pointers(place: Place, names: Iterable[str]) -> Iterator[_Pointer]:
         data = place.read(match[0])
         if data is not None and _hash(data) == match[2]:
             yield replace(parse_typed_json(data, _Pointer, place.where(match[0])), name=match[0])
-
-
-def _read_pointers(place: Place, entries: Sequence[Entry]) -> list[_Pointer]:
-    return list(_iterate_pointers(place, [entry.name for entry in entries]))
 
 
 def _find_expired(entries: Sequence[Entry], pointers: Sequence[_Pointer]) -> list[str]:
