@@ -108,7 +108,7 @@ class Exclusion:
 
     def __str__(self) -> str:
         """Return name, count and reason."""
-        return f"{self.name}: {self.samples} samples excluded: {self.reason or 'reason redacted'}"
+        return f"{self.name}: {self.samples} samples excluded: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,31 +201,6 @@ class Shard:
     rows: int
 
 
-@dataclass(frozen=True, slots=True)
-class Redacted:
-    """Facts that a redacted dataset omits, and facts that it does not hide."""
-
-    moved: str = (
-        "to 0 N 0 E as a whole, grid north up: lon, lat, x, y, course, heights, regions; distances are those of the ground, as chord_m, "
-        "to a centimetre"
-    )
-    cut: str = (
-        "names of logs, runs, maps, tables of covariates and lists of excluded samples, with their reasons; topics, frames, files, hosts "
-        "and times in findings, and their remedies; "
-        "what else the power feeds; checksums of rasters; the recipe's sections read, robots, power_sources and tables"
-    )
-    not_hidden: str = (
-        "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
-        "power, names of classes and layers, tags and covariates as they were given (their columns begin with "
-        "the table's name), codes, roles and the numbers of findings that the catalogue calls public, the sha256 of each log, and what "
-        "name, description and creator say"
-    )
-
-    def lines(self) -> tuple[str, str, str]:
-        """Return it in words."""
-        return f"Moved {self.moved}.", f"Cut: {self.cut}.", f"Not hidden: {self.not_hidden}."
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetCard:
     """All of dataset.json but its seal."""
@@ -267,7 +242,7 @@ class DatasetCard:
     """How well each label repeats itself; None where no place was driven twice."""
     runs: tuple[RunSource, ...]
     run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
-    """The tags that a run had to carry; None in cards of redacted datasets."""
+    """The tags that a run had to carry; None without coordinates."""
     maps: tuple[MapSource, ...]
     flagged_samples: FlaggedSamples
     """How many samples carry a quality flag."""
@@ -282,8 +257,8 @@ class DatasetCard:
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
     exclusions: tuple[Exclusion, ...] = field(default=(), metadata=LEFT_OUT)
     """A sample of two lists counts for the first one."""
-    redaction: Redacted | None = field(default=None, metadata=LEFT_OUT)
-    """Omitted facts; None for a dataset that is not redacted."""
+    without_coordinates: bool = field(default=False, metadata={"json": (False,)})
+    """Whether places are metres from an unpublished origin; then names, times, maps and regions are omitted too."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""

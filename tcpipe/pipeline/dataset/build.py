@@ -63,14 +63,9 @@ from tcpipe.pipeline.dataset.card import (
 )
 from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
-from tcpipe.pipeline.dataset.redaction import (
-    make_redaction,
-    redact_card,
-    redact_content,
-    redact_inputs,
-)
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.splitting import read_exclusions
+from tcpipe.pipeline.dataset.without_coordinates import make_publication
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import Recipe, TrainConfig
@@ -135,10 +130,9 @@ class BuildResult:
         return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
-        if self.card is None or self.card.redaction is None:
+        if self.card is None or not self.card.without_coordinates:
             return []
-        publish = f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        return [*self.card.redaction.lines(), publish]
+        return [f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
@@ -207,7 +201,7 @@ def _read_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | st
         covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
         exclusions=read_exclusions(options.exclude, options.reason),
         file_format=options.file_format,
-        redact=options.redact,
+        without_coordinates=options.without_coordinates,
         earlier=None if keep_split is None else read_earlier_splits(keep_split),
         keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
     )
@@ -248,7 +242,7 @@ def _find_left_out(
 ) -> tuple[Finding, ...]:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
-    before = () if known is None or known.redaction else known.runs
+    before = () if known is None or known.without_coordinates else known.runs
     fewer = (*chosen.missing, *find_gone_runs(before, chosen, robot=options.robot, tags=options.tags))
     if min_runs is None:
         return (*chosen.damaged, *fewer)
@@ -332,24 +326,25 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) ->
     waiting, recipe = directory / "spool", options.recipe
     waiting.mkdir()
     content = gather_content(waiting, inputs, options, jobs)
-    redaction = make_redaction(content, inputs, recipe) if options.redact else None
-    if redaction is not None:
-        content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
+    public = make_publication(content, inputs, patch_m=recipe.sample.patch_m) if options.without_coordinates else None
+    if public is not None:
+        content, inputs = public.convert_content(content), public.convert_inputs(inputs)
     logger.info("writing %d samples", len(content.samples))
     figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
     ids, compression = figures.column("sample_id"), recipe.dataset.compression
     shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
-    _write_overviews(directory, content.sources)
+    if public is None:
+        _write_overviews(directory, content.sources)
     repeatability = measure_repeatability(
         figures,
         content.samples.centres_xy_m(),
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
     )
-    if content.excluded.num_rows and redaction is None:
+    if content.excluded.num_rows and public is None:
         write_csv(content.excluded, directory / EXCLUDED)
     card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
-    card = card if redaction is None else redact_card(card, redaction)
+    card = card if public is None else public.make_card(card)
     shutil.rmtree(waiting)
     write_text(directory / HUB_CARD, format_hub_card(card))
     files = compute_checksums(directory)
@@ -362,7 +357,8 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) ->
 
 def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     """Write the samples; return the columns that card and page are made from, mapped from another file."""
-    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS)))
+    asked = dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS))
+    names = [name for name in asked if name in samples.schema.names]
 
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces():

@@ -63,7 +63,7 @@ class BuildOptions:
     covariates: tuple[CovariateTable, ...]
     exclusions: tuple[ExcludedIds, ...]
     file_format: FileFormat
-    redact: bool
+    without_coordinates: bool
     earlier: pa.Table | None
     """Samples of an earlier dataset, which keep their split."""
     keeps_own_split: bool
@@ -120,12 +120,12 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": options.region,
             "format": options.file_format,
+            "without_coordinates": options.without_coordinates,
             "covariates": [(table.name, table.checksum) for table in options.covariates],
             "excluded": [(ids.name, ids.checksum, ids.reason) for ids in options.exclusions],
             "kept_split": None if options.earlier is None else _hash_table(options.earlier),
         }
     )
-    fingerprint = digest(("redacted", fingerprint)) if options.redact else fingerprint
     findings = (*chosen.findings, *once.findings)
     return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings)
 
@@ -181,9 +181,9 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 def read_earlier_splits(dataset: str | Path) -> pa.Table:
     """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` for another path."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
-    if read_card(directory).redaction is not None:
+    if read_card(directory).without_coordinates:
         raise DatasetError(
-            f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"
+            f"{directory}: is without coordinates, its samples have other names; give the dataset with them (--keep-split)"
         )
     return read_samples(directory, ["sample_id", "split", "fold"])
 
@@ -223,10 +223,11 @@ _LONGEST_VALUE = 80
 
 def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> list[str]:
     """Return a line with both values for each option of a build that differs from those of the dataset it would replace."""
-    if card.redaction is not None or options.redact:
-        if bool(card.redaction) != options.redact:
-            return [_format_difference("--redact", bool(card.redaction), options.redact)]
-        return ["--redact: a redacted dataset omits its maps, region, tags and recipe, so that they cannot be compared"]
+    was, now = card.without_coordinates, options.without_coordinates
+    if was != now:
+        return [_format_difference("--without-coordinates", was, now)]
+    if now:
+        return ["--without-coordinates: maps, region, tags and recipe are not stored and cannot be compared"]
     return [
         _format_difference(name, was, now) for name, was, now in _iterate_options(card, options, inputs) if was != now
     ]
