@@ -94,10 +94,9 @@ class BuildResult:
         return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
-        if self.card is None or self.card.redaction is None:
+        if self.card is None or not self.card.without_coordinates:
             return []
-        publish = f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        return [*self.card.redaction.lines(), publish]
+        return [f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
@@ -249,7 +248,7 @@ def _find_left_out(
 ) -> tuple[Finding, ...]:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
-    before = () if known is None or known.redaction else known.runs
+    before = () if known is None or known.without_coordinates else known.runs
     fewer = (*chosen.missing, *find_gone_runs(before, chosen, robot=options.robot, tags=options.tags))
     if min_runs is None:
         return (*chosen.damaged, *fewer)
