@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import Recipe
@@ -61,9 +61,14 @@ class DatasetInputs:
     without_coordinates: bool
 
     @property
+    def parts(self) -> dict[str, str]:
+        """Hash of each part, by the name of its field."""
+        return {entry.name: digest([getattr(self, entry.name)]) for entry in fields(self)}
+
+    @property
     def digest(self) -> str:
         """Hash over all of it: the same inputs make the same dataset."""
-        return digest(self)
+        return digest(self.parts)
 
 
 @dataclass(frozen=True, slots=True)
