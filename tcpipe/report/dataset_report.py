@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,12 +14,12 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial import cKDTree
 
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings, judge_dataset
 from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_columns
+from tcpipe.formats.documents import BLOBS
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.run_documents import MARK
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
 from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
 from tcpipe.report.label_sections import (
@@ -44,6 +45,7 @@ from tcpipe.report.page import (
 )
 from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
+from tcpipe.store import Store, is_store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
 _PAGE = "report.html"
@@ -193,13 +195,13 @@ def _make_data(
 
 def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
     """Return the relative address of each run's page, for runs of a store in ``beside``."""
-    stores = sorted(mark.parent for mark in beside.glob(f"*/{MARK}"))
-    return {
-        run.run_id: f"../{place.relative_to(beside).as_posix()}/{_PAGE}"
-        for run in card.runs
-        for store in stores
-        if (place := store / "runs" / run.run_id / run.recipe_id).is_dir()
-    }
+    wanted, found = {(run.run_id, run.recipe_id) for run in card.runs}, dict[str, str]()
+    for path in sorted(runs.parent for runs in beside.glob("*/runs")):
+        with suppress(StoreError, UsageError):  # no store that can be read
+            rows = Store(path).scan().runs.values() if is_store(path) else ()
+            names = {row.run_id: row.blob for row in rows if row.blob and (row.run_id, row.recipe_id) in wanted}
+            found |= {run_id: f"../{path.name}/{BLOBS}/{blob}/{_PAGE}" for run_id, blob in names.items()}
+    return found
 
 
 def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableMapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from tcpipe.errors import TcpipeError, clean_line
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.report.colours import CURSOR, FAINT, SPLIT_COLOURS
 from tcpipe.report.pictures import (
     Bounds,
@@ -31,7 +32,7 @@ from tcpipe.store import Store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
 Floats = NDArray[np.float64]
-Pictures = MutableMapping[str, str]
+Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
 
 _LEAST_SHARE = 0.5
@@ -163,60 +164,66 @@ class RunMap:
     """Names of the pictures below the track."""
     missing: tuple[str, ...]
     """Reasons why pictures are missing."""
+    is_complete: bool
+    """Whether no map of the store is damaged."""
 
 
-def draw_run_map(
-    store: Store,
-    run: RunDirectory,
-    track: pa.Table,
-    segments: pa.Table,
-    *,
-    has_datum: bool,
-    pictures_by_map: MutableMapping[str, Pictures],
-) -> RunMap:
-    """Return the map; ``has_datum`` is whether the track has a place on Earth, ``pictures_by_map`` keeps pictures for further runs."""
+@dataclass(frozen=True, slots=True)
+class StoredMaps:
+    """The maps of a store, as backgrounds of the pages of its runs."""
+
+    store: Store
+    records: Mapping[str, StoredMap]
+    """By name."""
+    pictures: dict[str, Pictures] = field(default_factory=dict)
+    """Of the maps that were drawn, for further runs."""
+
+
+def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: StoredMaps, *, has_datum: bool) -> RunMap:
+    """Return the map; ``has_datum`` is whether the track has a place on Earth."""
     lonlat = np.column_stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")])
-    ground, missing = _find_ground(store, run, lonlat, pictures_by_map) if has_datum else (None, [])
+    ground, missing = _find_ground(run, lonlat, maps) if has_datum else (None, [])
+    is_complete = not missing
     if ground is None:
         start, end = (
             np.column_stack([to_floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
         )
         xy_m = np.column_stack([to_floats(track, "x_m"), to_floats(track, "y_m")])
         plot = _draw_track(("east [m]", "north [m]"), xy_m)
-        missing = missing or [_explain_no_map(store, has_datum=has_datum)]
-        return RunMap(plot, xy_m, (start, end), (), tuple(missing))
+        missing = missing or [_explain_no_map(maps, has_datum=has_datum)]
+        return RunMap(plot, xy_m, (start, end), (), tuple(missing), is_complete)
     to_map, bounds_m, pictures = ground
     xy_m = to_map(lonlat)
     plot = _draw_track(("easting [m]", "northing [m]"), xy_m)
     for number, (name, uri) in enumerate(pictures.items()):
         lay_picture(plot, name, uri, bounds_m, visible=number == 0)
     ends_xy_m = to_map(read_lonlat_deg(segments, "start")), to_map(read_lonlat_deg(segments, "end"))
-    return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing))
+    return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing), is_complete)
 
 
-def _explain_no_map(store: Store, *, has_datum: bool) -> str:
+def _explain_no_map(maps: StoredMaps, *, has_datum: bool) -> str:
     if not has_datum:
         return "No GNSS fix: the track has only local coordinates and cannot be placed on a map."
-    return "No map of the store covers the track." if store.maps() else "The store has no map ('tcpipe add-map')."
+    return "No map of the store covers the track." if maps.records else "The store has no map ('tcpipe add-map')."
 
 
 def _find_ground(
-    store: Store, run: RunDirectory, lonlat: Floats, pictures_by_map: MutableMapping[str, Pictures]
+    run: StoredRun, lonlat: Floats, maps: StoredMaps
 ) -> tuple[tuple[Callable[[Floats], Floats], Bounds, Pictures] | None, list[str]]:
     """Return projection, bounds and pictures of the first map that contains most of the track, and the maps that cannot be read."""
     lost: list[str] = []
-    for name in store.maps():
+    for name, record in maps.records.items():
         try:
-            source = open_map(*store.map_files(name))
+            source = open_map(*maps.store.map_at(record))
             transformer = Transformer.from_crs(run.manifest.recipe.read.gnss_crs, source.grid.crs, always_xy=True)
 
             def to_map(places_deg: Floats, transformer: Transformer = transformer) -> Floats:
                 return np.column_stack(transformer.transform(*places_deg.T)).reshape(-1, 2)
 
             if source.grid.contains(to_map(lonlat)).mean() > _LEAST_SHARE:
-                if name not in pictures_by_map:
-                    pictures_by_map[name] = _draw_pictures(source)
-                return (to_map, source.grid.bounds_m, pictures_by_map[name]), lost
+                if name not in maps.pictures:
+                    maps.pictures[name] = _draw_pictures(source)
+                return (to_map, source.grid.bounds_m, maps.pictures[name]), lost
         except (TcpipeError, OSError) as error:
             lost.append(f"Map {name} cannot be shown: {clean_line(str(error))}.")
     return None, lost

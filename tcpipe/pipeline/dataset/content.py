@@ -49,7 +49,7 @@ from tcpipe.formats.parquet import (
 )
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.inputs import Inputs
@@ -73,7 +73,7 @@ logger = logging.getLogger("tcpipe")
 
 
 def _pool_segments(
-    runs: Sequence[RunDirectory], directory: Path, *, again: Mapping[str, NDArray[np.bool_]]
+    runs: Sequence[StoredRun], directory: Path, *, again: Mapping[str, NDArray[np.bool_]]
 ) -> tuple[pa.Table, dict[str, float], list[Finding]]:
     """Return the segments that can become samples, mapped from a file in ``directory``, and metres by reason, which sum to the odometers.
 
@@ -109,7 +109,7 @@ def _pool_segments(
 
 
 def _iterate_usable(
-    runs: Sequence[RunDirectory],
+    runs: Sequence[StoredRun],
     again: Mapping[str, NDArray[np.bool_]],
     lacks: dict[str, list[str]],
     lost: Mapping[Loss, list[float]],
