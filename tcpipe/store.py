@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,14 +118,16 @@ class Store:
         return found
 
     @contextmanager
-    def new_map(self, state: State, name: str) -> Iterator[Path]:
-        """Yield where a map is to be written, and beside it a picture ``.png``; in the end it is the map of that name."""
-        with self.place.workshop() as directory:
-            with convert_run_errors(self.place.where(name), directory):
-                yield directory / f"{name}.zarr"
-            files = compute_checksums(directory)
-            record = StoredMap(name, DATA_MODEL_VERSION, self.put_blob(directory), files)
-            self.put(state, "maps", make_key(name), record)
+    def new_map(self, name: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
+        """Yield where a map is to be written, and beside it a picture ``.png``, and a function that puts both into the store."""
+        with self.place.workshop() as directory, convert_run_errors(self.place.where(name), directory):
+
+            def put(state: State) -> None:
+                files = compute_checksums(directory)
+                record = StoredMap(name, DATA_MODEL_VERSION, self.put_blob(directory), files)
+                self.put(state, "maps", make_key(name), record)
+
+            yield directory / f"{name}.zarr", put
 
     def prove(self, runs: Sequence[StoredRun]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.

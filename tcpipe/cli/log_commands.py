@@ -52,8 +52,8 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     """Read logs, fuse the sensors, mask unsteady driving, cut 1 m segments, and label them with power, velocity, time and energy.
 
     A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, a folder of these, or an s3:// URL. tcpipe skips logs that are in the
-    store (same content, same recipe) and logs that failed before with the same content. It prints a line when each log ends; for
-    several logs, findings follow by code.
+    store (same content, same recipe) and logs that failed before with the same content. It prints a line when each log ends (--quiet:
+    not for a log that is unchanged); for several logs, findings follow by code.
 
     Exit code 3: some logs failed, are damaged, or give no segments although the robot drove, and the problem is new: not reported
     before and not acknowledged (tcpipe acknowledge).
@@ -88,7 +88,8 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             if as_json:
                 print_json_line(convert_record(result, LogLine))
             else:
-                for line in _list_outcome(result, options.store, several=several):
+                is_silent = quiet and result.status == "unchanged" and not result.is_new_problem
+                for line in () if is_silent else _list_outcome(result, options.store, several=several):
                     shown.result(line)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
@@ -106,10 +107,10 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 
 def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
     """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
-    from tcpipe.cost.labels import format_budget
     from tcpipe.formats.finding_lines import (
         describe_finding,
         describe_power,
+        format_budget,
         format_findings,
         format_verdict,
         list_verdict,

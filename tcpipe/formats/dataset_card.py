@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from tcpipe.cost.repeatability import Floor
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
-from tcpipe.splits.audit import HeldOut
-from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit
+from tcpipe.tables.facts import ABSENT, EnergyBudget, Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import LEFT_OUT, Finding, Verdict, judge_by_code
 from tcpipe.terrain.classes import TerrainClass
 

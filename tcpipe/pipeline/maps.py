@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
+from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
@@ -19,10 +20,11 @@ from tcpipe.formats.maps.geotiff import list_raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
-from tcpipe.formats.run_documents import remove_if_empty
+from tcpipe.formats.store_records import StoredMap
+from tcpipe.pipeline.calls import ADD_MAP, RunningCall, record_call
 from tcpipe.pipeline.options import AddMapOptions, Files
 from tcpipe.report.pictures import draw_quick_look, write_overview
-from tcpipe.store import Store, open_store
+from tcpipe.store import Store, check_map_name, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function
 from tcpipe.terrain.classes import ClassScheme
@@ -62,7 +64,13 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
     Raises `MapError`, `StoreError`: a raster cannot be had or placed, the classes are not the store's, or the store cannot be written: the
     store is as it was.
     """
-    name, layers, categorical = options.name, options.layers or {}, options.categorical or {}
+    opened = open_store(options.store, create=True)
+    with record_call(opened, ADD_MAP, [options.name]) as call:
+        return _add_map(call, options)
+
+
+def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
+    name, layers, categorical = check_map_name(options.name), options.layers or {}, options.categorical or {}
     _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
     given = {role: getattr(options, role) for role in _ROLES}
     tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
@@ -70,38 +78,36 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
     bands = None if options.ortho_bands == "grey" else options.ortho_bands
     if "height" not in files:
         raise UsageError(f"map {name}: no height raster; give --height FILE")
-    with remove_if_empty(options.store):
-        opened = open_store(options.store, create=True)
-        before = opened.map_number(name)
-        inputs = MapInputs(_compute_checksums(files), options.crs, tuple(sorted(categorical)), bands)
-        more = MoreLayers(
-            {name: files[name] for name in layers},
-            {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
-            options.ortho_bands,
+    store, state = call.store, call.state
+    inputs = MapInputs(_compute_checksums(files), options.crs, tuple(sorted(categorical)), bands)
+    more = MoreLayers(
+        {name: files[name] for name in layers},
+        {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
+        options.ortho_bands,
+    )
+    if name in state.maps and not options.force:
+        return _find_unchanged(store, state, name, inputs)
+    with store.new_map(name) as (path, put):
+        build_map(
+            path,
+            name=name,
+            height=files["height"],
+            ortho=files.get("ortho", ()),
+            terrain=files.get("terrain", ()),
+            more=more,
+            classes=files["classes"][0] if "classes" in files else None,
+            agreed=_agree_classes(store, state, name),
+            crs=options.crs,
+            inputs=inputs,
         )
-        if before and not options.force:
-            return _find_unchanged(opened, name, inputs)
-        opened.check_writable()
-        try:
-            with opened.new_map(name, after=before) as path:
-                build_map(
-                    path,
-                    name=name,
-                    height=files["height"],
-                    ortho=files.get("ortho", ()),
-                    terrain=files.get("terrain", ()),
-                    more=more,
-                    classes=files["classes"][0] if "classes" in files else None,
-                    agreed=_agree_classes(opened, name),
-                    crs=options.crs,
-                    inputs=inputs,
-                )
-                write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
-        except StoreError:
-            if before or opened.map_number(name) == before:
-                raise
-            return _find_unchanged(opened, name, inputs)  # another process was faster, or its own answer was lost
-        return _make_added(opened, name, "done")
+        write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
+        before, state = state.maps.get(name), store.scan()
+        if state.maps.get(name) != before:
+            call.state = state
+            return _find_unchanged(store, state, name, inputs)  # another process was faster
+        call.begin()
+        put(state)
+    return _make_added(store, state.maps[name], "done")
 
 
 add_map = as_function(AddMapOptions, run_add_map)
@@ -125,10 +131,9 @@ def _refuse_layers(
         raise UsageError(*problems)
 
 
-def _make_added(store: Store, name: str, status: Literal["done", "unchanged"]) -> AddedMap:
-    document, place = store.map_document(name), store.place.below("maps")
-    found = open_map(*store.map_at(document)).summary()
-    return AddedMap(place.where(document.zarr), status, found, place.where(document.picture))
+def _make_added(store: Store, record: StoredMap, status: Literal["done", "unchanged"]) -> AddedMap:
+    found = open_map(*store.map_at(record)).summary()
+    return AddedMap(store.place.where(record.zarr), status, found, store.place.where(record.picture))
 
 
 def _find_files(given: Mapping[str, Files]) -> dict[str, list[Path]]:
@@ -184,10 +189,10 @@ def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[st
     return checksums
 
 
-def _find_unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
+def _find_unchanged(store: Store, state: State, name: str, inputs: MapInputs) -> AddedMap:
     """Return the map that is there; `MapError` that says what differs, unless it is made from the same."""
     try:
-        found = open_map(*store.map_files(name))
+        found = open_map(*store.map_at(state.maps[name]))
     except (MapError, StoreError) as error:
         raise MapError(*error.problems, f"map {name}: add it again with --force") from None
     before = found.facts.inputs
@@ -203,7 +208,7 @@ def _find_unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
             f"map {name}: is in the store already, made from something else: {'; '.join(changes)}; "
             "replace it with --force, or choose another name"
         )
-    return _make_added(store, name, "unchanged")
+    return _make_added(store, state.maps[name], "unchanged")
 
 
 def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
@@ -219,13 +224,13 @@ def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str
     return f"{role} has another content ({', '.join(names or before)})"
 
 
-def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
+def _agree_classes(store: Store, state: State, name: str) -> ClassScheme | None:
     """Return the classes that the store's other maps share; None if no other map has classes that a user or a raster named."""
-    for other in opened.maps():
+    for other, record in state.maps.items():
         if other == name:
             continue
         try:
-            found = open_map(*opened.map_files(other))
+            found = open_map(*store.map_at(record))
         except (MapError, StoreError):
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue

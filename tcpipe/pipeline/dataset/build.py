@@ -4,45 +4,29 @@ from __future__ import annotations
 
 import logging
 import shlex
-import shutil
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import pyarrow as pa
-from pyarrow.csv import write_csv
-
 from tcpipe import __version__
-from tcpipe.cost.labels import format_budget
-from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, clean_lines, list_first
-from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
+from tcpipe.errors import DatasetError, StoreError, UsageError, clean_lines, list_first
+from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
-    CLASSES,
     CROISSANT,
-    EXCLUDED,
-    HUB_CARD,
-    OVERVIEW,
-    RELIEF,
     REPORT,
-    SAMPLES,
     parse_card,
     read_card,
     read_intact_card,
 )
-from tcpipe.formats.finding_lines import format_mixed_groups, list_verdict
-from tcpipe.formats.geojson import read_regions
-from tcpipe.formats.hub_card import format_croissant, format_hub_card
-from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
-from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
 from tcpipe.formats.object_storage import is_url, make_absolute
-from tcpipe.formats.parquet import map_table, return_freed_memory, write_parquet_rows, write_pieces
+from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.place import open_place
-from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import (
     BUILD,
@@ -53,29 +37,11 @@ from tcpipe.pipeline.calls import (
     open_log,
     start_stopwatch,
 )
-from tcpipe.pipeline.dataset.card import (
-    CARD_COLUMNS,
-    PHYSICS_COLUMNS,
-    REPEATABILITY_COLUMNS,
-    VELOCITY_COLUMN,
-    make_dataset_card,
-    measure_repeatability,
-)
-from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
-from tcpipe.pipeline.dataset.redaction import (
-    make_redaction,
-    redact_card,
-    redact_content,
-    redact_inputs,
-)
+from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options
+from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
-from tcpipe.pipeline.dataset.splitting import read_exclusions
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
-from tcpipe.recipe import Recipe, TrainConfig
-from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
-from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
@@ -149,7 +115,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
-    measure, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
+    measure, ruling = start_stopwatch(), merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
     out, store, dry_run = options.out, options.store, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
     opened = open_store(store)
@@ -157,7 +123,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
     known, is_intact = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
-    marks = _read_options(options, ruling, place)
+    marks = read_build_options(options, ruling, place)
     inputs = choose_inputs(opened, marks, log.state)
     left_out = _find_left_out(inputs, known, marks, options.min_runs)
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
@@ -176,11 +142,13 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         expected = estimate(log.state.calls, BUILD, most, jobs=options.jobs)
         code = 3 if select_problems(inputs.findings) else 0
         return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
+    from tcpipe.pipeline.dataset.writing import write_dataset  # noqa: PLC0415  slow to import, and often nothing is to be built
+
     output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
     with commit_call(log, BUILD, [make_absolute(place)]) as call:
         with output as directory:
-            card = _build(directory, inputs, marks, options.jobs)
+            card = write_dataset(directory, inputs, marks, options.jobs)
             _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
         result = _make_result(place, "done", card, left_out)
         counts = {"runs": len(inputs.runs), "samples": card.samples}
@@ -191,26 +159,6 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         call.kind = "built"
         call.end = Entries(datasets=(dataset,), forgotten=replaced, calls=(measure(took),))
     return result
-
-
-def _read_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | str) -> BuildOptions:
-    """Return a user's choices for the dataset at ``place``."""
-    split, map_name, keep_split = options.split, options.map_name, options.keep_split
-    tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
-    return BuildOptions(
-        recipe=recipe,
-        robot=options.robot or recipe.robot,
-        tags=options.tags or {},
-        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
-        regions=None if split is None else read_regions(Path(split)),
-        region=None if split is None else Path(split).read_bytes().decode("utf-8", "replace"),
-        covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
-        exclusions=read_exclusions(options.exclude, options.reason),
-        file_format=options.file_format,
-        redact=options.redact,
-        earlier=None if keep_split is None else read_earlier_splits(keep_split),
-        keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
-    )
 
 
 build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
@@ -276,23 +224,6 @@ def _make_result(place: Path | str, status: str, card: DatasetCard, left_out: Se
     return BuildResult(str(place), status, findings, card, 3 if select_problems(findings) else 0)
 
 
-def _merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
-    """Return the recipe with the options ``--holdout`` and ``--seed`` in it."""
-    recipe = resolve_recipe(recipe)
-    kind, _, tag = (holdout or recipe.split.holdout).partition(":")
-    rules = replace(
-        recipe.split,
-        holdout=kind,  # type: ignore[arg-type]  # the recipe checks it
-        holdout_tag=recipe.split.holdout_tag if holdout is None else tag,
-        seed=recipe.split.seed if seed is None else seed,
-    )
-    if rules.holdout == "tag" and not rules.holdout_tag:
-        raise RecipeError(
-            'recipe: split.holdout is "tag"; expected split.holdout_tag too, for example "season" (--holdout tag:season)'
-        )
-    return replace(recipe, split=rules, train=TrainConfig())  # how models are trained is no part of a dataset
-
-
 def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     """Return the card of the dataset in a directory, if there is one, and whether it is intact; `DatasetError` for anything else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
@@ -325,63 +256,3 @@ def _name_remedy(place: Path | str) -> Iterator[None]:
     except DatasetError as error:
         left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
         raise DatasetError(*error.problems, left) from None
-
-
-def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> DatasetCard:
-    """Write the dataset into ``directory`` and return its card."""
-    waiting, recipe = directory / "spool", options.recipe
-    waiting.mkdir()
-    content = gather_content(waiting, inputs, options, jobs)
-    redaction = make_redaction(content, inputs, recipe) if options.redact else None
-    if redaction is not None:
-        content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
-    logger.info("writing %d samples", len(content.samples))
-    figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
-    ids, compression = figures.column("sample_id"), recipe.dataset.compression
-    shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
-    _write_overviews(directory, content.sources)
-    repeatability = measure_repeatability(
-        figures,
-        content.samples.centres_xy_m(),
-        velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
-        chord_m=recipe.segment.chord_m,
-    )
-    if content.excluded.num_rows and redaction is None:
-        write_csv(content.excluded, directory / EXCLUDED)
-    card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
-    card = card if redaction is None else redact_card(card, redaction)
-    shutil.rmtree(waiting)
-    write_text(directory / HUB_CARD, format_hub_card(card))
-    files = compute_checksums(directory)
-    write_text(directory / CROISSANT, format_croissant(card, content.samples.schema, files))
-    card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
-    write_sealed(directory / CARD, card)
-    write_text(directory / REPORT, seal_page(render_dataset_report(directory, samples=figures)))
-    return card
-
-
-def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
-    """Write the samples; return the columns that card and page are made from, mapped from another file."""
-    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS)))
-
-    def write_both() -> Iterator[pa.Table]:
-        for piece in samples.pieces():
-            write(piece)
-            few = piece.select(names).replace_schema_metadata(None)
-            del piece  # else it is in memory beside the next one
-            yield few
-            del few
-
-    with write_parquet_rows(path, samples.schema) as write:
-        write_pieces(mapped, pa.schema([samples.schema.field(name) for name in names]), write_both())
-    return map_table(mapped)
-
-
-def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
-    """Write the page's pictures of the maps: photograph (or relief), relief and classes, as far as the maps have them."""
-    write_overview(directory / OVERVIEW, draw_maps(sources))
-    layers = {layer for source in sources for layer in source.layers}
-    if "ortho" in layers:
-        write_overview(directory / RELIEF, draw_maps(sources, draw_relief))
-    if "terrain" in layers:
-        write_overview(directory / CLASSES, draw_maps(sources, draw_classes))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.cost.labels import pool_budgets
 from tcpipe.cost.physics import fit_and_validate_physics
-from tcpipe.cost.repeatability import Floor, compute_slope_residuals, estimate_repeatability, find_repeated_pairs
+from tcpipe.cost.repeatability import compute_slope_residuals, estimate_repeatability, find_repeated_pairs
 from tcpipe.formats.dataset_card import (
     DatasetCard,
     FlaggedSamples,
@@ -28,16 +28,16 @@ from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.maps.map_facts import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
+from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.audit import HeldOut
 from tcpipe.stages.label import make_fit_samples
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import PhysicsFit
+from tcpipe.tables.facts import Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, Verdict, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import LAYERS, Layer

@@ -22,22 +22,19 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
-from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_range
+from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
-from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples
+from tcpipe.formats.geojson import regions_to_json
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
 from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.pipeline.dataset.sampling import MapPlaces
-from tcpipe.pipeline.dataset.splitting import ExcludedIds, regions_to_json
 from tcpipe.pipeline.explain import flatten_recipe
-from tcpipe.recipe import Recipe
-from tcpipe.splits.regions import Regions
 from tcpipe.store import Store
 from tcpipe.tables.arrays import encode_rows, number_column
 from tcpipe.tables.columns import to_floats, to_integers
@@ -45,29 +42,7 @@ from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import TABLES_VERSION
 
 if TYPE_CHECKING:
-    from tcpipe.formats.covariates import CovariateTable
-
-
-@dataclass(frozen=True, slots=True)
-class BuildOptions:
-    """A user's choices for a dataset, read and checked; ``recipe`` includes holdout and seed of the call."""
-
-    recipe: Recipe
-    robot: str | None
-    tags: Mapping[str, str]
-    map_names: tuple[str, ...]
-    """In order of priority where maps overlap; none: the only one."""
-    region: str | None
-    """The file of the regions, as text."""
-    regions: Regions | None
-    covariates: tuple[CovariateTable, ...]
-    exclusions: tuple[ExcludedIds, ...]
-    file_format: FileFormat
-    redact: bool
-    earlier: pa.Table | None
-    """Samples of an earlier dataset, which keep their split."""
-    keeps_own_split: bool
-    """Whether that is the replaced dataset itself."""
+    from tcpipe.pipeline.dataset.sampling import MapPlaces
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,16 +151,6 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
             if name.startswith(start)
         }
     )
-
-
-def read_earlier_splits(dataset: str | Path) -> pa.Table:
-    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` for another path."""
-    directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
-    if read_card(directory).redaction is not None:
-        raise DatasetError(
-            f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"
-        )
-    return read_samples(directory, ["sample_id", "split", "fold"])
 
 
 def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:

@@ -20,8 +20,8 @@ from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
-from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.facts import HeldOut
 from tcpipe.tables.findings import Finding, Subject, read_catalogue
 
 PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs"

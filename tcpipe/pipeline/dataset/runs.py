@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import DatasetError, list_first
-from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import RunSource
-from tcpipe.formats.index_files import KnownSensor, RunFacts
+from tcpipe.formats.documents import State
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.run_documents import LogOrigin
-from tcpipe.formats.stored_runs import Ingestions, RunDirectory
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.recipe import Recipe
 from tcpipe.robots import GENERIC
 from tcpipe.store import Store
@@ -32,11 +31,9 @@ CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
 class SelectedRuns:
     """Runs of one robot and recipe, and findings on excluded ones."""
 
-    runs: tuple[RunDirectory, ...]
-    logs: Mapping[str, LogOrigin]
-    """By run, its log in run.json."""
+    runs: tuple[StoredRun, ...]
     missing: tuple[Finding, ...]
-    """On each matching run without a usable ingestion."""
+    """On each matching run that was ingested in another way."""
     damaged: tuple[Finding, ...]
     """On each run whose files were changed or lost."""
     findings: tuple[Finding, ...]
@@ -44,24 +41,21 @@ class SelectedRuns:
 
 
 def choose_runs(
-    store: Store, recipe: Recipe, *, state: State | None = None, robot: str | None, tags: Mapping[str, str]
+    store: Store, recipe: Recipe, *, state: State, robot: str | None, tags: Mapping[str, str]
 ) -> SelectedRuns:
     """Return the runs with all of the tags, each verified; two robots are pooled only on request."""
-    found, key = store.ingestions(state=state), ingest_key(recipe)
-    mine = [run for run in found.finished if run.facts.ingest_key == key]
+    found, key = store.runs(state), ingest_key(recipe)
+    mine = [run for run in found if run.facts.ingest_key == key]
     if not mine:
-        raise DatasetError(*_describe_no_runs(store, found))
-    for problem in found.state.problems:
-        if problem.key not in found.state.acknowledged:
-            logger.warning("%s: is missing or damaged, so that runs may be; see 'tcpipe status'", problem.log[0])
+        raise DatasetError(*_describe_no_runs(store, found, state))
     candidates = _select_one_robot(store, _select_tagged(store, mine, tags), robot)
     damaged = store.prove(candidates)
-    logs = {run.run_id: run.facts.log.source for run in candidates if run.facts.log and run.run_id not in damaged}
-    runs = [run for run in candidates if run.run_id in logs]
-    known = {run.run_id for run in mine}
-    for (run_id, recipe_id), line in found.damaged.items():
-        if run_id not in known and _is_selected(found.rows[run_id, recipe_id], robot, tags):
-            damaged.setdefault(run_id, line)
+    runs = [run for run in candidates if run.run_id not in damaged]
+    known, rows = {run.run_id for run in mine}, state.list_rows()
+    selected = [row for row in rows if row.run_id not in known and _is_selected(row, robot, tags)]
+    for row in selected:
+        if row.blob and not state.has_payload(row) and not row.superseded_by:
+            damaged.setdefault(row.run_id, f"the tables of run {row.run_id} are missing")
     if not runs:
         raise DatasetError(
             *(f"run {run_id}: excluded: {line}; ingest its log again with --force" for run_id, line in damaged.items())
@@ -69,37 +63,33 @@ def choose_runs(
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
     otherwise = {
-        run.run_id: {"what": "recipe", "has": run.recipe_id}
-        for run in found.finished
-        if _is_selected(run.facts, robot, tags)
+        row.run_id: {"what": "recipe", "has": row.recipe_id}
+        if row.data_model_version == DATA_MODEL_VERSION
+        else {"what": "data_model", "has": row.data_model_version}
+        for row in selected
+        if row.blob and not row.superseded_by and row.run_id not in damaged
     }
-    otherwise |= {
-        run_id: {"what": "data_model", "has": str(outdated.data_model_version)}
-        for run_id, outdated in found.outdated.items()
-        if _is_selected(outdated, robot, tags)
-    }
-    otherwise = {run_id: names for run_id, names in otherwise.items() if run_id not in {*known, *damaged}}
     nothing: dict[str, str] = {}
-    missing = tuple(_find_left_out(found, "run-ingested-otherwise", otherwise))
-    broken = tuple(_find_left_out(found, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
-    superseded = tuple(
-        make_finding("run-superseded", Subject("run", run_id), names={"by": by})
-        for run_id, by in found.superseded.items()
+    missing = tuple(_find_left_out(rows, "run-ingested-otherwise", otherwise))
+    broken = tuple(_find_left_out(rows, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
+    superseded = {row.run_id: row.superseded_by for row in rows if row.superseded_by and row.ingest_key == key}
+    findings = (
+        make_finding("run-superseded", Subject("run", run_id), names={"by": by}) for run_id, by in superseded.items()
     )
-    return SelectedRuns(tuple(runs), logs, missing, broken, superseded)
+    return SelectedRuns(tuple(runs), missing, broken, tuple(findings))
 
 
 def _find_left_out(
-    found: Ingestions, code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
+    rows: Iterable[RunFacts], code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
 ) -> Iterator[Finding]:
     """Yield a finding on each run of ``names``, with the command that ingests their logs again."""
-    command = f"tcpipe ingest {_suggest_logs(found, names)}{' --force' if force else ''}" if names else ""
+    command = f"tcpipe ingest {_suggest_logs(rows, names)}{' --force' if force else ''}" if names else ""
     for run_id in sorted(names):
         subject, remedy = Subject("run", run_id), Remedy("ingest", command=command)
         yield make_finding(code, subject, names=names[run_id], remedies=[remedy])
 
 
-def _select_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:
+def _select_one_robot(store: Store, runs: list[StoredRun], robot: str | None) -> list[StoredRun]:
     robots = sorted({run.facts.robot for run in runs})
     wanted = [run for run in runs if robot is None or run.facts.robot == robot]
     if not wanted:
@@ -109,9 +99,9 @@ def _select_one_robot(store: Store, runs: list[RunDirectory], robot: str | None)
     return wanted
 
 
-def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
+def _refuse_unlike(store: Store, runs: Iterable[StoredRun]) -> None:
     """Raise an error if runs of the generic robot have different sensors."""
-    groups = group_similar_runs({run.run_id: run.facts.log.sensors if run.facts.log else {} for run in runs})
+    groups = group_similar_runs({run.run_id: run.facts.sensors for run in runs})
     if len(groups) > 1:
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; expected one: tag each "
@@ -120,7 +110,7 @@ def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
         )
 
 
-def _select_tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
+def _select_tagged(store: Store, runs: list[StoredRun], tags: Mapping[str, str]) -> list[StoredRun]:
     """Return the runs with all of the tags; `DatasetError` lists all tags if no run has them."""
     chosen = [run for run in runs if tags.items() <= run.facts.tags.items()]
     if not chosen:
@@ -130,23 +120,23 @@ def _select_tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, st
     return chosen
 
 
-def _describe_no_runs(store: Store, found: Ingestions) -> list[str]:
+def _describe_no_runs(store: Store, found: Sequence[StoredRun], state: State) -> list[str]:
     """Return why no run of the store can be used."""
-    if not (found.finished or found.outdated or found.damaged):
+    rows = state.list_rows()
+    if not rows:
         return [f"{store.root}: no runs in the store; ingest one: tcpipe ingest LOG"]
-    head = ""
-    if found.finished:
+    if found:
         head = (
-            f"{len({run.run_id for run in found.finished})} runs in the store, none ingested with this recipe; ingest them with it "
+            f"{len({run.run_id for run in found})} runs in the store, none ingested with this recipe; ingest them with it "
             "(tcpipe ingest LOG --recipe FILE), or give the recipe they were ingested with (--recipe FILE)"
         )
-    elif found.outdated:
-        versions = ", ".join(sorted({str(head.data_model_version) for head in found.outdated.values()}))
-        head = (
-            f"{len(found.outdated)} runs in the store, all of data model {versions}, expected {DATA_MODEL_VERSION}; "
-            "ingest their logs again"
-        )
-    return [*([f"{store.root}: {head}"] if head else []), *dict.fromkeys(found.damaged.values())]
+        return [f"{store.root}: {head}"]
+    versions, lost = (
+        ", ".join(sorted({row.data_model_version for row in rows})),
+        sum(not state.has_payload(row) for row in rows),
+    )
+    why = f"data model {versions}, expected {DATA_MODEL_VERSION}; {lost} without tables"
+    return [f"{store.root}: {len(rows)} runs in the store, none that can be read ({why}); ingest their logs again"]
 
 
 def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
@@ -155,11 +145,10 @@ def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[s
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
 
 
-def _suggest_logs(found: Ingestions, run_ids: Iterable[str]) -> str:
+def _suggest_logs(rows: Iterable[RunFacts], run_ids: Iterable[str]) -> str:
     """Return an argument of `tcpipe ingest` for the logs of runs: their common folder, or LOG..."""
     names = set(run_ids)
-    logs = [row.log.source for row in found.rows.values() if row.log and row.run_id in names]
-    paths = [path for log in logs for path in log.paths]
+    paths = [path for row in rows if row.run_id in names for path in row.log.paths]
     with suppress(ValueError):  # no path, or some relative and some not
         folder = Path(os.path.commonpath(paths))
         if folder.is_absolute() and folder != Path(folder.anchor):
@@ -182,7 +171,7 @@ SensorsByRole = dict[str, tuple[str, str, str]]
 
 
 def group_similar_runs(
-    sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]],
+    sensors: Mapping[str, Mapping[str, Sensor]],
 ) -> list[tuple[list[str], SensorsByRole]]:
     """Return groups of runs whose sensors, by run and role, agree in type, frame and namespace, and the sensors of each group.
 
