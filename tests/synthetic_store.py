@@ -172,8 +172,10 @@ def add_run(
     includes=(),
     facts=None,
     streams=None,
+    state=None,
+    **values,
 ):
-    """Put a run with these segments, and this masked track, into the store, as ingestion would."""
+    """Put a run with these segments, and this masked track, into the store, as ingestion would; ``values`` of its record differ."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
@@ -207,7 +209,7 @@ def add_run(
         counts=Counts(table.num_rows),
         info=info,
     )
-    state = store.scan()
+    run, state = replace(run, **values), state or store.scan()
     with store.place.workshop() as directory:
         if streams:
             write_streams(directory, streams, key="k")
@@ -296,8 +298,9 @@ def _build_world(name, layers):
 
 def add_world(store, *, name="site", layers=("ortho", "terrain")):
     """Put the analytic map into the store."""
-    with store.new_map(store.scan(), name) as path:
+    with store.new_map(name) as (path, put):
         shutil.copytree(_build_world(name, layers), path)
+        put(store.scan())
 
 
 def open_world(directory: Path, **how) -> Store:
@@ -309,8 +312,9 @@ def open_world(directory: Path, **how) -> Store:
 
 def put_map(store, name, **how):
     """Put a map into the store, over one that is there, without a quick look."""
-    with store.new_map(store.scan(), name) as path:
+    with store.new_map(name) as (path, put):
         build_map(path, name=name, **{"agreed": PAPER_SCHEME, **how})
+        put(store.scan())
 
 
 def small_store(directory: Path) -> Store:
