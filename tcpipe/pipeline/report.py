@@ -94,8 +94,8 @@ def _report_dataset(path: Path | str, *, patches: bool) -> Page:
     card = read_intact_card(directory)
     folder, count = find_picture_folder(card)
     for name, data in iterate_pictures(directory, card) if patches else ():
-        place.put(f"{folder}/{name}", data, lasting=False)
-    shown = folder if card.samples and len(place.files(folder)) == count else ""
+        place.put(f"{folder}/{name}", data)
+    shown = folder if card.samples and len(place.list(folder)) == count else ""
     html = render_dataset_report(directory, None if is_url(path) else directory.absolute().parent, folder=shown)
     return _write(place, html, tuple(describe_physics(robot, fit) for robot, fit in card.physics.items()))
 

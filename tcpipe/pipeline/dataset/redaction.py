@@ -175,7 +175,8 @@ def redact_content(content: Content, redaction: Redaction) -> Content:
 def redact_inputs(inputs: Inputs, redaction: Redaction) -> Inputs:
     """Return inputs whose runs have public names, without names of logs."""
     runs = tuple(replace(run, run_id=redaction.runs[run.run_id], logs=(), tags=None) for run in inputs.sources)
-    return replace(inputs, sources=runs)
+    named = {redaction.runs[name]: replace(run, logs=(), tags={}) for name, run in inputs.made_from.runs.items()}
+    return replace(inputs, sources=runs, made_from=replace(inputs.made_from, runs=named))
 
 
 def redact_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -205,8 +206,9 @@ def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     runs = tuple(replace(run, findings=redact_findings(run.findings)) for run in card.runs)
     return replace(
         card,
-        recipe=bare,
-        run_tags=None,
+        made_from=replace(
+            card.made_from, recipe=bare, tags={}, maps={}, map_names=(), region=None, covariates={}, exclusions={}
+        ),
         split=replace(
             card.split,
             region=moved,
