@@ -60,7 +60,7 @@ class IngestOptions:
     shard: tuple[int, int] | None = option(
         None,
         Option(
-            "Be task I of N of an array job: ingest every N-th log.",
+            "Be task I of N of an array job: ingest its share of the logs, by their names.",
             (),
             "shard",
             "I/N",
