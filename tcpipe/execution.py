@@ -20,6 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, field
 from itertools import chain, islice
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext, SpawnProcess
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar, cast
 
@@ -71,6 +72,7 @@ def run_all(
     With ``cluster``, the address of a Dask scheduler, its workers do it instead of ``jobs`` processes. They see the same files under the
     same names. `UsageError`: there is no such scheduler, it has no workers, or one of them has several threads or another tcpipe.
     """
+    refuse_import_of_script(jobs)
     todo = enumerate(tasks)
     first = list(islice(todo, 1 + (jobs > 1)))
     if first and cluster is not None:
@@ -80,6 +82,36 @@ def run_all(
     else:
         for index, task in chain(first, todo):
             yield Outcome(index, function(task))
+
+
+_WORKER = "tcpipe worker"
+_UNGUARDED_EXIT = 78
+"""Exit code of a worker that ran the calls of its script again, EX_CONFIG of sysexits.h."""
+_UNGUARDED = (
+    "a script that uses several workers needs a main guard, because each worker imports the script: put its calls below "
+    "'if __name__ == \"__main__\":', or use jobs=1"
+)
+
+
+def refuse_import_of_script(jobs: int) -> None:
+    """Raise an error in a process that imports the script of its parent and so repeats the parent's call with several ``jobs``.
+
+    A worker of tcpipe ends without a word: its parent raises the `UsageError`.
+    """
+    process = multiprocessing.current_process()
+    if jobs > 1 and getattr(process, "_inheriting", False):  # as multiprocessing itself finds out
+        raise SystemExit(_UNGUARDED_EXIT) if process.name == _WORKER else UsageError(_UNGUARDED)
+
+
+class _WorkerContext(SpawnContext):
+    """Spawns workers that know by their name whose they are; `workers` are all of them."""
+
+    def __init__(self) -> None:
+        self.workers = list[SpawnProcess]()
+
+    def Process(self, **options: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802  a class there
+        self.workers.append(SpawnProcess(name=_WORKER, **options))
+        return self.workers[-1]
 
 
 def _run_in_pools(function: Callable[[T], R], todo: Iterator[tuple[int, T]], jobs: int) -> Iterator[Outcome[R]]:
@@ -119,7 +151,7 @@ def _run_alone(function: Callable[[T], R], task: T, index: int) -> Outcome[R]:
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Yield worker processes that say here what they log and live no longer than this process wants them to."""
-    context = multiprocessing.get_context("spawn")
+    context = _WorkerContext()
     heard, saying = context.Pipe(duplex=False)
     life, alive = context.Pipe(duplex=False)
     listener = threading.Thread(target=_repeat, args=(heard,), daemon=True)
@@ -138,6 +170,8 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
             end.close()
         listener.join()
         heard.close()
+    if any(worker.exitcode == _UNGUARDED_EXIT for worker in context.workers):
+        raise UsageError(_UNGUARDED)
 
 
 def _repeat(heard: Connection) -> None:

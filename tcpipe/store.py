@@ -1,4 +1,4 @@
-"""The store: where runs and maps lie, in a directory or a bucket, as documents and the payload that they name (ADR-28).
+"""The store: where runs and maps lie, in a directory or a bucket, as documents and the payload that they name (ADR-36).
 
 ::
 

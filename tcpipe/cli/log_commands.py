@@ -53,8 +53,8 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     """Read logs, fuse the sensors, mask unsteady driving, cut 1 m segments, and label them with power, velocity, time and energy.
 
     A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, a folder of these, or an s3:// URL. tcpipe skips logs that are in the
-    store (same content, same recipe) and logs that failed before with the same content. It prints a line when each log ends; for
-    several logs, findings follow by code.
+    store (same content, same recipe) and logs that failed before with the same content. It prints a line when each log ends (--quiet:
+    not for a log that is unchanged); for several logs, findings follow by code.
 
     Exit code 3: some logs failed, are damaged, or give no segments although the robot drove, and the problem is new: not reported
     before and not acknowledged (tcpipe acknowledge).
@@ -89,7 +89,8 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             if as_json:
                 print_json_line(convert_record(result, LogLine))
             else:
-                for line in _list_outcome(result, options.store, several=several, quiet=quiet):
+                is_silent = quiet and result.status == "unchanged" and not result.is_new_problem
+                for line in () if is_silent else _list_outcome(result, options.store, several=several):
                     shown.result(line)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
@@ -106,15 +107,12 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     return summary.exit_code
 
 
-def _list_outcome(result: IngestResult, store: Path | str, *, several: bool, quiet: bool) -> Iterator[str]:
-    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken.
-
-    With ``quiet`` an unchanged log without a new problem has no line.
-    """
-    from tcpipe.cost.labels import format_budget
+def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
+    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
     from tcpipe.formats.finding_lines import (
         describe_finding,
         describe_power,
+        format_budget,
         format_findings,
         format_verdict,
         list_verdict,
@@ -123,8 +121,6 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool, qui
 
     aside = " (acknowledged)" if result.acknowledged else ""
     is_new, run = result.status != "unchanged", result.run
-    if quiet and not (is_new or result.is_new_problem):
-        return
     budget = run.energy_budget if run and is_new else None
     problems = select_problems(result.findings)
     if run is None:

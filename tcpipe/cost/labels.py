@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tcpipe.power.noise import compute_median_period_s
 from tcpipe.power.rails import Rail, Samples, is_power_only
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.facts import EnergyBudget
+from tcpipe.tables.facts import CAUSES, EnergyBudget
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Floats = NDArray[np.float64]
@@ -158,10 +158,6 @@ def subtract_idle_power(
     return {name: np.where(known, value, np.nan) for name, value in values.items()}
 
 
-CAUSES = ("position", "rate", "current", "voltage")
-"""Displacement of both ends; the current between samples; noise and rounding of the current; those of the voltage."""
-
-
 def estimate_energy_budget(
     energy_joule: NDArray[np.float64], variance_j2: Mapping[str, NDArray[np.float64]]
 ) -> EnergyBudget | None:
@@ -202,20 +198,6 @@ def find_noise(budget: EnergyBudget | None, subject: Subject) -> tuple[Finding, 
         return ()
     numbers = {f"{name}_fraction": getattr(budget, name) for name in ("total", *CAUSES, "at_20_hz")}
     return (make_finding("energy-noise", subject, **numbers),)
-
-
-def format_budget(budget: EnergyBudget) -> str:
-    """Return the budget as a sentence: the floor, its causes from the largest, and the floor with power at 20 Hz if that is lower."""
-    names = {"position": "position", "rate": "power rate", "current": "current noise", "voltage": "voltage"}
-    shares = {cause: getattr(budget, cause) for cause in CAUSES}
-    causes = ", ".join(
-        f"{names[cause]} {100 * shares[cause]:.1f}" for cause in sorted(CAUSES, key=lambda c: -shares[c])
-    )
-    floor = f"Noise floor of E {100 * budget.total:.1f} % of a segment's mean {budget.mean_energy_joule:.0f} J"
-    text = f"{floor}: {causes} (they add in square)"
-    if budget.at_20_hz < 0.95 * budget.total:
-        text += f"; power at 20 Hz would leave {100 * budget.at_20_hz:.1f} %"
-    return text + "."
 
 
 MIN_INSTANTANEOUS_HZ = 10.0

@@ -8,12 +8,12 @@ Bootstrap*, 1993, chapter 11). The offset between two footprints makes the figur
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
+
+from tcpipe.tables.facts import Floor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -45,21 +45,6 @@ _BLOCK = 10.0
 """Side of a jackknife block, in chords."""
 _FEWEST_BLOCKS = 5
 _CONFIDENCE = 0.95
-
-
-@dataclass(frozen=True, slots=True)
-class Floor:
-    """How well a label repeats itself, in the label's unit: the standard deviation of one pass, with its 95 % interval."""
-
-    pairs: int
-    places: int
-    """Number of blocks of ground that contain the pairs."""
-    std: float
-    std_low: float | None
-    """None where there are too few places for an interval."""
-    std_high: float | None
-    share_of_variance: float
-    """Share of the label's variance; a model can explain at most the rest."""
 
 
 def find_repeated_pairs(

@@ -26,13 +26,13 @@ import google_crc32c
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import make_lasting_scratch
 from tcpipe.formats.cache import fetch_cached, is_cached
-
-LOG, State = "log", object
+from tcpipe.formats.file_checks import find_changed_files
 from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
-from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import Place, find_changed_files, open_place
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.place import Place, open_place
 
+LOG, State = "log", object
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
 _UNLISTED = ("report.html",)
@@ -81,7 +81,7 @@ class FetchedShards:
 
     def fetch_file(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
-        return self.place.local(self._name(path), self._checksum(path))
+        return self.place.fetch(self._name(path), self._checksum(path), proved=False)
 
     def is_complete(self) -> bool:
         """Return whether each file is there, and as large as it was."""
@@ -153,8 +153,7 @@ def find_newest(url: str, cards: Sequence[str]) -> FoundCard | None:
 
     The number of requests does not depend on the number of generations.
     """
-    place = open_place(url)
-    return _find_at(place, cards)
+    return _find_at(open_place(url), cards)
 
 
 def _find_at(place: Place, cards: Sequence[str]) -> FoundCard | None:
@@ -251,7 +250,7 @@ def _make_subdirectory(directory: Path, url: str) -> Path:
 def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
     """Link or copy the cached content of a file to where it is wanted."""
     to.parent.mkdir(parents=True, exist_ok=True)
-    held = place.proved(name, checksum)
+    held = place.fetch(name, checksum)
     with suppress(FileExistsError):
         try:
             os.link(held, to)

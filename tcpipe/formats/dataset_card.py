@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from tcpipe.cost.repeatability import Floor
+from tcpipe.formats.dataset_inputs import DatasetInputs
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
-from tcpipe.splits.audit import HeldOut
-from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit
+from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import LEFT_OUT, Finding, Verdict, judge_by_code
 from tcpipe.terrain.classes import TerrainClass
 
@@ -234,7 +233,9 @@ class DatasetCard:
     data_model_version: str
     tcpipe_version: str
     inputs: str
-    """Hash of everything the dataset is made from; the same inputs make the same dataset."""
+    """Digest of ``made_from``: the same inputs make the same dataset."""
+    made_from: DatasetInputs
+    """Of a redacted dataset, without what it omits."""
     name: str
     description: str
     licence: str = ""
@@ -247,9 +248,6 @@ class DatasetCard:
     terrain: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """Samples by split and terrain name."""
     label_statistics_of_train: Mapping[str, LabelStatistics] = field(default_factory=dict)
-    recipe: Recipe
-    format: str
-    """``zarr`` or ``parquet``."""
     patch_m: float
     patch_px: int
     layers: Mapping[str, Description]
@@ -266,8 +264,6 @@ class DatasetCard:
     repeatability: Mapping[str, Floor | None]
     """How well each label repeats itself; None where no place was driven twice."""
     runs: tuple[RunSource, ...]
-    run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
-    """The tags that a run had to carry; None in cards of redacted datasets."""
     maps: tuple[MapSource, ...]
     flagged_samples: FlaggedSamples
     """How many samples carry a quality flag."""
@@ -287,6 +283,16 @@ class DatasetCard:
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""
+
+    @property
+    def recipe(self) -> Recipe:
+        """The recipe that it was built with."""
+        return self.made_from.recipe
+
+    @property
+    def format(self) -> str:
+        """``zarr`` or ``parquet``."""
+        return self.made_from.file_format
 
     @property
     def findings_by_run(self) -> dict[str, tuple[Finding, ...]]:

@@ -6,7 +6,7 @@
     blobs/5f0c6a7be1d29c04/segments.parquet          payload in a folder with a random name; a document names the folder
     index.parquet                                    cache of what documents say, by name; it may be deleted
 
-Rules (ADR-28):
+Rules (ADR-36):
 
 1. Bytes whose sha256 does not begin with the digest in their name are no document: they are damaged, or half copied.
 2. For each kind and key the document with the highest number counts; of several with this number, the one with the smallest digest.

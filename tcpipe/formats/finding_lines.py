@@ -14,6 +14,7 @@ import numpy as np
 from tcpipe.motion.distance_breakdown import StoreLoss, make_loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.robots import KNOWN_ENERGY
+from tcpipe.tables.facts import CAUSES, EnergyBudget
 from tcpipe.tables.findings import (
     AFFECTED,
     GRADES,
@@ -357,3 +358,17 @@ def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]])
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines
+
+
+def format_budget(budget: EnergyBudget) -> str:
+    """Return the budget as a sentence: the floor, its causes from the largest, and the floor with power at 20 Hz if that is lower."""
+    names = {"position": "position", "rate": "power rate", "current": "current noise", "voltage": "voltage"}
+    shares = {cause: getattr(budget, cause) for cause in CAUSES}
+    causes = ", ".join(
+        f"{names[cause]} {100 * shares[cause]:.1f}" for cause in sorted(CAUSES, key=lambda c: -shares[c])
+    )
+    floor = f"Noise floor of E {100 * budget.total:.1f} % of a segment's mean {budget.mean_energy_joule:.0f} J"
+    text = f"{floor}: {causes} (they add in square)"
+    if budget.at_20_hz < 0.95 * budget.total:
+        text += f"; power at 20 Hz would leave {100 * budget.at_20_hz:.1f} %"
+    return text + "."

@@ -318,3 +318,13 @@ def make_line_feature(lonlat_deg: NDArray[np.float64], properties: P) -> LineFea
     """Return a line through points, shape (P, 2), as a feature of GeoJSON."""
     points = np.round(lonlat_deg, _DECIMALS).tolist()
     return LineFeature(properties, LineString(tuple((lon, lat) for lon, lat in points)))
+
+
+def regions_to_json(regions: Regions) -> dict[str, PolygonGeometry]:
+    """Return the regions as GeoJSON geometries by kind."""
+    kinds = {"train_test": regions.train_test, "unseen": regions.unseen, "exclude": regions.exclude}
+    return {
+        kind: PolygonGeometry(**shapely.geometry.mapping(area))
+        for kind, area in kinds.items()
+        if not shapely.is_empty(area)
+    }

@@ -10,13 +10,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import zarr
-from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 from tcpipe.errors import StoreError
+
+if TYPE_CHECKING:
+    import zarr
 
 Compression = Literal["zstd", "lz4"]
 """zstd is smaller, lz4 two to three times as fast to read."""
@@ -24,6 +25,8 @@ Compression = Literal["zstd", "lz4"]
 
 def create_group(path: Path, attributes: Mapping[str, Any] | None = None) -> zarr.Group:
     """Create an empty group at ``path``: inside an `atomic.atomic_directory`, so that it appears only when it is complete."""
+    import zarr  # noqa: PLC0415  slow to import, and only needed to write
+
     try:
         return zarr.create_group(str(path), attributes=dict(attributes or {}), overwrite=True)
     except OSError as error:
@@ -48,6 +51,8 @@ def add_array(
 
     ``chunks`` and ``shards`` are elements per chunk and per shard (a multiple of the chunks; None: one file a chunk).
     """
+    from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec  # noqa: PLC0415  slow to import, and only needed to write
+
     width = np.dtype(dtype).itemsize
     shuffle: Literal["bitshuffle", "noshuffle"] = "bitshuffle" if width > 1 else "noshuffle"
     codec = (
@@ -70,6 +75,8 @@ def add_array(
 
 def consolidate_metadata(group: zarr.Group) -> None:
     """Gather the descriptions of all arrays in the group's own, so that xarray opens it in one read and without a warning."""
+    import zarr  # noqa: PLC0415  slow to import, and only needed to write
+
     with warnings.catch_warnings():
         # zarr's own reservation
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
-from tcpipe.cost.repeatability import Floor
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
@@ -64,6 +63,7 @@ from tcpipe.learning.predictor import Prediction, find_kind
 from tcpipe.learning.training import Variant, compute_dataset_checksum, select_train, train
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.tables.facts import Floor
 from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding, read_threshold
 from tcpipe.terrain.classes import NODATA_ID
 

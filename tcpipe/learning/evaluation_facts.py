@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias
 
 from tcpipe.cost.coverage import Coverage
-from tcpipe.cost.repeatability import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import Training
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.facts import ABSENT
+from tcpipe.tables.facts import ABSENT, Floor
 from tcpipe.tables.findings import Finding, Verdict
 
 KIND = "tcpipe evaluation"

@@ -13,7 +13,7 @@ from typing import Literal
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
-from tcpipe.execution import run_all
+from tcpipe.execution import refuse_import_of_script, run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.object_storage import is_presigned, make_absolute
@@ -80,7 +80,9 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one log or path stands
     in its result.
     """
+    refuse_import_of_script(options.jobs)
     opened = open_store(options.store, create=not options.existing_store)
+    options = replace(options, logs=list(options.logs))
     given = tuple(make_absolute(path) for path in options.logs if not is_presigned(path))  # signed URLs are not stored
     definitions = options.message_definitions and str(Path(options.message_definitions).absolute())
     how = CallOptions(options.robot, options.as_one, definitions or None)

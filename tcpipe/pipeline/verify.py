@@ -15,11 +15,12 @@ from tcpipe.formats.commit_log import COMMIT, LOG, SNAPSHOT, make_snapshot_name,
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
+from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_row_count, read_table
-from tcpipe.formats.place import Place, find_wrong_files, open_place
+from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import (
     COPY_MARK,
@@ -153,7 +154,7 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     if is_bucket(path):
         yield from (line for line in _verify_log(open_place(path)) if isinstance(line, str))
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
-        yield from _verify_counts(place.proved(SAMPLES, checksums[SAMPLES]), card, where)
+        yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 
 
 def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[CheckResult]:
@@ -358,7 +359,7 @@ def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Ch
     yield from _repair_by(repair, wrong)
     yield "files", len(manifest.checksums)
     for name, checksum in manifest.checksums.items() if not wrong else ():
-        table, rows = PurePosixPath(name).stem, read_row_count(place.local(name, checksum))
+        table, rows = PurePosixPath(name).stem, read_row_count(place.fetch(name, checksum, proved=False))
         yield "rows", rows
         if (count := getattr(manifest.counts, _COUNTS[table])) not in (None, rows):
             yield f"{where}: {_COUNTS[table]} is {count}, but {table}.parquet has {rows} rows"

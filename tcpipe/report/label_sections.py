@@ -8,14 +8,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import format_budget
-from tcpipe.cost.repeatability import Floor
-from tcpipe.formats.finding_lines import advise_on_loss
+from tcpipe.formats.finding_lines import advise_on_loss, format_budget
 from tcpipe.motion.distance_breakdown import find_largest_losses
 from tcpipe.report.page import Section
 from tcpipe.report.plots import draw_waterfall
 from tcpipe.tables.bits import Quality, flag_name
-from tcpipe.tables.facts import EnergyBudget, PhysicsFit, PhysicsTerm
+from tcpipe.tables.facts import EnergyBudget, Floor, PhysicsFit, PhysicsTerm
 
 LABELS = {
     "power": ("power_watt", "power_std_watt", 1),

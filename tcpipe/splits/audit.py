@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from tcpipe.tables.facts import HeldOut
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.signedinteger]
@@ -30,28 +31,6 @@ PLACES = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 """Columns of a chord's ends."""
 
 _M_A_DEG = 111_195.0  # of a great circle: to half a per cent
-
-
-@dataclass(frozen=True, slots=True)
-class HeldOut:
-    """One held-out split against train; counts are of samples or of pairs of samples."""
-
-    split: str
-    """``test`` or ``unseen``."""
-    samples: int
-    """Samples in it."""
-    overlapping_samples: int
-    """Those whose footprint shares ground with a train footprint."""
-    overlapping_pairs: int
-    """Pairs of footprints, one held out and one in train, that share ground."""
-    same_track_pairs: int
-    """Pairs that follow one another on one track, one held out and one in train."""
-    repeated_place_samples: int
-    """Those that share ground with a train footprint of another run."""
-    nearest_train_min_m: float | None
-    """Distance between the nearest footprints of the two splits [m]; None where one is empty."""
-    nearest_train_median_m: float | None
-    """Median over the held-out samples of the distance to the nearest train footprint [m]."""
 
 
 def audit_leakage(

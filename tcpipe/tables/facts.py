@@ -299,6 +299,10 @@ class RailFacts:
     current: SignalFacts
 
 
+CAUSES = ("position", "rate", "current", "voltage")
+"""Displacement of both ends; the current between samples; noise and rounding of the current; those of the voltage."""
+
+
 @dataclass(frozen=True, slots=True)
 class EnergyBudget:
     """The noise floor of E over some segments: shares of the mean energy, root mean square over the segments [1]."""
@@ -319,6 +323,43 @@ class EnergyBudget:
     """The error that all segments of a run share, which is not part of the total."""
     delay: float | None = field(default=None, metadata=LEFT_OUT)
     """The error by the delay of power against motion, which is not part of the total."""
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """How well a label repeats itself, in the label's unit: the standard deviation of one pass, with its 95 % interval."""
+
+    pairs: int
+    places: int
+    """Number of blocks of ground that contain the pairs."""
+    std: float
+    std_low: float | None
+    """None where there are too few places for an interval."""
+    std_high: float | None
+    share_of_variance: float
+    """Share of the label's variance; a model can explain at most the rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """One held-out split against train; counts are of samples or of pairs of samples."""
+
+    split: str
+    """``test`` or ``unseen``."""
+    samples: int
+    """Samples in it."""
+    overlapping_samples: int
+    """Those whose footprint shares ground with a train footprint."""
+    overlapping_pairs: int
+    """Pairs of footprints, one held out and one in train, that share ground."""
+    same_track_pairs: int
+    """Pairs that follow one another on one track, one held out and one in train."""
+    repeated_place_samples: int
+    """Those that share ground with a train footprint of another run."""
+    nearest_train_min_m: float | None
+    """Distance between the nearest footprints of the two splits [m]; None where one is empty."""
+    nearest_train_median_m: float | None
+    """Median over the held-out samples of the distance to the nearest train footprint [m]."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -247,6 +247,13 @@ def test_json_is_an_object_a_log_and_one_of_all_and_quiet_says_only_what_is_news
         assert [line.startswith(f"tcpipe: {junk}: not a log") for line in lines] == [True] * (code == 3)
 
 
+def test_quiet_prints_no_line_for_an_unchanged_log(log: Path, store: Path, tmp_path: Path) -> None:
+    shutil.copytree(store, tmp_path / "tcpipe-store")
+    assert "unchanged " in _run("ingest", log, cwd=tmp_path)
+    lines = _run("ingest", log, "--quiet", cwd=tmp_path).splitlines()
+    assert [line.split(":")[0] for line in lines] == ["recipe", "nothing to do"]
+
+
 def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path) -> None:
     """Standard error closed, or a pipe that nobody reads: the work is done all the same."""
     for number, redirection in enumerate(("2>&-", "2>&1 | head -c1")):

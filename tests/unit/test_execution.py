@@ -95,3 +95,17 @@ def test_workers_end_with_their_parent(tmp_path: Path, number: signal.Signals) -
         parent.communicate(timeout=20)
     assert parent.returncode != 0
     _wait_for(lambda: all(_gone(worker) for worker in workers))
+
+
+def test_a_script_without_a_main_guard_is_told_in_one_line(tmp_path: Path) -> None:
+    """Each worker imports the script, which would begin workers of its own."""
+    script, store = tmp_path / "script.py", tmp_path / "store"
+    script.write_text(f"import tcpipe\ntcpipe.ingest([{str(tmp_path)!r}], store={str(store)!r}, jobs=2)\n")
+    for name in "ab":
+        (tmp_path / f"{name}.mcap").write_bytes(name.encode())
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    said = done.stdout + done.stderr
+    assert said.count("Traceback") == 1
+    assert "main guard" in done.stderr.splitlines()[-1]
+    assert done.stderr.splitlines()[-1].startswith("tcpipe.errors.UsageError")

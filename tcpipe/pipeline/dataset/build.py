@@ -4,80 +4,39 @@ from __future__ import annotations
 
 import logging
 import shlex
-import shutil
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Collection, Container, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-import pyarrow as pa
-from pyarrow.csv import write_csv
-
-from tcpipe import __version__
-from tcpipe.cost.labels import format_budget
-from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, clean_lines, list_first
-from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
+from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
+from tcpipe.execution import refuse_import_of_script
+from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
-from tcpipe.formats.commits import CallRecord, Dataset, Entries
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
-    CLASSES,
     CROISSANT,
-    EXCLUDED,
-    HUB_CARD,
-    OVERVIEW,
-    RELIEF,
     REPORT,
-    SAMPLES,
     parse_card,
     read_card,
     read_intact_card,
 )
-from tcpipe.formats.finding_lines import format_mixed_groups, list_verdict
-from tcpipe.formats.geojson import read_regions
-from tcpipe.formats.hub_card import format_croissant, format_hub_card
-from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
-from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.documents import State, make_key
+from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
 from tcpipe.formats.object_storage import is_url, make_absolute
-from tcpipe.formats.parquet import map_table, return_freed_memory, write_parquet_rows, write_pieces
+from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.place import open_place
-from tcpipe.formats.recipe_toml import resolve_recipe
+from tcpipe.formats.store_records import Output
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.calls import (
-    BUILD,
-    Estimate,
-    LogWriter,
-    commit_call,
-    estimate,
-    open_log,
-    start_stopwatch,
-)
-from tcpipe.pipeline.dataset.card import (
-    CARD_COLUMNS,
-    PHYSICS_COLUMNS,
-    REPEATABILITY_COLUMNS,
-    VELOCITY_COLUMN,
-    make_dataset_card,
-    measure_repeatability,
-)
-from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
-from tcpipe.pipeline.dataset.redaction import (
-    make_redaction,
-    redact_card,
-    redact_content,
-    redact_inputs,
-)
+from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
+from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, prove_maps
+from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
-from tcpipe.pipeline.dataset.splitting import read_exclusions
-from tcpipe.pipeline.generations import read_generations, write_generation
+from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
-from tcpipe.recipe import Recipe, TrainConfig
-from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
-from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.store import open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
 from tcpipe.tables.options import as_function
 
@@ -145,72 +104,127 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
     Findings on damaged runs (which are excluded), runs to be ingested again, runs that only the replaced dataset has, and empty splits make
-    the exit code 3. The bytes do not depend on ``jobs``.
+    the exit code 3, unless the call before has reported them. The bytes do not depend on ``jobs``.
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
-    measure, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
-    out, store, dry_run = options.out, options.store, options.dry_run
+    refuse_import_of_script(options.jobs)
+    out = options.out
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
-    opened = open_store(store)
-    log = open_log(opened)
-    if isinstance(place, Path) and not dry_run:
-        clear_beside(place)
+    opened = open_store(options.store)
+    if options.dry_run:
+        return _plan(opened.scan(), opened, options, place)
+    where = make_absolute(place)
+    with record_call(opened, BUILD, [where], jobs=options.jobs) as call:
+        before = call.state.outputs.get(where) or Output(where=where)
+        now = replace(before, options=_describe_options(options), at=call.call.begin)
+        try:
+            result, inputs = _build(call, options, place, reported=before.reported)
+        except TcpipeError as error:
+            message = "\n".join(error.problems)
+            _record_output(call, replace(now, exit_code=error.exit_code, message=message), before)
+            raise
+        runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
+        reported = tuple(sorted(map(_name_finding, select_problems(result.findings))))
+        made = replace(now, inputs=inputs.digest, runs=runs, exit_code=result.exit_code, message="", reported=reported)
+        _record_output(call, made, before)
+    return result
+
+
+def _plan(state: State, store: Store, options: BuildDatasetOptions, place: Path | str) -> BuildResult:
+    """Return what a call would do."""
+    job = _read_job(state, store, options, place)
+    if job.is_made and job.known is not None:
+        return _make_result(place, "unchanged", job.known, job.left_out, ())
+    most = sum(run.facts.segments - int(job.inputs.again[run.run_id].sum()) for run in job.inputs.runs)
+    expected = estimate(list_ended_calls(state), BUILD, most, jobs=options.jobs)
+    code = 3 if select_problems(job.inputs.findings) else 0
+    return BuildResult(str(place), "planned", job.inputs.findings, exit_code=code, estimate=expected)
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What a call has to do."""
+
+    marks: BuildOptions
+    inputs: Inputs
+    left_out: tuple[Finding, ...]
+    """On excluded runs."""
+    known: DatasetCard | None
+    """The card of the dataset that lies there."""
+    is_made: bool
+    """Whether that is what would be made now."""
+
+
+def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: Path | str) -> _Job:
     known, is_intact = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
-    marks = _read_options(options, ruling, place)
-    inputs = choose_inputs(opened, marks, log.state)
+    marks = read_build_options(options, merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed), place)
+    inputs = choose_inputs(store, marks, state)
     left_out = _find_left_out(inputs, known, marks, options.min_runs)
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
-    if is_intact and known is not None and known.inputs == inputs.digest:
-        result = _make_result(place, "unchanged", known, left_out)
-        _commit_references(log, _describe_dataset(result, inputs))
-        return result
+    is_made = is_intact and known is not None and known.inputs == inputs.digest
     others = [] if known is None or known.inputs == inputs.digest else find_other_options(known, marks, inputs)
     if others and not options.force:
         what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
         raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
-    if dry_run:
-        if isinstance(place, str):
-            read_generations(open_place(place), CARD)
-        most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
-        expected = estimate(log.state.calls, BUILD, most, jobs=options.jobs)
-        code = 3 if select_problems(inputs.findings) else 0
-        return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
+    return _Job(marks, inputs, left_out, known, is_made)
+
+
+def _build(
+    call: RunningCall, options: BuildDatasetOptions, place: Path | str, *, reported: Collection[str]
+) -> tuple[BuildResult, Inputs]:
+    """Write the dataset, unless it is there; return the result and its inputs. ``reported`` are findings that are known."""
+    if isinstance(place, Path):
+        clear_beside(place)
+    job = _read_job(call.state, call.store, options, place)
+    if job.is_made and job.known is not None:
+        result = _make_result(place, "unchanged", job.known, job.left_out, reported)
+        call.result |= {"exit_code": result.exit_code, "counts": {"unchanged": 1}}
+        return result, job.inputs
+    prove_maps(call.store, job.inputs.map_records)
+    from tcpipe.pipeline.dataset.writing import write_dataset  # noqa: PLC0415  slow to import, and often nothing is to be built
+
     output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
-    with commit_call(log, BUILD, [make_absolute(place)]) as call:
-        with output as directory:
-            card = _build(directory, inputs, marks, options.jobs)
-            _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
-        result = _make_result(place, "done", card, left_out)
-        counts = {"runs": len(inputs.runs), "samples": card.samples}
-        written = sum(checksum.size_bytes for checksum in card.checksums.values())
-        took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
-        dataset = _describe_dataset(result, inputs)
-        replaced = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
-        call.kind = "built"
-        call.end = Entries(datasets=(dataset,), forgotten=replaced, calls=(measure(took),))
-    return result
+    with output as directory:
+        card = write_dataset(directory, job.inputs, job.marks, options.jobs)
+        _refuse_others_since(place, {job.known.inputs if job.known else None, job.inputs.digest})
+    result = _make_result(place, "done", card, job.left_out, reported)
+    call.result |= {
+        "exit_code": result.exit_code,
+        "counts": {"runs": len(job.inputs.runs), "samples": card.samples},
+        "written_bytes": sum(checksum.size_bytes for checksum in card.checksums.values()),
+    }
+    return result, job.inputs
 
 
-def _read_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | str) -> BuildOptions:
-    """Return a user's choices for the dataset at ``place``."""
-    split, map_name, keep_split = options.split, options.map_name, options.keep_split
-    tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
-    return BuildOptions(
-        recipe=recipe,
-        robot=options.robot or recipe.robot,
-        tags=options.tags or {},
-        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
-        regions=None if split is None else read_regions(Path(split)),
-        region=None if split is None else Path(split).read_bytes().decode("utf-8", "replace"),
-        covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
-        exclusions=read_exclusions(options.exclude, options.reason),
-        file_format=options.file_format,
-        redact=options.redact,
-        earlier=None if keep_split is None else read_earlier_splits(keep_split),
-        keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
-    )
+def _describe_options(options: BuildDatasetOptions) -> dict[str, object]:
+    """Return the options of a call as JSON values, files as absolute paths, so that `tcpipe status` can plan it again."""
+    found = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name not in _NOT_RECORDED}
+    for name in ("split", "keep_split"):
+        found[name] = found[name] and make_absolute(found[name])
+    for name in ("covariates", "exclude"):
+        given = [found[name]] if isinstance(found[name], str | Path) else found[name]
+        found[name] = [make_absolute(path) for path in given]
+    return {name: value for name, value in found.items() if value not in (None, (), [], {}, False)}
+
+
+_NOT_RECORDED = ("out", "store", "recipe", "jobs", "dry_run", "force")
+"""Options of a call that do not decide what the dataset is made of, or, as the recipe, are found again as all commands find it."""
+
+
+def _record_output(call: RunningCall, output: Output, before: Output) -> None:
+    """Write what an output is made of and how the last call for it ended; nothing if that is known."""
+    if replace(output, at="") == replace(before, at=""):
+        return
+    try:
+        call.store.put(call.state, "outputs", make_key(output.where), output)
+    except StoreError as error:
+        logger.warning("%s; so 'tcpipe status' and 'tcpipe prune' do not know this dataset", error.problems[0])
+
+
+def _name_finding(finding: Finding) -> str:
+    return f"{finding.code} {finding.subject.kind} {finding.subject.name}"
 
 
 build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
@@ -228,19 +242,6 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         raise StoreError(
             f"{place}: another call has built a dataset here meanwhile and it is kept; run the command again"
         )
-
-
-def _describe_dataset(result: BuildResult, inputs: Inputs) -> Dataset:
-    return Dataset(make_absolute(result.path), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
-
-
-def _commit_references(log: LogWriter, dataset: Dataset) -> None:
-    """Commit the runs of an earlier dataset unless the log has them: ``tcpipe prune`` keeps what a dataset refers to."""
-    if log.state.datasets.get((dataset.out, dataset.inputs)) != dataset:
-        try:
-            log.commit("built", Entries(datasets=(dataset,)))
-        except StoreError as error:
-            logger.warning("%s; so 'tcpipe prune' does not know the runs of this dataset", error.problems[0])
 
 
 def _find_left_out(
@@ -270,27 +271,13 @@ def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     return card, fetched is not None and fetched.is_complete()
 
 
-def _make_result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
-    """Return the result, with today's findings on excluded runs in place of the card's."""
+def _make_result(
+    place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding], reported: Collection[str]
+) -> BuildResult:
+    """Return the result, with today's findings on excluded runs in place of the card's; those ``reported`` before are no news."""
     findings = (*left_out, *(finding for finding in card.findings if finding.code not in CHOICE_CODES))
-    return BuildResult(str(place), status, findings, card, 3 if select_problems(findings) else 0)
-
-
-def _merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
-    """Return the recipe with the options ``--holdout`` and ``--seed`` in it."""
-    recipe = resolve_recipe(recipe)
-    kind, _, tag = (holdout or recipe.split.holdout).partition(":")
-    rules = replace(
-        recipe.split,
-        holdout=kind,  # type: ignore[arg-type]  # the recipe checks it
-        holdout_tag=recipe.split.holdout_tag if holdout is None else tag,
-        seed=recipe.split.seed if seed is None else seed,
-    )
-    if rules.holdout == "tag" and not rules.holdout_tag:
-        raise RecipeError(
-            'recipe: split.holdout is "tag"; expected split.holdout_tag too, for example "season" (--holdout tag:season)'
-        )
-    return replace(recipe, split=rules, train=TrainConfig())  # how models are trained is no part of a dataset
+    is_news = any(_name_finding(finding) not in reported for finding in select_problems(findings))
+    return BuildResult(str(place), status, findings, card, 3 if is_news else 0)
 
 
 def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
@@ -325,63 +312,3 @@ def _name_remedy(place: Path | str) -> Iterator[None]:
     except DatasetError as error:
         left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
         raise DatasetError(*error.problems, left) from None
-
-
-def _build(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> DatasetCard:
-    """Write the dataset into ``directory`` and return its card."""
-    waiting, recipe = directory / "spool", options.recipe
-    waiting.mkdir()
-    content = gather_content(waiting, inputs, options, jobs)
-    redaction = make_redaction(content, inputs, recipe) if options.redact else None
-    if redaction is not None:
-        content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
-    logger.info("writing %d samples", len(content.samples))
-    figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
-    ids, compression = figures.column("sample_id"), recipe.dataset.compression
-    shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
-    _write_overviews(directory, content.sources)
-    repeatability = measure_repeatability(
-        figures,
-        content.samples.centres_xy_m(),
-        velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
-        chord_m=recipe.segment.chord_m,
-    )
-    if content.excluded.num_rows and redaction is None:
-        write_csv(content.excluded, directory / EXCLUDED)
-    card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
-    card = card if redaction is None else redact_card(card, redaction)
-    shutil.rmtree(waiting)
-    write_text(directory / HUB_CARD, format_hub_card(card))
-    files = compute_checksums(directory)
-    write_text(directory / CROISSANT, format_croissant(card, content.samples.schema, files))
-    card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
-    write_sealed(directory / CARD, card)
-    write_text(directory / REPORT, seal_page(render_dataset_report(directory, samples=figures)))
-    return card
-
-
-def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
-    """Write the samples; return the columns that card and page are made from, mapped from another file."""
-    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS)))
-
-    def write_both() -> Iterator[pa.Table]:
-        for piece in samples.pieces():
-            write(piece)
-            few = piece.select(names).replace_schema_metadata(None)
-            del piece  # else it is in memory beside the next one
-            yield few
-            del few
-
-    with write_parquet_rows(path, samples.schema) as write:
-        write_pieces(mapped, pa.schema([samples.schema.field(name) for name in names]), write_both())
-    return map_table(mapped)
-
-
-def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
-    """Write the page's pictures of the maps: photograph (or relief), relief and classes, as far as the maps have them."""
-    write_overview(directory / OVERVIEW, draw_maps(sources))
-    layers = {layer for source in sources for layer in source.layers}
-    if "ortho" in layers:
-        write_overview(directory / RELIEF, draw_maps(sources, draw_relief))
-    if "terrain" in layers:
-        write_overview(directory / CLASSES, draw_maps(sources, draw_classes))

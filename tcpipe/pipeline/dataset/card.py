@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.cost.labels import pool_budgets
 from tcpipe.cost.physics import fit_and_validate_physics
-from tcpipe.cost.repeatability import Floor, compute_slope_residuals, estimate_repeatability, find_repeated_pairs
+from tcpipe.cost.repeatability import compute_slope_residuals, estimate_repeatability, find_repeated_pairs
 from tcpipe.formats.dataset_card import (
     DatasetCard,
     FlaggedSamples,
@@ -28,16 +28,16 @@ from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.maps.map_facts import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
+from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.audit import HeldOut
 from tcpipe.stages.label import make_fit_samples
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import PhysicsFit
+from tcpipe.tables.facts import Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, Verdict, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import LAYERS, Layer
@@ -89,6 +89,7 @@ def make_dataset_card(
         data_model_version=DATA_MODEL_VERSION,
         tcpipe_version=__version__,
         inputs=inputs.digest,
+        made_from=inputs.made_from,
         name=about.name,
         description=about.description,
         licence=about.licence,
@@ -100,8 +101,6 @@ def make_dataset_card(
         terrain=_count_terrain(samples) if has_terrain else {},
         label_statistics_of_train=_compute_statistics(samples),
         flagged_samples=count_flagged(samples.column("quality")),
-        recipe=recipe,
-        format=options.file_format,
         patch_m=recipe.sample.patch_m,
         patch_px=recipe.sample.patch_px,
         layers={name: describe_layer(layer) for name, layer in layers.items()},
@@ -120,8 +119,7 @@ def make_dataset_card(
         removal=content.removal,
         repeatability=repeatability,
         runs=runs,
-        run_tags=options.tags,
-        maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
+        maps=tuple(map(_map_source, content.sources, inputs.made_from.maps.values(), content.registrations)),
         physics=fit_physics_by_robot(samples.filter(pc.equal(samples.column("split"), "train"))),
         covariates=content.covariates,
         exclusions=content.exclusions,

@@ -52,8 +52,9 @@ from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
+from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_removed_by_ground, register_runs
+from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
@@ -400,20 +401,6 @@ TAG = "tag_"
 """Prefix of a tag's column."""
 
 _NUMBER = re.compile(r"[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d{1,3})?")
-
-
-def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple[CovariateTable, ...]:
-    """Return the tables of the files; `DatasetError` where one cannot be used or two have one name."""
-    if not paths:
-        return ()
-    from tcpipe.formats.covariates import read_covariates  # noqa: PLC0415  polars only where a table is given
-
-    names = [path.stem for path in paths]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise DatasetError(
-            f"--covariates: {twice[0]} is given twice; columns are named after the file: give each its own name"
-        )
-    return tuple(read_covariates(path, time_column=config.time_column, time_unit=config.time_unit) for path in paths)
 
 
 def make_added_columns(

@@ -20,8 +20,8 @@ from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
-from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.facts import HeldOut
 from tcpipe.tables.findings import Finding, Subject, read_catalogue
 
 PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs"
@@ -175,7 +175,8 @@ def redact_content(content: Content, redaction: Redaction) -> Content:
 def redact_inputs(inputs: Inputs, redaction: Redaction) -> Inputs:
     """Return inputs whose runs have public names, without names of logs."""
     runs = tuple(replace(run, run_id=redaction.runs[run.run_id], logs=(), tags=None) for run in inputs.sources)
-    return replace(inputs, sources=runs)
+    named = {redaction.runs[name]: replace(run, logs=(), tags={}) for name, run in inputs.made_from.runs.items()}
+    return replace(inputs, sources=runs, made_from=replace(inputs.made_from, runs=named))
 
 
 def redact_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -205,8 +206,9 @@ def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     runs = tuple(replace(run, findings=redact_findings(run.findings)) for run in card.runs)
     return replace(
         card,
-        recipe=bare,
-        run_tags=None,
+        made_from=replace(
+            card.made_from, recipe=bare, tags={}, maps={}, map_names=(), region=None, covariates={}, exclusions={}
+        ),
         split=replace(
             card.split,
             region=moved,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -14,12 +13,12 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from tcpipe.errors import DatasetError, UsageError
+from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Exclusion, KeptSplit, SplitResult
-from tcpipe.formats.dataset_files import EXCLUDED_IDS, IS_EXCLUDED, read_sample_ids
-from tcpipe.formats.geojson import PolygonGeometry
-from tcpipe.formats.integrity import Checksum, compute_checksum
+from tcpipe.formats.dataset_files import EXCLUDED_IDS, IS_EXCLUDED
+from tcpipe.formats.geojson import regions_to_json
 from tcpipe.formats.parquet import take_rows
+from tcpipe.pipeline.dataset.options import ExcludedIds
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, SPLITS, Assignment, assign_splits, hash_ranks
@@ -35,33 +34,6 @@ _ROWS = 1 << 16
 """Rows whose ids are in memory together."""
 _MARGIN_DEG = 0.05
 """Regions are cut this far around the samples (3 km or more below 60° latitude)."""
-
-
-@dataclass(frozen=True, slots=True)
-class ExcludedIds:
-    """A list of samples that a user excludes: the file's name and checksum, why, and the ids."""
-
-    name: str
-    checksum: Checksum
-    reason: str
-    ids: tuple[str, ...]
-
-
-def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Sequence[str]) -> tuple[ExcludedIds, ...]:
-    """Return the lists of samples to exclude; `UsageError` unless each has a reason, `DatasetError` if one cannot be read."""
-    paths = [Path(path) for path in ([files] if isinstance(files, str | Path) else files)]
-    texts = [text.strip() for text in ([reasons] if isinstance(reasons, str) else reasons)]
-    if len(texts) != len(paths) or not all(texts):
-        raise UsageError(
-            f"--exclude: {len(paths)} lists of samples and {len([text for text in texts if text])} reasons; "
-            "give each list its --reason TEXT, in the same order"
-        )
-    if len({path.name for path in paths}) < len(paths):
-        raise UsageError("--exclude: two lists have one name, by which the dataset names them; rename one")
-    return tuple(
-        ExcludedIds(path.name, compute_checksum(path), text, tuple(read_sample_ids(path)))
-        for path, text in zip(paths, texts, strict=True)
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,16 +160,6 @@ def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignm
     split[known] = earlier.column("split").to_numpy().astype(np.str_)[rows]
     fold[known] = earlier.column("fold").fill_null(NO_FOLD).to_numpy()[rows]
     return Assignment.from_names(split, fold)
-
-
-def regions_to_json(regions: Regions) -> dict[str, PolygonGeometry]:
-    """Return the regions as GeoJSON geometries by kind."""
-    kinds = {"train_test": regions.train_test, "unseen": regions.unseen, "exclude": regions.exclude}
-    return {
-        kind: PolygonGeometry(**shapely.geometry.mapping(area))
-        for kind, area in kinds.items()
-        if not shapely.is_empty(area)
-    }
 
 
 def _project_regions(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from tcpipe.cost.labels import (
-    CAUSES,
     compute_labels,
     estimate_energy_budget,
     find_noise,
-    format_budget,
     has_low_power_rate,
     pool_budgets,
     subtract_idle_power,
     touches_voltage_outside,
 )
+from tcpipe.formats.finding_lines import format_budget
 from tcpipe.power.rails import make_rail, make_samples
+from tcpipe.tables.facts import CAUSES
 from tcpipe.tables.findings import Subject
 
 EXACT = {"chord_m": 1.0, "displacement_std_m": 0.01, "energy_noise_joule": 0.0}

@@ -129,7 +129,7 @@ def test_a_card_that_counts_otherwise_is_found(copy, key, value):
     assert verify(directory).problems == (told,)
 
 
-@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "distance_by_reason_m", "layers", "format"])
+@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "distance_by_reason_m", "layers", "made_from"])
 def test_a_card_that_lacks_something_is_one_problem_and_no_traceback(copy, key):
     directory = copy("parquet")
     card = json.loads((directory / "dataset.json").read_text())

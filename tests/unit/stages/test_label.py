@@ -9,7 +9,8 @@ import pytest
 from made_tracks import make_track, power_streams, stamps, straight_track, with_columns
 from simulated_streams import log_of, streams_of
 
-from tcpipe.cost.labels import CAUSES, SensorError, format_budget
+from tcpipe.cost.labels import SensorError
+from tcpipe.formats.finding_lines import format_budget
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.power.rails import IdlePower, integrate_energy
 from tcpipe.recipe import LabelConfig, MaskConfig, Recipe, SegmentConfig
@@ -24,7 +25,7 @@ from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import PowerSensorFacts
+from tcpipe.tables.facts import CAUSES, PowerSensorFacts
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Sensor, Streams
 

@@ -17,7 +17,7 @@ import tcpipe
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket_directories import GENERATIONS
 from tcpipe.formats.place import open_place
-from tcpipe.pipeline.dataset import build as building
+from tcpipe.pipeline.dataset import writing
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
@@ -119,14 +119,14 @@ def test_what_0_8_or_a_copy_put_there_is_read_and_the_next_build_is_beside_it(ma
 
 
 def test_a_build_of_another_call_meanwhile_stays(made, bucket, monkeypatch):
-    draw = building.write_patches
+    draw = writing.write_patches
 
     def while_the_first_draws(*how, **more):
-        monkeypatch.setattr(building, "write_patches", draw)
+        monkeypatch.setattr(writing, "write_patches", draw)
         build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7)
         return draw(*how, **more)
 
-    monkeypatch.setattr(building, "write_patches", while_the_first_draws)
+    monkeypatch.setattr(writing, "write_patches", while_the_first_draws)
     with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(URL, store=made / "store", recipe=Recipe())
     assert len(folders(bucket)) == 1

@@ -15,8 +15,9 @@ from synthetic_store import add_run, add_world, box, commit_run, lanes, region_f
 from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.pipeline.dataset import build as building
+from tcpipe.pipeline.dataset import writing
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
 from tcpipe.store import open_store
 
@@ -100,7 +101,44 @@ def test_regions_and_tables_differ_by_what_they_are(here):
 def test_the_same_region_written_otherwise_is_the_same_option(here):
     path = here / "region.geojson"
     path.write_text(json.dumps(json.loads(path.read_text()), indent=3))
-    assert build_dataset(here / "dataset", **usual(here)).status == "done"
+    assert build_dataset(here / "dataset", **usual(here)).status == "unchanged"
+
+
+CAUSES = {
+    "covariates": ({"covariates": "soil.csv"}, {}, ("covariates: removed soil.csv",)),
+    "content of covariates": ({"covariates": "soil.csv"}, {"covariates": "wet/soil.csv"}, ("covariates: soil.csv is another table",)),
+    "chosen tags": ({"tags": {"weather": "dry"}}, {"tags": {}},
+    ("log: added wet.mcap (run wet, 20 samples)", "chosen tags: weather dry → none")),
+    "order of maps": ({"map_name": ["site", "yard"]}, {"map_name": ["yard", "site"]}, ("map: order site, yard → yard, site",)),
+    "map": ({"map_name": "site"}, {"map_name": "yard"}, ("map: added yard", "map: removed site")),
+    "region": ({"split": "region.geojson"}, {"split": "other.geojson"}, ("region: another one",)),
+    "kept split": ({}, {"keep_split": "dataset"}, ("kept split: added",)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_diff_names_every_input_that_differs(here, name):
+    """Each entry of the record of inputs, not a list of some of them."""
+    (here / "wet").mkdir()
+    (here / "wet" / "soil.csv").write_text((here / "soil.csv").read_text().replace("0.2", "0.4"))
+    *options, causes = CAUSES[name]
+    for out, how in zip("ab", options, strict=True):
+        paths = {
+            key: here / value if key in ("covariates", "split", "keep_split") else value for key, value in how.items()
+        }
+        build_dataset(here / out, **usual(here, **paths))
+    found = diff(here / "a", here / "b")
+    assert set(found.causes) == set(causes)
+    assert not found.same
+    assert diff(here / "a", here / "a").same
+
+
+def test_diff_names_other_tags_of_a_run(here):
+    store = open_store(here / "store")
+    store.tag_run("dry", {"weather": "dry", "soil": "clay"})
+    commit_run(store, "dry")
+    build_dataset(here / "b", **usual(here))
+    assert diff(here / "dataset", here / "b").causes == ("tags: run dry soil none → clay",)
 
 
 def test_other_runs_and_another_map_of_the_name_are_built_in_unasked(here):
@@ -159,7 +197,7 @@ def test_a_dataset_of_another_data_model_in_a_bucket_is_left_alone(here, monkeyp
 def test_a_redacted_dataset_does_not_tell_its_options(here):
     out = here / "dataset"
     build_dataset(out, **usual(here, redact=True, force=True))
-    assert read_card(out).run_tags is None
+    assert read_card(out).made_from.tags == {}
     assert build_dataset(out, **usual(here, redact=True)).status == "unchanged"
     (line,) = refused(here, redact=True, map_name="yard")
     assert line.startswith("--redact: a redacted dataset omits its")
@@ -198,15 +236,15 @@ def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_gen
 
 
 def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
-    out, draw = here / "dataset", building.write_patches
+    out, draw = here / "dataset", writing.write_patches
 
     def while_the_first_draws(*how, **more):
-        monkeypatch.setattr(building, "write_patches", draw)
+        monkeypatch.setattr(writing, "write_patches", draw)
         build_dataset(out, **usual(here, map_name="yard", force=True))
         return draw(*how, **more)
 
     add_run(open_store(here / "store"), "dry", segments("dry", *lanes(1.0, -10.0, 10.0)))
-    monkeypatch.setattr(building, "write_patches", while_the_first_draws)
+    monkeypatch.setattr(writing, "write_patches", while_the_first_draws)
     with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(out, **usual(here))
     assert [entry.name for entry in read_card(out).maps] == ["yard"]

@@ -1,0 +1,134 @@
+"""A user's choices for a dataset, read from files and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+
+from tcpipe.errors import DatasetError, RecipeError, UsageError
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
+from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_sample_ids, read_samples
+from tcpipe.formats.geojson import read_regions
+from tcpipe.formats.integrity import Checksum, compute_checksum
+from tcpipe.formats.object_storage import make_absolute
+from tcpipe.formats.recipe_toml import resolve_recipe
+from tcpipe.pipeline.options import BuildDatasetOptions
+from tcpipe.recipe import CovariateConfig, Recipe, TrainConfig
+from tcpipe.splits.regions import Regions
+
+if TYPE_CHECKING:
+    from tcpipe.formats.covariates import CovariateTable
+
+
+@dataclass(frozen=True, slots=True)
+class ExcludedIds:
+    """A list of samples that a user excludes: the file's name and checksum, why, and the ids."""
+
+    name: str
+    checksum: Checksum
+    reason: str
+    ids: tuple[str, ...]
+
+
+def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Sequence[str]) -> tuple[ExcludedIds, ...]:
+    """Return the lists of samples to exclude; `UsageError` unless each has a reason, `DatasetError` if one cannot be read."""
+    paths = [Path(path) for path in ([files] if isinstance(files, str | Path) else files)]
+    texts = [text.strip() for text in ([reasons] if isinstance(reasons, str) else reasons)]
+    if len(texts) != len(paths) or not all(texts):
+        raise UsageError(
+            f"--exclude: {len(paths)} lists of samples and {len([text for text in texts if text])} reasons; "
+            "give each list its --reason TEXT, in the same order"
+        )
+    if len({path.name for path in paths}) < len(paths):
+        raise UsageError("--exclude: two lists have one name, by which the dataset names them; rename one")
+    return tuple(
+        ExcludedIds(path.name, compute_checksum(path), text, tuple(read_sample_ids(path)))
+        for path, text in zip(paths, texts, strict=True)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class BuildOptions:
+    """A user's choices for a dataset, read and checked; ``recipe`` includes holdout and seed of the call."""
+
+    recipe: Recipe
+    robot: str | None
+    tags: Mapping[str, str]
+    map_names: tuple[str, ...]
+    """In order of priority where maps overlap; none: the only one."""
+    region: str | None
+    """The file of the regions, as text."""
+    regions: Regions | None
+    covariates: tuple[CovariateTable, ...]
+    exclusions: tuple[ExcludedIds, ...]
+    file_format: FileFormat
+    redact: bool
+    earlier: pa.Table | None
+    """Samples of an earlier dataset, which keep their split."""
+    keeps_own_split: bool
+    """Whether that is the replaced dataset itself."""
+
+
+def read_build_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | str) -> BuildOptions:
+    """Return a user's choices for the dataset at ``place``."""
+    split, map_name, keep_split = options.split, options.map_name, options.keep_split
+    tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
+    return BuildOptions(
+        recipe=recipe,
+        robot=options.robot or recipe.robot,
+        tags=options.tags or {},
+        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
+        regions=None if split is None else read_regions(Path(split)),
+        region=None if split is None else Path(split).read_bytes().decode("utf-8", "replace"),
+        covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
+        exclusions=read_exclusions(options.exclude, options.reason),
+        file_format=options.file_format,
+        redact=options.redact,
+        earlier=None if keep_split is None else read_earlier_splits(keep_split),
+        keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
+    )
+
+
+def merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
+    """Return the recipe with the options ``--holdout`` and ``--seed`` in it."""
+    recipe = resolve_recipe(recipe)
+    kind, _, tag = (holdout or recipe.split.holdout).partition(":")
+    rules = replace(
+        recipe.split,
+        holdout=kind,  # type: ignore[arg-type]  # the recipe checks it
+        holdout_tag=recipe.split.holdout_tag if holdout is None else tag,
+        seed=recipe.split.seed if seed is None else seed,
+    )
+    if rules.holdout == "tag" and not rules.holdout_tag:
+        raise RecipeError(
+            'recipe: split.holdout is "tag"; expected split.holdout_tag too, for example "season" (--holdout tag:season)'
+        )
+    return replace(recipe, split=rules, train=TrainConfig())  # how models are trained is no part of a dataset
+
+
+def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple[CovariateTable, ...]:
+    """Return the tables of the files; `DatasetError` where one cannot be used or two have one name."""
+    if not paths:
+        return ()
+    from tcpipe.formats.covariates import read_covariates  # noqa: PLC0415  polars only where a table is given
+
+    names = [path.stem for path in paths]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise DatasetError(
+            f"--covariates: {twice[0]} is given twice; columns are named after the file: give each its own name"
+        )
+    return tuple(read_covariates(path, time_column=config.time_column, time_unit=config.time_unit) for path in paths)
+
+
+def read_earlier_splits(dataset: str | Path) -> pa.Table:
+    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` for another path."""
+    directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
+    if read_card(directory).redaction is not None:
+        raise DatasetError(
+            f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"
+        )
+    return read_samples(directory, ["sample_id", "split", "fold"])

@@ -1,0 +1,106 @@
+"""Writing a dataset from chosen inputs: sample, split, audit, describe; card and page last."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+from pyarrow.csv import write_csv
+
+from tcpipe.formats.atomic import write_text
+from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_files import (
+    CARD,
+    CLASSES,
+    CROISSANT,
+    EXCLUDED,
+    HUB_CARD,
+    OVERVIEW,
+    RELIEF,
+    REPORT,
+    SAMPLES,
+)
+from tcpipe.formats.hub_card import format_croissant, format_hub_card
+from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
+from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.parquet import map_table, write_parquet_rows, write_pieces
+from tcpipe.pipeline.dataset.card import (
+    CARD_COLUMNS,
+    PHYSICS_COLUMNS,
+    REPEATABILITY_COLUMNS,
+    VELOCITY_COLUMN,
+    make_dataset_card,
+    measure_repeatability,
+)
+from tcpipe.pipeline.dataset.content import SampleTable, gather_content, write_patches
+from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.options import BuildOptions
+from tcpipe.pipeline.dataset.redaction import make_redaction, redact_card, redact_content, redact_inputs
+from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
+from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
+
+logger = logging.getLogger("tcpipe")
+
+
+def write_dataset(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> DatasetCard:
+    """Write the dataset into ``directory`` and return its card."""
+    waiting, recipe = directory / "spool", options.recipe
+    waiting.mkdir()
+    content = gather_content(waiting, inputs, options, jobs)
+    redaction = make_redaction(content, inputs, recipe) if options.redact else None
+    if redaction is not None:
+        content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
+    logger.info("writing %d samples", len(content.samples))
+    figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
+    ids, compression = figures.column("sample_id"), recipe.dataset.compression
+    shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
+    _write_overviews(directory, content.sources)
+    repeatability = measure_repeatability(
+        figures,
+        content.samples.centres_xy_m(),
+        velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
+        chord_m=recipe.segment.chord_m,
+    )
+    if content.excluded.num_rows and redaction is None:
+        write_csv(content.excluded, directory / EXCLUDED)
+    card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
+    card = card if redaction is None else redact_card(card, redaction)
+    shutil.rmtree(waiting)
+    write_text(directory / HUB_CARD, format_hub_card(card))
+    files = compute_checksums(directory)
+    write_text(directory / CROISSANT, format_croissant(card, content.samples.schema, files))
+    card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
+    write_sealed(directory / CARD, card)
+    write_text(directory / REPORT, seal_page(render_dataset_report(directory, samples=figures)))
+    return card
+
+
+def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
+    """Write the samples; return the columns that card and page are made from, mapped from another file."""
+    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS)))
+
+    def write_both() -> Iterator[pa.Table]:
+        for piece in samples.pieces():
+            write(piece)
+            few = piece.select(names).replace_schema_metadata(None)
+            del piece  # else it is in memory beside the next one
+            yield few
+            del few
+
+    with write_parquet_rows(path, samples.schema) as write:
+        write_pieces(mapped, pa.schema([samples.schema.field(name) for name in names]), write_both())
+    return map_table(mapped)
+
+
+def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
+    """Write the page's pictures of the maps: photograph (or relief), relief and classes, as far as the maps have them."""
+    write_overview(directory / OVERVIEW, draw_maps(sources))
+    layers = {layer for source in sources for layer in source.layers}
+    if "ortho" in layers:
+        write_overview(directory / RELIEF, draw_maps(sources, draw_relief))
+    if "terrain" in layers:
+        write_overview(directory / CLASSES, draw_maps(sources, draw_classes))
