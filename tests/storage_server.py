@@ -6,7 +6,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -83,17 +83,23 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(*((200, b"") if allowed else (412, b"<Error><Code>PreconditionFailed</Code></Error>")))
 
     def do_DELETE(self) -> None:
-        (self.server.root / unquote(urlsplit(self.path).path).lstrip("/")).unlink(missing_ok=True)
+        self.server.fetched.requests += 1
+        self._delete(unquote(urlsplit(self.path).path).lstrip("/"))
         self._send(204, b"")
 
     def do_POST(self) -> None:
+        self.server.fetched.requests += 1
         text = self.rfile.read(int(self.headers["Content-Length"])).decode()
         bucket = urlsplit(self.path).path.lstrip("/")
         names = re.findall("<Key>(.*?)</Key>", text)
         for name in names:
-            (self.server.root / bucket / unescape(name)).unlink(missing_ok=True)
+            self._delete(f"{bucket}/{unescape(name)}")
         deleted = "".join(f"<Deleted><Key>{name}</Key></Deleted>" for name in names)
         self._send(200, f"<DeleteResult>{deleted}</DeleteResult>".encode())
+
+    def _delete(self, name: str) -> None:
+        with suppress(FileNotFoundError, NotADirectoryError, IsADirectoryError):  # there is no such object
+            (self.server.root / name).unlink()
 
     def _answer(self, *, with_body: bool) -> None:
         self.server.fetched.requests += 1

@@ -89,8 +89,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             if as_json:
                 print_json_line(convert_record(result, LogLine))
             else:
-                is_silent = quiet and result.status == "unchanged" and not result.is_new_problem
-                for line in () if is_silent else _list_outcome(result, options.store, several=several):
+                for line in _list_outcome(result, options.store, several=several, quiet=quiet):
                     shown.result(line)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
@@ -107,8 +106,11 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     return summary.exit_code
 
 
-def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
-    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
+def _list_outcome(result: IngestResult, store: Path | str, *, several: bool, quiet: bool) -> Iterator[str]:
+    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken.
+
+    With ``quiet`` an unchanged log without a new problem has no line.
+    """
     from tcpipe.formats.finding_lines import (
         describe_finding,
         describe_power,
@@ -121,6 +123,8 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
 
     aside = " (acknowledged)" if result.acknowledged else ""
     is_new, run = result.status != "unchanged", result.run
+    if quiet and not (is_new or result.is_new_problem):
+        return
     budget = run.energy_budget if run and is_new else None
     problems = select_problems(result.findings)
     if run is None:
@@ -337,46 +341,26 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 
 
 @click.command()
+@click.argument("runs", nargs=-1, metavar="[RUN...]", shell_complete=complete_runs)
 @store_option
 @recipe_option
 @click.option(
-    "--keep",
-    multiple=True,
-    metavar="RUN|RECIPE",
-    shell_complete=complete_runs,
-    help="Keep this run or recipe; repeatable.",
-)
-@click.option(
     "--forget", multiple=True, metavar="DATASET", help="Remove what only this deleted dataset needs; repeatable."
 )
-@min_age_option("1d", "Remove files of killed calls that are older than this (90, 90s, 10m, 2h, 1d).")
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
 @json_option
 def prune(
-    *,
-    store: str,
-    recipe: str | None,
-    keep: tuple[str, ...],
-    forget: tuple[str, ...],
-    min_age_s: float,
-    dry_run: bool,
-    as_json: bool,
+    runs: tuple[str, ...], *, store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool, as_json: bool
 ) -> int:
-    """Remove results of earlier recipes that the current recipe replaces, superseded runs, and files of killed calls.
+    """Remove results of earlier recipes that the current recipe replaces, superseded runs, and files of killed calls; or RUN.
 
-    tcpipe keeps everything that a dataset built from this store needs, and directories that contain files of others.
+    tcpipe keeps everything that a dataset built from this store needs, and files of others. While another call works on the store,
+    nothing is removed.
     """
     from tcpipe.pipeline.prune import prune as run
 
-    found = run(
-        store=store,
-        recipe=resolve_recipe_with_source(recipe)[0],
-        keep=keep,
-        forget=forget,
-        min_age_s=min_age_s,
-        dry_run=dry_run,
-    )
-    print_result(found, as_json=as_json)
+    ruling = resolve_recipe_with_source(recipe)[0]
+    print_result(run(runs, store=store, recipe=ruling, forget=forget, dry_run=dry_run), as_json=as_json)
     return 0
 
 

@@ -47,7 +47,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 """In the order in which they are listed: calls first, so that a call that ends later is seen as open."""
 BLOBS = "blobs"
 INDEX = "index.parquet"
-_RECORDS: Mapping[Kind, type] = {
+RECORDS: Mapping[Kind, type] = {
     "calls": Call, "runs": RunFacts, "failed": Failure, "tags": Tags, "seen": LogSnapshot, "acknowledged": Problem, "maps": StoredMap,
     "outputs": Output,
 }  # fmt: skip
@@ -188,7 +188,7 @@ class State:
     def add_run(self, row: RunFacts) -> None:
         """Add a run that a worker has written after the scan."""
         self.facts["runs"][make_run_key(row.log.sha256, row.recipe_id)] = row
-        self.blobs |= {row.blob, row.streams_blob}
+        self.blobs |= {row.blob, row.streams_blob} - {""}
         self._joined = None
 
     def add(self, name: Name, record: object) -> None:
@@ -200,7 +200,7 @@ class State:
         self.is_new = False
         if name.kind == "runs":
             row = cast("RunFacts", record)
-            self.blobs |= {row.blob, row.streams_blob}
+            self.blobs |= {row.blob, row.streams_blob} - {""}
         if name.kind in ("runs", "tags"):
             self._joined = None
 
@@ -300,13 +300,13 @@ def _decode(
         if (text := str(name)) in decoded:
             continue
         if text in indexed:
-            decoded[text] = parse_typed_json(indexed[text], _RECORDS[name.kind], text)
+            decoded[text] = parse_typed_json(indexed[text], RECORDS[name.kind], text)
         else:
             unread.append(name)
     found: list[bytes | None] = place.map(lambda name: _read_document(place, name), unread)
     for name, data in zip(unread, found, strict=True):
         if data is not None:
-            record: object = parse_typed_json(data, _RECORDS[name.kind], place.where(str(name)))
+            record: object = parse_typed_json(data, RECORDS[name.kind], place.where(str(name)))
             decoded[str(name)], fresh[str(name)] = record, to_compact_json(record)
     return fresh
 

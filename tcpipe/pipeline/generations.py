@@ -15,7 +15,7 @@ from tcpipe.formats.commits import Entries, Generation, Process, State
 from tcpipe.formats.place import Place, open_place
 
 _NOBODY = Process("", "", "", "", 0, "")
-"""Who commits: the log of a redacted dataset names no machine."""
+"""Who commits: the log at a URL names no machine."""
 
 
 @contextmanager

@@ -129,7 +129,7 @@ def tag_log(store: Store, state: State, sha256: str, given: Mapping[str, str]) -
 
 
 def _find_hash(state: State, log: AnyLog) -> str:
-    """Return the hash by which the store knows a log, or is to know it (ADR-30).
+    """Return the hash by which the store knows a log, or is to know it (ADR-36).
 
     That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage
     is not taken for it: what was broken there may be whole here.

@@ -37,7 +37,7 @@ from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.recipe import Recipe
-from tcpipe.store import open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _MOST_NAMES = 3
@@ -133,7 +133,7 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     if not create and len(killed) == len(open_calls) and all(is_below(make_absolute(log), [*asked]) for log in given):
         problems += _find_waiting(steps)
     problems += [make_missing(path, state) for path in missing if path in lately]
-    problems += [] if create else find_stale_outputs(state)
+    problems += [] if create else find_stale_outputs(opened, state)
     problems = [problem for problem in problems if problem.key not in acknowledged]
     groups, waiting = tuple(_iterate_groups(steps)), [step for step in steps if step.is_todo]
     current = [run.facts for run in opened.runs(state) if run.facts.ingest_key == ingest_key(ruling)]
@@ -209,13 +209,20 @@ def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str
     return f"to do now: tcpipe ingest ({waiting} logs)" if waiting else "nothing to do"
 
 
-def find_stale_outputs(state: State) -> Iterator[Problem]:
+def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
     """Yield the outputs whose last call failed, or that would be made of something else now."""
+    if not state.outputs:
+        return
+    from tcpipe.pipeline.dataset.build import find_changed_parts  # noqa: PLC0415  only for stores with datasets
+
     for output in state.outputs.values():
         subject = Subject("dataset", output.where)
         if output.exit_code not in (0, 3):
             names = {"message": output.message.partition("\n")[0], "at": output.at[:19]}
             yield Problem(make_finding("output-failed", subject, names=names), f"{output.where} {output.at}")
+        elif changes := find_changed_parts(store, state, output):
+            found = make_finding("output-outdated", subject, names={"changes": changes})
+            yield Problem(found, f"{output.where} {output.inputs}")
 
 
 def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:

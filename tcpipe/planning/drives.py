@@ -30,7 +30,7 @@ from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import Reason, check_model, predict_segments
 from tcpipe.planning.path_cost import find_added_turning
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles
 from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
@@ -235,8 +235,8 @@ def compute_drive_cost(
     found = predict_run(model, source, run, gnss_crs=recipe.read.gnss_crs, sample=recipe.sample, shift=shift)
     errors, trained, length_m = model.errors, data["train"], found.run.metres["energy"].length_m
     near = are_near(
-        compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
-        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.card.chord_m,
+        compute_middles([to_floats(segments, name) for name in PLACES]),
+        compute_middles([trained.column(name) for name in PLACES]), within_m=CLOSE * model.card.chord_m, in_degrees=True,
     )  # fmt: skip
     good = {name: metres.take(found.is_good) for name, metres in found.run.metres.items()}
     sums = {

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings, judge_dataset
-from tcpipe.formats.dataset_files import read_intact_card, read_samples
+from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_columns
 from tcpipe.formats.documents import BLOBS
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
@@ -54,17 +54,18 @@ MOST_SAMPLES = 100_000
 
 SAMPLE_COLUMNS = (
     *("sample_id", "split", "run_id", "start_ns", "start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg"),
+    *("start_x_m", "start_y_m", "end_x_m", "end_y_m"),
     *("terrain_class", "terrain_name", "slope_rad", "yaw_change_rad", "quality"),
     *(column for *columns, _ in LABELS.values() for column in columns),
 )
-"""Columns of samples.parquet that the page needs."""
+"""Columns of samples.parquet that the page needs, those that the dataset has."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class SamplesShown:
-    """The samples of the page, and their middles in the first map's plane, (N, 2)."""
+    """The samples of the page, and their middles in the first map's plane, or from the dataset's own origin, (N, 2)."""
 
     xy_m: Floats
     json: Json
@@ -81,9 +82,11 @@ def render_dataset_report(
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
     card = read_intact_card(directory)
-    samples = read_samples(directory, SAMPLE_COLUMNS) if samples is None else samples
+    if samples is None:
+        there = sample_columns(directory)
+        samples = read_samples(directory, [name for name in SAMPLE_COLUMNS if name in there])
     shown = select_samples(card, samples)
-    plots, lost = draw_dataset_map(directory, card, len(shown.xy_m))
+    plots, lost = draw_dataset_map(directory, card, shown.xy_m)
     quality = samples.column("quality").to_numpy()
     try:
         patches = make_patches_data(directory, card, samples, len(shown.xy_m))
@@ -295,7 +298,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
             )
             for grid in card.maps
         ),
-        *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs),
+        *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs if run.sha256),
         *(("excluded", str(exclusion)) for exclusion in card.exclusions),
         ("licence", card.licence or "none given"),
         ("creator", card.creator or "none given"),
@@ -319,9 +322,7 @@ def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floa
 
 def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
     """Return the samples of the page."""
-    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
-    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
-    xy_m = np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
+    xy_m = _read_middles_m(card, table)
     apart_m, nearest = find_nearest_train_m(xy_m, _find_indices(table, "split", SPLITS))
     starts_ns = np.array(find_first_starts_ns(card, table), np.int64)
     table = table.slice(0, MOST_SAMPLES)
@@ -346,6 +347,15 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
         "nearest": ("u32", np.where(near, nearest, np.arange(len(near)))[:count]),
     }
     return SamplesShown(xy_m[:count], {"packed": pack_columns(columns), "ids": _find_odd_ids(table)})
+
+
+def _read_middles_m(card: DatasetCard, table: pa.Table) -> Floats:
+    if card.without_coordinates:
+        ends = [np.column_stack([to_floats(table, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")]
+        return 0.5 * (ends[0] + ends[1])
+    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
+    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
+    return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
 
 
 def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray[np.int32]:

@@ -14,7 +14,6 @@ from pyproj import Transformer
 from tcpipe.errors import TcpipeError, clean_line
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
-from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.store_records import StoredMap
 from tcpipe.formats.stored_runs import StoredRun
@@ -40,12 +39,15 @@ _LEAST_SHARE = 0.5
 """Smallest share of the track on a map that becomes its background."""
 
 
-def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> tuple[list[Plot], list[str]]:
-    """Return the map of the samples and the plot beside it, and which parts of the map are lost."""
-    bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
+def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[list[Plot], list[str]]:
+    """Return the map of the samples at ``xy_m``, (N, 2), and the plot beside it, and which parts of the map are lost."""
+    if card.maps:
+        bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
+    else:
+        bounds = (0.0, 0.0, *xy_m.max(axis=0, initial=1.0).tolist())
     tools = "box_select,lasso_select"
     plot = make_map_plot(
-        alt=f"Map of {sample_count} points, coloured by the quantity chosen above; the tables below list the counts.",
+        alt=f"Map of {len(xy_m)} points, coloured by the quantity chosen above; the tables below list the counts.",
         axes=("easting [m]", "northing [m]"),
         height_px=110 + 330 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
         tools=f"pan,wheel_zoom,{tools},reset,save",
@@ -55,7 +57,7 @@ def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> t
     ends = {end: np.empty(0) for end in ("x0", "y0", "x1", "y1")}
     leaks = figure.segment(source=ends, color=CURSOR, line_width=1.5, name="leaks", visible=False)
     leaks.level = "overlay"  # above the points that they join
-    rings = _project_rings(card.split.region, Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True))
+    rings = _project_rings(card)
     xs, ys = ([ring[:, axis] for ring in rings] for axis in (0, 1))
     figure.multi_line(xs, ys, color="#b3202a", line_width=2, line_dash="dashed")
     corners = {
@@ -128,7 +130,7 @@ def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds
     files = {"orthophoto" if has_ortho else "hillshade": OVERVIEW, "hillshade ": RELIEF, "classes": CLASSES}
     lost = []
     for number, (name, file) in enumerate(files.items()):
-        if file != OVERVIEW and file not in card.checksums:
+        if file not in card.checksums:
             continue
         pixels = read_picture(directory / file)
         if pixels is None:
@@ -138,10 +140,12 @@ def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds
     return lost
 
 
-def _project_rings(region: Mapping[str, PolygonGeometry] | None, to_map: Transformer) -> list[Floats]:
+def _project_rings(card: DatasetCard) -> list[Floats]:
     """Return every ring of every polygon of the region in the map's plane [m], each of shape (M, 2)."""
-    rings = []
-    for geometry in (region or {}).values():
+    if card.split.region is None:
+        return []
+    to_map, rings = Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True), []
+    for geometry in card.split.region.values():
         polygons = (geometry.coordinates,) if geometry.type == "Polygon" else geometry.coordinates
         rings += [np.array(ring, dtype=float)[:, :2] for polygon in polygons for ring in polygon]
     return [np.column_stack(to_map.transform(ring[:, 0], ring[:, 1])) for ring in rings]

@@ -132,8 +132,8 @@ def test_a_build_of_another_call_meanwhile_stays(made, bucket, monkeypatch):
     assert len(folders(bucket)) == 1
 
 
-def test_a_redacted_dataset_names_no_machine_in_its_log(made, bucket):
-    build_dataset(URL, store=made / "store", recipe=Recipe(), redact=True)
+def test_a_dataset_without_coordinates_names_no_machine_in_its_log(made, bucket):
+    build_dataset(URL, store=made / "store", recipe=Recipe(), without_coordinates=True)
     text = b"".join(path.read_bytes() for path in (bucket[0] / "by name" / "ds" / "log").iterdir()).decode()
     assert "generations/0000000001-" in text
     assert not [name for name in (socket.gethostname(), str(made), getpass.getuser()) if name in text]
