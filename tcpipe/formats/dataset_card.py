@@ -107,7 +107,7 @@ class Exclusion:
 
     def __str__(self) -> str:
         """Return name, count and reason."""
-        return f"{self.name}: {self.samples} samples excluded: {self.reason or 'reason redacted'}"
+        return f"{self.name}: {self.samples} samples excluded: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,31 +200,6 @@ class Shard:
     rows: int
 
 
-@dataclass(frozen=True, slots=True)
-class Redacted:
-    """Facts that a redacted dataset omits, and facts that it does not hide."""
-
-    moved: str = (
-        "to 0 N 0 E as a whole, grid north up: lon, lat, x, y, course, heights, regions; distances are those of the ground, as chord_m, "
-        "to a centimetre"
-    )
-    cut: str = (
-        "names of logs, runs, maps, tables of covariates and lists of excluded samples, with their reasons; topics, frames, files, hosts "
-        "and times in findings, and their remedies; "
-        "what else the power feeds; checksums of rasters; the recipe's sections read, robots, power_sources and tables"
-    )
-    not_hidden: str = (
-        "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
-        "power, names of classes and layers, tags and covariates as they were given (their columns begin with "
-        "the table's name), codes, roles and the numbers of findings that the catalogue calls public, the sha256 of each log, and what "
-        "name, description and creator say"
-    )
-
-    def lines(self) -> tuple[str, str, str]:
-        """Return it in words."""
-        return f"Moved {self.moved}.", f"Cut: {self.cut}.", f"Not hidden: {self.not_hidden}."
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetCard:
     """All of dataset.json but its seal."""
@@ -235,7 +210,7 @@ class DatasetCard:
     inputs: str
     """Digest of ``made_from``: the same inputs make the same dataset."""
     made_from: DatasetInputs
-    """Of a redacted dataset, without what it omits."""
+    """Of a dataset without coordinates: without runs, maps, region and files."""
     name: str
     description: str
     licence: str = ""
@@ -278,8 +253,8 @@ class DatasetCard:
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
     exclusions: tuple[Exclusion, ...] = field(default=(), metadata=LEFT_OUT)
     """A sample of two lists counts for the first one."""
-    redaction: Redacted | None = field(default=None, metadata=LEFT_OUT)
-    """Omitted facts; None for a dataset that is not redacted."""
+    without_coordinates: bool = field(default=False, metadata={"json": (False,)})
+    """Whether places are metres from an unpublished origin; then names, times, maps and regions are omitted too."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""

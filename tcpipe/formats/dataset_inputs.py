@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import Recipe
@@ -39,31 +39,36 @@ class DatasetInputs:
     """``results`` and ``tables``."""
     recipe: Recipe
     """Without its section ``train``."""
-    runs: Mapping[str, RunInputs]
+    runs: Mapping[str, RunInputs] = field(default_factory=dict)
     """By id."""
     robots: tuple[str, ...]
     """Of the runs."""
-    tags: Mapping[str, str]
+    tags: Mapping[str, str] = field(default_factory=dict)
     """Tags that a run had to have."""
-    maps: Mapping[str, str]
+    maps: Mapping[str, str] = field(default_factory=dict)
     """By name: sha256 over the map's files."""
-    map_names: tuple[str, ...]
+    map_names: tuple[str, ...] = ()
     """In order of priority where maps overlap."""
-    region: Mapping[str, str] | None
+    region: Mapping[str, str] | None = None
     """By kind of polygon: the sha256 of its coordinates."""
-    covariates: Mapping[str, str]
+    covariates: Mapping[str, str] = field(default_factory=dict)
     """By file: its sha256."""
-    exclusions: Mapping[str, ExclusionInputs]
+    exclusions: Mapping[str, ExclusionInputs] = field(default_factory=dict)
     """By file."""
-    kept_split: str | None
+    kept_split: str | None = None
     """The sha256 of the splits of the earlier dataset, which its samples keep."""
     file_format: str
-    redact: bool
+    without_coordinates: bool
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """Hash of each part, by the name of its field."""
+        return {entry.name: digest([getattr(self, entry.name)]) for entry in fields(self)}
 
     @property
     def digest(self) -> str:
         """Hash over all of it: the same inputs make the same dataset."""
-        return digest(self)
+        return digest(self.parts)
 
 
 @dataclass(frozen=True, slots=True)

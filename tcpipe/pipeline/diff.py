@@ -212,7 +212,7 @@ def _iterate_causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
             line for change in changes if change.path[0] == field for line in describe(change, a, b)
         )
     if a.inputs != b.inputs and not changes:
-        yield "inputs: differ, but a redacted dataset omits in what"
+        yield "inputs: differ, but a dataset without coordinates does not store them"
 
 
 def _describe_change(word: str) -> Describe:
@@ -298,7 +298,7 @@ _CAUSES: dict[str, Describe] = {
     "exclusions": _describe_exclusion,
     "kept_split": _describe_file("kept split", "one"),
     "file_format": _describe_change("format"),
-    "redact": _describe_change("redacted"),
+    "without_coordinates": _describe_change("without coordinates"),
 }
 """By field of `DatasetInputs`: what to say of a change."""
 

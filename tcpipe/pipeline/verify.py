@@ -18,7 +18,7 @@ from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.parquet import read_row_count, read_table
+from tcpipe.formats.parquet import read_column_names, read_row_count
 from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.published_outputs import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
@@ -34,10 +34,9 @@ from tcpipe.formats.run_documents import (
     read_sealed_at,
     split_number,
 )
-from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.store import Store, find_store_above, is_store
 from tcpipe.tables.facts import LEFT_OUT
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import COORDINATES, DATA_MODEL_VERSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +74,7 @@ class Verified:
     read: Mapping[str, int]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    """How to repair the problems; limits of a redacted dataset."""
+    """How to repair the problems."""
 
     def __str__(self) -> str:
         """Return a line of what was read, and one for each problem."""
@@ -92,7 +91,7 @@ def verify(path: Path | str) -> Verified:
     """
     if not is_url(path) and not Path(path).exists():
         raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
-    kind, findings, notes = _find_kind(path)
+    kind, findings = _find_kind(path)
     read: dict[str, int] = {}
     problems, repairs = list[str](), list[str]()
     try:
@@ -108,29 +107,24 @@ def verify(path: Path | str) -> Verified:
     if kind not in ("store", "run") and not is_url(path):
         again = "the next command that writes it removes it"
         problems += [f"{left}: was left by a killed command; {again}" for left in find_leftovers(Path(path))]
-    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), (*dict.fromkeys(repairs), *notes))
+    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), tuple(dict.fromkeys(repairs)))
 
 
-def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str, ...]]:
-    """Return what a path is, its findings, which are made as they are asked for, and notes."""
+def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult]]:
+    """Return what a path is, and its findings, which are made as they are asked for."""
     if inside := find_store_above(path):
-        return "run", _verify_run(*inside), ()
+        return "run", _verify_run(*inside)
     above, _, last = str(path).rstrip("/").rpartition("/")
     for root in (path, *([above] if above and last in (LOG, "maps") else [])):  # which lie in a store
         if is_store(root):
-            return "store", _verify_store(Store(root if is_url(root) else Path(root))), ()
+            return "store", _verify_store(Store(root if is_url(root) else Path(root)))
     place = open_place(path)
     if place.path and place.path.resolve().suffix == ".zarr" and not (place.path.resolve().parent / CARD).is_file():
-        return "map", _verify_map(place.path), ()
+        return "map", _verify_map(place.path)
     found = find_newest(str(path), CARDS)
     if found is None:
         raise UsageError(f"{path}: is no {_KNOWN}; give one of these directories")
-    card: DatasetCard | None = None
-    with suppress(TcpipeError):  # a problem that is found again
-        card = parse_card(found.data, found.place.where(CARD), proved=False) if found.name == CARD else None
-    redaction = None if card is None else card.redaction
-    notes = () if redaction is None else ("It is redacted.", *redaction.lines())
-    return _KINDS[found.name], _verify_directory(found, str(path)), notes
+    return _KINDS[found.name], _verify_directory(found, str(path))
 
 
 def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
@@ -156,16 +150,17 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
 
 
 def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[CheckResult]:
-    """Compare how many samples there are; of a redacted dataset also that it reveals nothing."""
+    """Compare how many samples there are, and with a card without coordinates the columns."""
     rows = read_row_count(samples)
     yield "samples", rows
     counts = {"splits": sum(card.splits.values()), "runs": sum(run.samples for run in card.runs)}
     for name, count in {"samples": card.samples, **counts}.items():
         if count != rows:
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
-    if card.redaction is not None:
-        table = read_table(samples)
-        yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
+    coordinates = [name for name in read_column_names(samples) if name in COORDINATES]
+    if card.without_coordinates and coordinates:
+        columns = ", ".join(coordinates)
+        yield f"{where}: states that it has no coordinates, but {SAMPLES} has the columns {columns}; build it again"
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:

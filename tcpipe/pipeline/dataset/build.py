@@ -30,7 +30,7 @@ from tcpipe.formats.published_outputs import check_kind, find_newest, write_outp
 from tcpipe.formats.store_records import Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
-from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, prove_maps
+from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.options import BuildDatasetOptions
@@ -93,10 +93,9 @@ class BuildResult:
         return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
-        if self.card is None or self.card.redaction is None:
+        if self.card is None or not self.card.without_coordinates:
             return []
-        publish = f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        return [*self.card.redaction.lines(), publish]
+        return [f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
@@ -125,7 +124,10 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
             raise
         runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
         reported = tuple(sorted(map(_name_finding, select_problems(result.findings))))
-        made = replace(now, inputs=inputs.digest, runs=runs, exit_code=result.exit_code, message="", reported=reported)
+        made = replace(
+            now, inputs=inputs.digest, parts=inputs.made_from.parts, runs=runs, exit_code=result.exit_code, message="",
+            reported=reported,
+        )  # fmt: skip
         _record_output(call, made, before)
     return result
 
@@ -198,18 +200,38 @@ def _build(
 
 
 def _describe_options(options: BuildDatasetOptions) -> dict[str, object]:
-    """Return the options of a call as JSON values, files as absolute paths, so that `tcpipe status` can plan it again."""
+    """Return the options of a call as JSON values, files as absolute paths, so that it can be planned again."""
     found = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name not in _NOT_RECORDED}
-    for name in ("split", "keep_split"):
-        found[name] = found[name] and make_absolute(found[name])
+    for name in ("split", "keep_split", "recipe"):
+        value = found[name]
+        found[name] = make_absolute(value) if isinstance(value, str | Path) else None if value is None else _IN_PYTHON
     for name in ("covariates", "exclude"):
         given = [found[name]] if isinstance(found[name], str | Path) else found[name]
         found[name] = [make_absolute(path) for path in given]
     return {name: value for name, value in found.items() if value not in (None, (), [], {}, False)}
 
 
-_NOT_RECORDED = ("out", "store", "recipe", "jobs", "dry_run", "force")
-"""Options of a call that do not decide what the dataset is made of, or, as the recipe, are found again as all commands find it."""
+_NOT_RECORDED = ("out", "store", "jobs", "dry_run", "force")
+"""Options of a call that do not decide what the dataset is made of."""
+_IN_PYTHON = "a recipe in Python"
+
+
+def find_changed_parts(store: Store, state: State, output: Output) -> str:
+    """Return which parts of a dataset would be others if it were built now, or why it cannot be planned; "" if nothing would change.
+
+    A dataset whose recipe was given in Python is taken for unchanged.
+    """
+    if not output.inputs or output.options.get("recipe") == _IN_PYTHON:
+        return ""
+    options = BuildDatasetOptions(output.where, store=store.root, **output.options)  # type: ignore[arg-type]  # as recorded
+    try:
+        recipe = merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
+        parts = plan_inputs(store, read_build_options(options, recipe, output.where), state).parts
+    except TcpipeError as error:
+        return error.problems[0]
+    except OSError as error:
+        return f"{error.filename}: {error.strerror}"
+    return ", ".join(name.replace("_", " ") for name, part in parts.items() if output.parts.get(name) != part)
 
 
 def _record_output(call: RunningCall, output: Output, before: Output) -> None:
@@ -248,7 +270,7 @@ def _find_left_out(
 ) -> tuple[Finding, ...]:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
-    before = () if known is None or known.redaction else known.runs
+    before = () if known is None or known.without_coordinates else known.runs
     fewer = (*chosen.missing, *find_gone_runs(before, chosen, robot=options.robot, tags=options.tags))
     if min_runs is None:
         return (*chosen.damaged, *fewer)

@@ -118,7 +118,7 @@ def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Seq
         exclusions={ids.name: ExclusionInputs(ids.checksum.sha256, ids.reason) for ids in options.exclusions},
         kept_split=None if options.earlier is None else _hash_table(options.earlier),
         file_format=options.file_format,
-        redact=options.redact,
+        without_coordinates=options.without_coordinates,
     )
 
 
@@ -210,7 +210,7 @@ _OPTIONS = {
     "exclusions": "--exclude",
     "kept_split": "--keep-split",
     "file_format": "--format",
-    "redact": "--redact",
+    "without_coordinates": "--without-coordinates",
 }
 """Options of a build, by the field of `DatasetInputs` that each rules."""
 
@@ -218,9 +218,10 @@ _OPTIONS = {
 def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> list[str]:
     """Return a line with both values for each option of a build that differs from those of the dataset it would replace."""
     was, now = card.made_from, inputs.made_from
-    if was.redact and now.redact:
-        return ["--redact: a redacted dataset omits its maps, region, tags and recipe, so that they cannot be compared"]
-    names = ("redact",) if was.redact or now.redact else ("recipe", *_OPTIONS)
+    if was.without_coordinates and now.without_coordinates:
+        return ["--without-coordinates: maps, region, tags and recipe are not stored and cannot be compared"]
+    is_other = was.without_coordinates != now.without_coordinates
+    names = ("without_coordinates",) if is_other else ("recipe", *_OPTIONS)
     lines = (
         _format_option(change, was, now)
         for change in compare_records(was, now)

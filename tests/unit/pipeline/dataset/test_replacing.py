@@ -70,7 +70,7 @@ OTHER = {
     "file_format": ("parquet", "--format: zarr in the dataset, parquet now"),
     "seed": (5, "recipe split.seed: 0 in the dataset, 5 now"),
     "holdout": ("sample", "recipe split.holdout: block in the dataset, sample now"),
-    "redact": (True, "--redact: no in the dataset, yes now"),
+    "without_coordinates": (True, "--without-coordinates: no in the dataset, yes now"),
     "recipe": (
         Recipe(sample=SampleConfig(patch_px=20), dataset=DatasetConfig(licence="CC0-1.0")),
         "recipe dataset.licence: none in the dataset, CC0-1.0 now",
@@ -194,14 +194,14 @@ def test_a_dataset_of_another_data_model_in_a_bucket_is_left_alone(here, monkeyp
     assert move == "s3://sets/ds: is not changed, because its inputs are unknown; move it or give another OUT"
 
 
-def test_a_redacted_dataset_does_not_tell_its_options(here):
+def test_a_dataset_without_coordinates_does_not_store_its_options(here):
     out = here / "dataset"
-    build_dataset(out, **usual(here, redact=True, force=True))
+    build_dataset(out, **usual(here, without_coordinates=True, force=True))
     assert read_card(out).made_from.tags == {}
-    assert build_dataset(out, **usual(here, redact=True)).status == "unchanged"
-    (line,) = refused(here, redact=True, map_name="yard")
-    assert line.startswith("--redact: a redacted dataset omits its")
-    assert refused(here) == ("--redact: yes in the dataset, no now",)
+    assert build_dataset(out, **usual(here, without_coordinates=True)).status == "unchanged"
+    (line,) = refused(here, without_coordinates=True, map_name="yard")
+    assert line == "--without-coordinates: maps, region, tags and recipe are not stored and cannot be compared"
+    assert refused(here) == ("--without-coordinates: yes in the dataset, no now",)
 
 
 @pytest.mark.parametrize("force", [False, True])
