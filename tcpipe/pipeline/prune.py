@@ -15,11 +15,11 @@ from pathlib import Path
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.bucket_directories import find_newest
 from tcpipe.formats.dataset_files import CARD, REPORT, parse_card
 from tcpipe.formats.documents import BLOBS, State, make_run_key, read_record
 from tcpipe.formats.object_storage import make_absolute
 from tcpipe.formats.place import Entry
+from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.formats.store_records import Output, StoredMap
