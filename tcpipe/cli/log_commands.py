@@ -332,45 +332,25 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 
 
 @click.command()
+@click.argument("runs", nargs=-1, metavar="[RUN]...", shell_complete=complete_runs)
 @store_option
 @recipe_option
 @click.option(
-    "--keep",
-    multiple=True,
-    metavar="RUN|RECIPE",
-    shell_complete=complete_runs,
-    help="Keep this run or recipe; repeatable.",
+    "--forget", multiple=True, metavar="OUT", help="Remove what only this deleted dataset needs; repeatable."
 )
-@click.option(
-    "--forget", multiple=True, metavar="DATASET", help="Remove what only this deleted dataset needs; repeatable."
-)
-@min_age_option("1d", "Remove files of killed calls that are older than this (90, 90s, 10m, 2h, 1d).")
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
 @json_option
 def prune(
-    *,
-    store: str,
-    recipe: str | None,
-    keep: tuple[str, ...],
-    forget: tuple[str, ...],
-    min_age_s: float,
-    dry_run: bool,
-    as_json: bool,
+    *, runs: tuple[str, ...], store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool, as_json: bool
 ) -> int:
-    """Remove results of earlier recipes that the current recipe replaces, superseded runs, and files of killed calls.
+    """Remove superseded runs, and those of earlier recipes that the current recipe replaces; or each RUN (or RUN/RECIPE).
 
-    tcpipe keeps everything that a dataset built from this store needs, and directories that contain files of others.
+    tcpipe also removes files of killed calls. It keeps runs that a dataset needs and folders that contain files of others. While
+    another call works on the store it removes nothing.
     """
     from tcpipe.pipeline.prune import prune as run
 
-    found = run(
-        store=store,
-        recipe=resolve_recipe_with_source(recipe)[0],
-        keep=keep,
-        forget=forget,
-        min_age_s=min_age_s,
-        dry_run=dry_run,
-    )
+    found = run(runs, store=store, recipe=resolve_recipe_with_source(recipe)[0], forget=forget, dry_run=dry_run)
     print_result(found, as_json=as_json)
     return 0
 
