@@ -108,7 +108,7 @@ def prune(
         removal = _Removal(opened, first, dry_run, forgotten)
         if (waits_for := _find_running(first, dead, mine)) is None:
             removal.give_up(chosen)
-            payload = _list_payload(opened)
+            payload = list_payload(opened)
             second = opened.scan()
             waits_for = _find_running(second, dead, mine)
             removal.take_back(second, is_all=waits_for is not None)
@@ -195,7 +195,7 @@ def _read_inputs(where: str) -> str | None:
         return None
 
 
-def _list_payload(store: Store) -> dict[str, list[Entry]]:
+def list_payload(store: Store) -> dict[str, list[Entry]]:
     """Return the files of each folder of payload."""
     found: dict[str, list[Entry]] = {name: [] for name in store.place.list(BLOBS) if BLOB.fullmatch(name)}
     for entry in store.place.entries(BLOBS):
@@ -232,7 +232,7 @@ def read_beaten(store: Store, names: Iterable[str]) -> tuple[list[RunFacts | Sto
         kind = name.partition("/")[0]
         if kind in ("runs", "maps"):
             try:
-                records.append(read_record(store.place, name, RunFacts if kind == "runs" else StoredMap))
+                records.append(read_record(store.place, name, RunFacts) if kind == "runs" else read_record(store.place, name, StoredMap))
             except StoreError:
                 damaged.append(name)
     return records, damaged
