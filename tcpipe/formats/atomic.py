@@ -155,9 +155,10 @@ def put_directory(directory: Path, path: Path) -> None:
 
 def _put_synced(directory: Path, place: Path, before: str = _BEFORE) -> None:
     for above, _, files in os.walk(directory):
-        for name in files:
-            with (Path(above) / name).open("rb") as stream:
-                os.fsync(stream.fileno())
+        for path in (Path(above) / name for name in files):
+            if not path.is_symlink():
+                with path.open("rb") as stream:
+                    os.fsync(stream.fileno())
     with lock_directory(place.parent):
         _take_place(directory, place, before)
     _sync_directory(place.parent)

@@ -14,7 +14,7 @@ from tcpipe.formats.bucket_directories import CARDS, FoundCard, find_newest, fin
 from tcpipe.formats.commit_log import COMMIT, LOG, SNAPSHOT, make_snapshot_name, read_snapshot, refresh
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
+from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, find_foreign_files, is_desktop_file, parse_card
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
@@ -60,8 +60,7 @@ _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
 _HOW_MADE = {"dataset": "build", "model": "train", "cost map": "make"}
 
 _KILLED = "was left by a killed command; 'tcpipe prune' removes it"
-_BESIDE = ".aux.xml"
-"""Ending of the statistics that GDAL and QGIS put beside a raster that they look at."""
+_DESKTOP = "a file manager or a GIS program left it; tcpipe ignores it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +146,10 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     wrong = list(find_wrong_files(place, checksums))
     yield from _repair_by(Repair(f"{repair} with --force"), wrong)
     yield "files", len(checksums)
-    yield from (
-        f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)
-    )
+    is_local = kind == "dataset" and place.path is not None
+    for name in find_foreign_files(Path(path), checksums) if is_local else find_unlisted_files(path):
+        full = place.where(name) if is_local else name
+        yield Repair(f"{full}: {_DESKTOP}") if is_desktop_file(name) else f"{full}: is no file of this {kind}"
     if is_bucket(path):
         yield from (line for line in _verify_log(open_place(path)) if isinstance(line, str))
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded

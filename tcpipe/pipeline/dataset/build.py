@@ -17,8 +17,8 @@ from tcpipe.formats.commits import CallRecord, Dataset, Entries
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
-    CROISSANT,
-    REPORT,
+    find_foreign_files,
+    keep_foreign_files,
     parse_card,
     read_card,
     read_intact_card,
@@ -68,6 +68,8 @@ class BuildResult:
     """The recipe's source, as a command found it."""
     estimate: Estimate | None = None
     """Estimate of a dry run, as if each segment became a sample."""
+    foreign_files: tuple[str, ...] = ()
+    """Files in its directory that tcpipe did not write, and keeps."""
 
     def __str__(self) -> str:
         """Return counts, distance breakdown, noise floor, verdict and findings, as plain lines."""
@@ -101,10 +103,12 @@ class BuildResult:
         return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
+        names = list_first(self.foreign_files, most=3)
+        kept = [f"{self.path}: contains {names}, not of the dataset; kept"] if names else []
         if self.card is None or self.card.redaction is None:
-            return []
+            return kept
         publish = f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        return [*self.card.redaction.lines(), publish]
+        return [*kept, *self.card.redaction.lines(), publish]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
@@ -128,7 +132,8 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     left_out = _find_left_out(inputs, known, marks, options.min_runs)
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
     if is_intact and known is not None and known.inputs == inputs.digest:
-        result = _make_result(place, "unchanged", known, left_out)
+        foreign = _find_foreign_files(place, known)
+        result = replace(_make_result(place, "unchanged", known, left_out), foreign_files=foreign)
         _commit_references(log, _describe_dataset(result, inputs))
         return result
     others = [] if known is None or known.inputs == inputs.digest else find_other_options(known, marks, inputs)
@@ -150,7 +155,10 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         with output as directory:
             card = write_dataset(directory, inputs, marks, options.jobs)
             _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
-        result = _make_result(place, "done", card, left_out)
+            foreign = _find_foreign_files(place, known)
+            if isinstance(place, Path):
+                keep_foreign_files(foreign, place, directory)
+        result = replace(_make_result(place, "done", card, left_out), foreign_files=foreign)
         counts = {"runs": len(inputs.runs), "samples": card.samples}
         written = sum(checksum.size_bytes for checksum in card.checksums.values())
         took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
@@ -176,6 +184,11 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         raise StoreError(
             f"{place}: another call has built a dataset here meanwhile and it is kept; run the command again"
         )
+
+
+def _find_foreign_files(place: Path | str, card: DatasetCard | None) -> tuple[str, ...]:
+    """Return the files of others in the directory of a dataset; in a bucket each build has a folder of its own."""
+    return tuple(find_foreign_files(place, card.checksums)) if isinstance(place, Path) and card is not None else ()
 
 
 def _describe_dataset(result: BuildResult, inputs: Inputs) -> Dataset:
@@ -239,10 +252,6 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     except DatasetError as error:
         proved = False
         logger.warning("%s; it is built again", error.problems[0])
-    ours = {*card.checksums, CARD, CROISSANT, REPORT}
-    others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
-    if others:
-        raise UsageError(f"{place}: contains {list_first(others)}, not of the dataset; move it or give another OUT")
     files = ((place / name, entry.size_bytes) for name, entry in card.checksums.items())
     is_whole = all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
     return card, proved and is_whole
