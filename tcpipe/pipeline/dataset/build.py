@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, UsageError, clean_lines, list_first
+from tcpipe.execution import refuse_import_of_script
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
@@ -119,6 +120,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
+    refuse_import_of_script(options.jobs)
     measure, ruling = start_stopwatch(), merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
     out, store, dry_run = options.out, options.store, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
