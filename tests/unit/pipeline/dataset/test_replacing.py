@@ -171,6 +171,15 @@ def test_diff_names_every_input_that_differs(here, name):
     assert diff(here / "a", here / "a").same
 
 
+def test_the_record_of_inputs_is_read_as_it_was_written(here):
+    """Its digest decides whether a dataset is built again."""
+    build_dataset(here / "b", **usual(here, covariates=here / "soil.csv", map_name=["yard", "site"]))
+    for name in ("b", "dataset"):
+        card = read_card(here / name)
+        assert card.made_from.digest == card.inputs
+    assert read_card(here / "b").made_from.map_names == ("yard", "site")
+
+
 def test_diff_names_other_tags_of_a_run(here):
     store = open_store(here / "store")
     store.tag_run("dry", {"weather": "dry", "soil": "clay"})
