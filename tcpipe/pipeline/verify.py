@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
+from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, find_foreign_files, is_desktop_file, parse_card
 from tcpipe.formats.documents import (
     BLOBS,
     INDEX,
@@ -32,7 +32,7 @@ from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.pipeline.calls import list_open_calls
 from tcpipe.pipeline.named_runs import find_named_runs
 from tcpipe.pipeline.problems import find_incomplete_runs
-from tcpipe.pipeline.prune import BLOB, is_note, is_payload, list_payload, name_payload, read_beaten
+from tcpipe.pipeline.prune import BLOB, is_payload, list_payload, name_payload, read_beaten
 from tcpipe.store import Store, is_store
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.levels import COORDINATES, DATA_MODEL_VERSION
@@ -64,6 +64,7 @@ _REPAIRS: Mapping[Kind, str] = {
     "outputs": "remove it and build the dataset again",
 }  # fmt: skip
 """By kind of document: how to repair one that is damaged."""
+_DESKTOP = "a file manager or a GIS program left it; tcpipe ignores it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +142,10 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     wrong = list(find_wrong_files(place, checksums))
     yield from _repair_by(Repair(f"{repair} with --force"), wrong)
     yield "files", len(checksums)
-    yield from (f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not is_note(name))
+    is_local = kind == "dataset" and place.path is not None
+    for name in find_foreign_files(Path(path), checksums) if is_local else find_unlisted_files(path):
+        full = place.where(name) if is_local else name
+        yield Repair(f"{full}: {_DESKTOP}") if is_desktop_file(name) else f"{full}: is no file of this {kind}"
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
         yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 
@@ -178,7 +182,7 @@ def _verify_map(path: Path) -> Iterator[CheckResult]:
     place, checksums = Place(path), read_checksums(path)
     yield from _verify_files(place, checksums, Repair(f"{path}: copy it again, or add the map again with --force"))
     strange = [entry.name for entry in place.entries() if entry.name not in {*checksums, CHECKSUMS}]
-    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_note(name))
+    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_desktop_file(name))
 
 
 def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator[CheckResult]:
@@ -290,7 +294,7 @@ def _verify_names(store: Store, state: State) -> Iterator[CheckResult]:
                 strange.append(f"{BLOBS}/{blob}/{entry.name}")
     for name in strange:
         line = f"{place.where(name)}: is no file of this store"
-        yield Repair(line) if is_note(name) else line
+        yield Repair(line) if is_desktop_file(name) else line
     for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
         if is_abandoned(path):
             yield f"{path}: {_KILLED}"
