@@ -1,6 +1,6 @@
-"""Directories with a sealed card (datasets, models, cost maps) in a bucket, fetched to this machine (ADR-30).
+"""Directories with a sealed card (datasets, models, cost maps) in a bucket, fetched to this machine (ADR-36).
 
-What is built to a URL lies in folders, one for each build; a log of commits says which is the newest (ADR-30)::
+What is built to a URL lies in folders, one for each build; a log of commits says which is the newest (ADR-36)::
 
     log/0000000002.json                         the commit of the second build
     generations/0000000002-1f0c8a3be2d94c57/    its files: the number of its commit, and the digest of its card

@@ -21,7 +21,6 @@ from __future__ import annotations
 import gc
 import hashlib
 import logging
-import secrets
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -29,12 +28,12 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from tcpipe import __version__
 from tcpipe.errors import StoreError
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.json_files import digest, parse_typed_json, to_compact_json, to_json
+from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.runs import RunFacts
 from tcpipe.formats.store_records import Call, Failure, LogSnapshot, Output, Problem, StoredMap, Tags, find_lineage
@@ -92,11 +91,6 @@ def make_key(*parts: object) -> str:
 def make_run_key(sha256: str, recipe_id: str) -> str:
     """Return the key of the run of a content under a recipe."""
     return make_key(sha256, recipe_id)
-
-
-def make_blob_name() -> str:
-    """Return the name of a folder that nobody else writes to."""
-    return secrets.token_hex(_HEX // 2)
 
 
 @dataclass(slots=True)
@@ -337,8 +331,8 @@ def _read_index(place: Place) -> dict[str, bytes]:
 
 
 def _parse_index(data: bytes) -> dict[str, bytes]:
-    with suppress(pa.ArrowException, OSError, KeyError, ValueError):  # what pyarrow raises for damaged files
-        table = pq.ParquetFile(pa.BufferReader(data)).read()
+    with suppress(StoreError, KeyError):
+        table = read_parquet_bytes(data, INDEX)
         rows = dict(zip(table["name"].to_pylist(), table["facts"].to_pylist(), strict=True))
         if (table.schema.metadata or {}).get(_SEAL) == _seal(rows):
             return rows
@@ -346,11 +340,9 @@ def _parse_index(data: bytes) -> dict[str, bytes]:
 
 
 def _write_index(place: Place, rows: Mapping[str, bytes]) -> None:
-    sink = pa.BufferOutputStream()
     columns = [pa.array([*rows], pa.string()), pa.array([*rows.values()], pa.binary())]
     table = pa.Table.from_arrays(columns, ["name", "facts"]).replace_schema_metadata({_SEAL: _seal(rows)})
-    pq.write_table(table, sink, compression="zstd")
-    data = sink.getvalue().to_pybytes()
+    data = write_parquet_bytes(table)
     try:
         place.put(INDEX, data)
     except StoreError:  # a reader that may not write here keeps it in its own cache

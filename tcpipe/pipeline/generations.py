@@ -1,4 +1,4 @@
-"""Writing datasets, models, cost maps and evaluations to a URL: each build is a generation of its own (ADR-30)."""
+"""Writing datasets, models, cost maps and evaluations to a URL: each build is a generation of its own (ADR-36)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Removal of what a store no longer needs: replaced documents, given-up runs, payload that no document names; nothing of a dataset.
 
-A removal is safe beside other calls (ADR-28): only documents that did not count in a first scan go, and only payload that was listed before
+A removal is safe beside other calls (ADR-36): only documents that did not count in a first scan go, and only payload that was listed before
 a second scan and that no document of this scan names. While another call may run, nothing goes.
 """
 

@@ -7,11 +7,11 @@ from datetime import datetime
 import obstore
 import pytest
 from object_gateway import open_bucket
+from tcpipe.formats.commit_log import Stamp, put_commit, read_state
+from tcpipe.formats.commits import Entries, Generation, Process, State
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.bucket_directories import GENERATIONS, find_newest
-from tcpipe.formats.commit_log import Stamp, put_commit, read_state
-from tcpipe.formats.commits import Entries, Generation, Process, State
 from tcpipe.formats.place import Place
 from tcpipe.pipeline import generations
 from tcpipe.pipeline.generations import write_generation
