@@ -188,7 +188,7 @@ class State:
     def add_run(self, row: RunFacts) -> None:
         """Add a run that a worker has written after the scan."""
         self.facts["runs"][make_run_key(row.log.sha256, row.recipe_id)] = row
-        self.blobs |= {row.blob, row.streams_blob}
+        self.blobs |= {row.blob, row.streams_blob} - {""}
         self._joined = None
 
     def add(self, name: Name, record: object) -> None:
@@ -200,7 +200,7 @@ class State:
         self.is_new = False
         if name.kind == "runs":
             row = cast("RunFacts", record)
-            self.blobs |= {row.blob, row.streams_blob}
+            self.blobs |= {row.blob, row.streams_blob} - {""}
         if name.kind in ("runs", "tags"):
             self._joined = None
 
