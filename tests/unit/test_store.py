@@ -15,6 +15,7 @@ from synthetic_store import add_run, change_run, lanes, segments, supersede, tag
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.documents import scan
 from tcpipe.formats.place import Place
+from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, check_map_name, is_store, name_run, open_store
 
@@ -91,6 +92,17 @@ def test_a_run_that_is_written_again_replaces_the_one_before_and_recipes_live_si
         assert [found.name for found in store.find_runs(run.name)] == [run.name]
         assert run.manifest.recipe_id == run.recipe_id
     assert store.find_runs(f"{RUN}/nosuch") == store.find_runs("nosuch") == []
+
+
+def test_a_run_whose_tables_were_given_up_does_not_count_in_the_call_that_gives_them_up_either(root):
+    store = open_store(root, create=True)
+    put(store)
+    state = store.scan()
+    (row,) = state.list_rows()
+    forget_tables(store, state, row)
+    for found in (state, store.scan()):
+        (row,) = found.list_rows()
+        assert (row.blob, found.has_payload(row), store.runs(found)) == ("", False, [])
 
 
 def test_two_that_write_one_run_at_once_write_to_folders_of_their_own_and_all_readers_find_the_same_one(root):
