@@ -91,20 +91,21 @@ def test_rellis_plays_its_roles_by_the_topics_of_its_readme() -> None:
 def test_schedulers_call_commands_and_options_that_exist() -> None:
     """Their own parsers read them in addition (systemd-analyze verify, crontab -n, bash -n), where those are."""
     checks = {
+        "nightly.sh": ["bash", "-n"],
         "slurm/night.sbatch": ["bash", "-n"],
         "slurm/cluster.sbatch": ["bash", "-n"],
         "crontab": ["crontab", "-n"],
         "systemd/tcpipe-night.timer": ["systemd-analyze", "calendar"],
     }
     seen = 0
-    for path in (PIPELINES / "systemd/tcpipe-night.service", *(PIPELINES / name for name in checks)):
-        for call in re.findall(
-            r"(?<!Description=)\btcpipe (ingest|build-dataset|status)\b([^;|>&\n]*)", path.read_text()
-        ):
+    for path in (PIPELINES / name for name in checks):
+        for call in re.findall(r"\b(?:tcpipe|run) (ingest|build-dataset|status)\b([^;|>&\n]*)", path.read_text()):
             options = {option for of in cli.commands[call[0]].params for option in of.opts}
-            assert set(re.findall(r"--[a-z-]+", call[1])) <= options, (path, call)
+            given = set(re.findall(r"--[a-z-]+", call[1]))
+            assert given <= options, (path, call)
+            assert call[0] != "ingest" or "--existing-store" in given, path
             seen += 1
-    assert seen >= 6
+    assert seen >= 5
     for name, checker in checks.items():
         if shutil.which(checker[0]):
             what = "*-*-* 02:15:00" if checker[1] == "calendar" else PIPELINES / name
