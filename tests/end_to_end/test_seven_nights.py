@@ -12,7 +12,6 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
@@ -97,21 +96,14 @@ def full_disk(data: Path) -> Iterator[str]:
     filler.unlink()
 
 
-@dataclass(frozen=True)
-class Morning:
-    """What a night left."""
-
-    mail: str
-    exit_code: int
-    samples: int
-
-
 class Crontab:
     """The job of `pipelines/crontab` on another directory, night after night."""
 
     def __init__(self, data: Path, tmp_path: Path) -> None:
         """Copy the job's program, so that it can be changed as a user changes it."""
-        self._data, self._bin = data, tmp_path / "bin"
+        self.data, self.recordings = data, data / "recordings"
+        self.recordings.mkdir()
+        self._bin = tmp_path / "bin"
         self._bin.mkdir()
         shutil.copy(PIPELINES / "nightly.sh", self._bin)
         self.change_program("--jobs 4", "--jobs 1")
@@ -129,6 +121,12 @@ class Crontab:
         }
         self._night = 0
 
+    @property
+    def samples(self) -> int:
+        """Number of samples in the dataset."""
+        card = self.data / "dataset" / "dataset.json"
+        return int(json.loads(card.read_text())["samples"]) if card.exists() else 0
+
     def start(self, before: str = "") -> subprocess.Popen[str]:
         """Begin a night, a day after the one before."""
         self._night += 1
@@ -142,19 +140,16 @@ class Crontab:
             start_new_session=True,
         )
 
-    def run(self, before: str = "") -> Morning:
-        """Run a whole night."""
+    def run(self, before: str = "") -> tuple[str, int]:
+        """Run a whole night; return the mail and the exit code."""
         with self.start(before) as job:
             mail = job.communicate(timeout=HANGS_S)[0]
-        card = self._data / "dataset" / "dataset.json"
-        return Morning(mail, job.returncode, json.loads(card.read_text())["samples"] if card.exists() else 0)
+        return mail, job.returncode
 
-    def by_hand(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+    def run_by_hand(self, *arguments: str) -> None:
         """Run a command as the user does in the morning, who works in the directory."""
         environment = self._environment | {"CLOCK_AHEAD_S": str(self._night * _DAY_S + _DAY_S // 4)}
-        return subprocess.run(
-            [COMMAND, *arguments], cwd=self._data, env=environment, capture_output=True, text=True, check=False
-        )
+        subprocess.run([COMMAND, *arguments], cwd=self.data, env=environment, capture_output=True, check=True)
 
     def change_program(self, old: str, new: str) -> None:
         """Edit nightly.sh."""
@@ -176,82 +171,111 @@ def crontab(data: Path, tmp_path: Path) -> Crontab:
     return Crontab(data, tmp_path)
 
 
+Drives = dict[str, Path]
 SILENT = ("", 0)
 
 
-def test_seven_nights(crontab: Crontab, data: Path, drives: dict[str, Path]) -> None:
-    recordings = data / "recordings"
-    recordings.mkdir()
-    (data / "tcpipe.toml").write_text('[split]\nholdout = "sample"\n')
+def lack_the_store(crontab: Crontab, drives: Drives) -> None:
+    """The disk with the store is not mounted: no store is made in its place."""
+    (crontab.data / "tcpipe.toml").write_text('[split]\nholdout = "sample"\n')
+    shutil.copy(drives["first"], crontab.recordings / "first.mcap")
+    mail, exit_code = crontab.run()
+    assert "tcpipe ingest recordings --existing-store" in mail
+    assert f"{crontab.data}/store" in mail
+    assert (exit_code, (crontab.data / "store").exists()) == (1, False)
+    layers = {layer: drives[layer] for layer in ("height", "terrain", "classes")}
+    add_map("site", **layers, store=crontab.data / "store")
 
-    # No store: the disk with it is not mounted. Nothing is made in its place.
-    shutil.copy(drives["first"], recordings / "first.mcap")
-    morning = crontab.run()
-    assert "tcpipe ingest recordings --existing-store" in morning.mail
-    assert f"{data}/store" in morning.mail
-    assert (morning.exit_code, (data / "store").exists()) == (1, False)
-    add_map("site", **{layer: drives[layer] for layer in ("height", "terrain", "classes")}, store=data / "store")
 
-    # 1. A new log.
-    morning = crontab.run()
-    assert (morning.mail, morning.exit_code) == SILENT
-    first = morning.samples
-    assert first > 0
+def bring_a_new_log(crontab: Crontab, _: Drives) -> None:
+    assert crontab.run() == SILENT
+    assert crontab.samples > 0
 
-    # 2. A damaged log: it is named, what can be read is used, and it is named again until somebody acknowledges it.
-    (recordings / "second.mcap").write_bytes(drives["second"].read_bytes()[:500_000])
-    morning = crontab.run()
-    assert "tcpipe ingest recordings --existing-store --jobs 1 --min-age 10m --quiet: exit code 3\n" in morning.mail
-    assert "second.mcap: the file ends inside a chunk or record" in morning.mail
-    assert "tcpipe build-dataset" not in morning.mail
-    assert "tcpipe status: exit code 3\n" in morning.mail
-    assert morning.samples > first
-    crontab.by_hand("acknowledge", "recordings/second.mcap").check_returncode()
 
-    # 3. A second robot: the dataset stays as it is, and every night says so until the job names a robot.
-    before = morning.samples
-    shutil.copy(drives["jackal"], recordings / "jackal.mcap")
-    morning = crontab.run()
-    assert "tcpipe build-dataset dataset --jobs 1 --quiet: exit code 1\n" in morning.mail
-    assert "runs of 2 robots (husky, jackal); name one with --robot" in morning.mail
-    assert (morning.samples, "tcpipe ingest" in morning.mail) == (before, False)
-    # Status of outputs: "tcpipe status: exit code 3" in the mail, and `crontab.by_hand("status").returncode == 3`.
+def bring_a_damaged_log(crontab: Crontab, drives: Drives) -> None:
+    """It is named, and what can be read of it is used."""
+    before = crontab.samples
+    (crontab.recordings / "second.mcap").write_bytes(drives["second"].read_bytes()[:500_000])
+    mail, _ = crontab.run()
+    assert "tcpipe ingest recordings --existing-store --jobs 1 --min-age 10m --quiet: exit code 3\n" in mail
+    assert "second.mcap: the file ends inside a chunk or record" in mail
+    assert "tcpipe status: exit code 3\n" in mail
+    assert "tcpipe build-dataset" not in mail
+    assert crontab.samples > before
+    crontab.run_by_hand("acknowledge", "recordings/second.mcap")
+
+
+def bring_a_second_robot(crontab: Crontab, drives: Drives) -> None:
+    """The dataset stays as it is until the job names a robot."""
+    before = crontab.samples
+    shutil.copy(drives["jackal"], crontab.recordings / "jackal.mcap")
+    mail, _ = crontab.run()
+    assert "tcpipe build-dataset dataset --jobs 1 --quiet: exit code 1\n" in mail
+    assert "runs of 2 robots (husky, jackal); name one with --robot" in mail
+    assert ("tcpipe ingest" in mail, crontab.samples) == (False, before)
+    # When status knows outputs: assert "tcpipe status: exit code 3\n" in mail
     crontab.change_program("build-dataset dataset", "build-dataset dataset --robot husky")
 
-    # 4. The recipe changes: its runs are made, the dataset is not replaced before somebody asks for it.
-    (data / "tcpipe.toml").write_text('[split]\nholdout = "sample"\n[mask]\nrequire_full_speed = false\n')
-    morning = crontab.run()
-    assert "tcpipe build-dataset dataset --robot husky --jobs 1 --quiet: exit code 2\n" in morning.mail
-    assert "recipe mask.require_full_speed: yes in the dataset, no now" in morning.mail
-    assert (morning.samples, "tcpipe ingest" in morning.mail) == (before, False)
-    # Status of outputs: "tcpipe status: exit code 3" in the mail, and `crontab.by_hand("status").returncode == 3`.
-    crontab.by_hand("build-dataset", "dataset", "--robot", "husky", "--force").check_returncode()
 
-    # 5. A full disk: each command that failed says so; the next night completes the work.
-    shutil.copy(drives["third"], recordings / "third.mcap")
-    with full_disk(data) as limit:
-        morning = crontab.run(limit)
-    assert "tcpipe ingest recordings" in morning.mail
-    assert "third.mcap: " in morning.mail
-    assert ("No space left on device" if data.is_mount() else "File too large") in morning.mail
-    assert morning.exit_code == 1
+def change_the_recipe(crontab: Crontab, _: Drives) -> None:
+    """The runs are made again; the dataset is not replaced before somebody asks for it."""
+    before = crontab.samples
+    with (crontab.data / "tcpipe.toml").open("a") as recipe:
+        recipe.write("[mask]\nrequire_full_speed = false\n")
+    mail, _ = crontab.run()
+    assert "tcpipe build-dataset dataset --robot husky --jobs 1 --quiet: exit code 2\n" in mail
+    assert "recipe mask.require_full_speed: yes in the dataset, no now" in mail
+    assert ("tcpipe ingest" in mail, crontab.samples) == (False, before)
+    # When status knows outputs: assert "tcpipe status: exit code 3\n" in mail
+    crontab.run_by_hand("build-dataset", "dataset", "--robot", "husky", "--force")
 
-    # 6. The log of a complete run is archived. The third log, which had no room, is ingested now.
-    (recordings / "first.mcap").unlink()
-    morning = crontab.run()
-    assert (morning.mail, morning.exit_code) == SILENT
-    assert morning.samples > before
-    assert not [*data.rglob(".tmp-*")]
 
-    # 7. A night that hangs: the next one does not start beside it, and shows what it printed.
-    hung = crontab.add_program("tcpipe", "#!/bin/sh\necho reading third.mcap\nexec sleep 3600\n")
-    with crontab.start() as sleeping:
-        while "reading" not in "".join(path.read_text() for path in (data / "night").glob("ingest.txt")):
+def fill_the_disk(crontab: Crontab, drives: Drives) -> None:
+    """Each command that fails is named with its reason, though the disk has no room for what it prints."""
+    shutil.copy(drives["third"], crontab.recordings / "third.mcap")
+    with full_disk(crontab.data) as limit:
+        mail, exit_code = crontab.run(limit)
+    assert "tcpipe ingest recordings" in mail
+    assert "third.mcap: " in mail
+    assert ("No space left on device" if crontab.data.is_mount() else "File too large") in mail
+    # When calls are recorded with their message: assert "tcpipe status: exit code 3\n" in mail
+    assert exit_code == 1
+
+
+def archive_a_log(crontab: Crontab, _: Drives) -> None:
+    """The log of a complete run is no longer there; the third log, for which there was no room, is ingested."""
+    before = crontab.samples
+    (crontab.recordings / "first.mcap").unlink()
+    assert crontab.run() == SILENT
+    assert crontab.samples > before
+    assert not [*crontab.data.rglob(".tmp-*")]
+
+
+def hang(crontab: Crontab, _: Drives) -> None:
+    """The next night does not start beside one that hangs, and shows what that one printed; the night after is as any other."""
+    complete = crontab.samples
+    sleeper = crontab.add_program("tcpipe", "#!/bin/sh\necho reading third.mcap\nexec sleep 3600\n")
+    with crontab.start() as hanging:
+        while "reading" not in "".join(path.read_text() for path in crontab.data.glob("night/ingest.txt")):
             time.sleep(0.05)
-        hung.unlink()
-        complete, morning = morning.samples, crontab.run()
-        assert "An earlier night still runs. It has printed:\nreading third.mcap\n" in morning.mail
-        assert (morning.exit_code, morning.samples) == (1, complete)
-        os.killpg(sleeping.pid, signal.SIGKILL)
-    morning = crontab.run()
-    assert (morning.mail, morning.exit_code, morning.samples) == (*SILENT, complete)
+        sleeper.unlink()
+        mail, exit_code = crontab.run()
+        os.killpg(hanging.pid, signal.SIGKILL)
+    assert "An earlier night still runs. It has printed:\nreading third.mcap\n" in mail
+    assert exit_code == 1
+    assert crontab.run() == SILENT
+    assert crontab.samples == complete
+
+
+def test_seven_nights(crontab: Crontab, drives: Drives) -> None:
+    for night in (
+        lack_the_store,
+        bring_a_new_log,
+        bring_a_damaged_log,
+        bring_a_second_robot,
+        change_the_recipe,
+        fill_the_disk,
+        archive_a_log,
+        hang,
+    ):
+        night(crontab, drives)
