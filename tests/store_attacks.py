@@ -1,4 +1,4 @@
-"""Calls on one store that are killed, or interrupted by another call, before any of their requests; see `tests/unit/pipeline/test_store_attacks.py`."""
+"""Calls on one store that are killed, or interrupted by another call, before any of their requests."""
 
 import shutil
 import threading
@@ -88,7 +88,7 @@ class World:
 
     def patch(self, monkeypatch: pytest.MonkeyPatch, *, is_light: bool = True) -> None:
         """Let each request to the store, on disk or in a bucket in memory, begin with a `step`."""
-        do, put_files = Place._do, Place.put_files  # noqa: SLF001  every request goes through it
+        do, put_files = Place._do, Place.put_files
 
         def do_stepwise(self_: Place, *args: object, **how: object) -> object:
             if self_.path is not None:
@@ -184,7 +184,7 @@ class World:
         return next(row.run_id for row in self.scan().list_rows() if row.run_id.startswith(stem))
 
     def scan(self) -> State:
-        documents._DECODED.clear()  # noqa: SLF001  as another process
+        documents._DECODED.clear()
         return Store(self.root).scan()
 
     def save(self) -> dict[str, bytes]:
@@ -287,7 +287,7 @@ def _ingest_lightly(task: IngestTask, *, hashed: list[str]) -> object:
     return make_result(task.source, "done", row, sha256, same_as=None)
 
 
-_REAL_INGEST, _REAL_DO, _REAL_PUT_FILES = ingest_run._ingest, Place._do, Place.put_files  # noqa: SLF001
+_REAL_INGEST, _REAL_DO, _REAL_PUT_FILES = ingest_run._ingest, Place._do, Place.put_files
 
 
 def write_logs(folder: Path) -> Path:
