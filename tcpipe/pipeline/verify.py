@@ -217,9 +217,9 @@ def _verify_documents(place: Place) -> Iterator[CheckResult]:
         names = [str(name) for file in place.list(kind) if (name := parse_name(kind, file)) is not None]
         yield "documents", len(names)
         damaged = place.map(lambda name, kind=kind: _is_damaged(place, kind, name), names)  # type: ignore[misc]
-        for name in itertools.compress(names, damaged):
-            yield f"{place.where(name)}: is missing or has changed since it was written"
-            yield Repair(f"{place.where(name)}: copy it again, or {_REPAIRS[kind]}")
+        for where in map(place.where, itertools.compress(names, damaged)):
+            yield f"{where}: is missing or has changed since it was written"
+            yield Repair(f"{where}: copy it again, or {_REPAIRS[kind]}")
 
 
 def _is_damaged(place: Place, kind: Kind, name: str) -> bool:
