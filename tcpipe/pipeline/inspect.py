@@ -46,7 +46,7 @@ class InspectedRecipe(RunFacts):
     """A run under one recipe: its facts, and the verdict by the catalogue of this version."""
 
     counts: Counts
-    verdict: Verdict
+    verdict: Verdict = field()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
