@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -97,15 +96,15 @@ def check_kind(url: str, card: str) -> None:
 
 
 @contextmanager
-def write_output(url: str, card: str) -> Iterator[Path]:
-    """Yield a directory; its files at the end, a card among them, become the newest build at a URL.
+def write_output(url: str, card: str, name: str) -> Iterator[Path]:
+    """Yield a directory; its files at the end, a card among them, become the newest build at a URL, in a folder with a random name.
 
     Builds that were replaced more than seven days ago are removed then, and folders of that age that no pointer names.
 
     Raises `UsageError`: something else is at the URL; `StoreError`: the place cannot be read or written.
     """
     check_kind(url, card)
-    place, folder = open_place(url), f"{BUILDS}/{secrets.token_hex(8)}"
+    place, folder = open_place(url), f"{BUILDS}/{name}"
     with make_scratch_directory() as scratch:
         directory = scratch / url.rstrip("/").rpartition("/")[2]
         directory.mkdir()

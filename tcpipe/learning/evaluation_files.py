@@ -32,6 +32,7 @@ from tcpipe.learning.models import load_model, read_model_card
 from tcpipe.learning.own_models import load_own_kind
 from tcpipe.learning.predictions import check_fit, collect_runs
 from tcpipe.learning.training import compute_dataset_checksum
+from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.tables.findings import PREDICTED
 
 SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
@@ -87,7 +88,7 @@ def run_evaluation(
     if is_url(out):
         if (known := _read_at_url(str(out), key)) is not None:
             return known
-        with write_output(str(out), JSON) as made:
+        with write_output(str(out), JSON, make_blob_name()) as made:
             result = run_evaluation(model, dataset, made, config=config, plant=plant, predictor=predictor)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)

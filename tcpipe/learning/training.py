@@ -44,6 +44,7 @@ from tcpipe.learning.predictor import (
     find_held_out,
     find_kind,
 )
+from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
 from tcpipe.terrain.layers import COLOURS, LAYERS, PAPER_LAYERS
 from tcpipe.terrain.sampling import compute_relief_m
@@ -221,7 +222,7 @@ def _train_into_bucket(url: str, key: str, run: Callable[[Path], TrainResult]) -
     known = read_model_card(fetch_directory(url)) if find_newest(url, [CARD]) else None
     if known is not None and known.training.key == key:
         return _make_result(url, "unchanged", known.training, TrainingTimes())
-    with write_output(url, CARD) as place:
+    with write_output(url, CARD, make_blob_name()) as place:
         result = run(place)
     return replace(result, path=url)
 

@@ -40,6 +40,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
 from tcpipe.formats.published_outputs import find_newest, write_output
 from tcpipe.learning.models import Model
+from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
     BARRED,
@@ -194,7 +195,7 @@ def make_cost_map(
         known = read_cost_map_card(fetch_directory(url)) if find_newest(url, [CARD]) else None
         if known is not None and (known.key, known.origin_deg) == (key, origin_deg):
             return CostMapResult(url, "unchanged", known)
-        with write_output(url, CARD) as place:
+        with write_output(url, CARD, make_blob_name()) as place:
             made = make_cost_map(model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step)
         return replace(made, path=url)
     out = Path(out)

@@ -25,6 +25,7 @@ from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.published_outputs import require_card, write_output
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.learning.models import Model
+from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.planning.cost_model import Reason, check_model, predict_segments
 from tcpipe.planning.path_cost import find_added_turning
@@ -329,7 +330,7 @@ def evaluate_drives(
     Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
     """
     if is_url(out):
-        with write_output(str(out), JSON) as made:
+        with write_output(str(out), JSON, make_blob_name()) as made:
             result = evaluate_drives(model, data, source, logs, store=store, out=made)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place, opened = Path(out), open_store(store)

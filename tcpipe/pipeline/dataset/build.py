@@ -29,7 +29,7 @@ from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
 from tcpipe.formats.store_records import Output
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
+from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, make_blob_name, record_call
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
@@ -190,7 +190,11 @@ def _build(
     prove_maps(call.store, job.inputs.map_records)
     from tcpipe.pipeline.dataset.writing import write_dataset  # noqa: PLC0415  slow to import, and often nothing is to be built
 
-    output = write_output(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
+    output = (
+        write_output(place, CARD, make_blob_name())
+        if isinstance(place, str)
+        else write_atomic_directory(place.absolute())
+    )
     return_freed_memory()
     with output as directory:
         card = write_dataset(directory, job.inputs, job.marks, options.jobs)

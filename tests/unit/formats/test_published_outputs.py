@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import uuid
 from concurrent.futures import ThreadPoolExecutor
 
@@ -40,7 +41,7 @@ def aged(served, tmp_path):
 
 
 def write(place, text, card=CARD):
-    with write_output(place.root, card) as directory:
+    with write_output(place.root, card, secrets.token_hex(8)) as directory:
         listed = {"data": {"size_bytes": len(text), "sha256": hashlib.sha256(text.encode()).hexdigest()}}
         (directory / card).write_text(json.dumps({"text": text, "checksums": listed}))
         (directory / "data").write_text(text)
@@ -90,7 +91,7 @@ def test_a_build_is_a_folder_and_one_small_pointer_that_its_digest_proves(place)
 
 
 def test_of_two_at_once_one_wins_and_none_mixes(place):
-    with write_output(place.root, CARD) as mine:
+    with write_output(place.root, CARD, "0" * 16) as mine:
         write(place, "theirs")
         (mine / CARD).write_text('{"text": "mine", "checksums": {}}')
         (mine / "data").write_text("mine")

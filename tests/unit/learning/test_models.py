@@ -137,7 +137,7 @@ def test_what_does_not_belong_to_a_model_is_named(tmp_path, place):
 
 @pytest.mark.usefixtures("served")
 def test_a_model_in_a_bucket_is_the_one_on_disk(place):
-    with write_output("s3://tests/a b", "model.json") as directory:
+    with write_output("s3://tests/a b", "model.json", "0" * 16) as directory:
         shutil.copytree(place, directory, dirs_exist_ok=True)
     there = load_model("s3://tests/a b")
     assert (there.checksum, there.name) == (load_model(place).checksum, "s3://tests/a b")
