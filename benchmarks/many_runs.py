@@ -1,101 +1,117 @@
-"""Nights on a store of 10,000 runs: what it costs to ingest nothing, to tell where everything stands, to choose a dataset's runs, to prune.
+"""Nights on a store of 10,000 runs: CPU time and memory of whole commands, with the index of the store and without it.
 
 ::
 
-    python benchmarks/many_runs.py DIRECTORY [RUNS]
-    python benchmarks/many_runs.py DIRECTORY RUNS new      one new log alone, with the memory that it takes
+    python benchmarks/many_runs.py DIRECTORY [RUNS] [COMMAND...]     commands: status, ingest, new, build-dataset (default: all)
 
-Logs and runs are copies of one short drive under other names, hashes and times, laid out as ingestion would have; documents have its size.
-10,000 take one CPU minute, 100,000 eleven and 8 GB.
+Runs are synthetic: four segments on a small map, with the findings, sensors and topics of one short drive, so that documents have its size.
+Logs are files of eight bytes under the names, sizes and times that the store has seen. 10,000 take two CPU minutes, 100,000 need 12 GB.
 """
 
 import hashlib
 import os
-import re
-import resource
 import shutil
+import subprocess
 import sys
 import time
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from tcpipe.formats.commits import Entries
+from tcpipe.formats.documents import BLOBS, INDEX, State, make_key
 from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.logs.writing import write_mcap
-from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.calls import open_log
-from tcpipe.pipeline.dataset.inputs import remove_duplicates
-from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.pipeline.ingest import ingest
+from tcpipe.formats.runs import LogOrigin, Run
+from tcpipe.formats.store_records import find_lineage
+from tcpipe.formats.stored_runs import StoredRun
+from tcpipe.pipeline.calls import INGEST, make_blob_name, record_call
+from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
-from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.prune import prune
-from tcpipe.pipeline.status import find_status
+from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from synthetic_store import add_run, add_world, driven, lanes, segments
 from wheel_drives import wheel_drive
 
-T = TypeVar("T")
-
 DAY_NS = 86_400 * 10**9
-SEAL = re.compile(r'(?m)^  "document_sha256": "([0-9a-f]{64})"(,?)\n')
+FIRST_NS = 10**18
+STEM = "drive_"
+SHARED = ("findings", "sensors", "topics", "notes", "read_report", "distance_by_reason_m", "physics")
+"""What a synthetic run has of the drive that was ingested."""
+LIMITS = {"status": (1.2, None), "ingest": (None, None), "new": (2.2, 300), "build-dataset": (2.5, 300)}
+"""CPU time [s] and memory [MB] of a command with 10,000 runs, where the index is there."""
 
 
-def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
+def make_many_runs(directory: Path, count: int) -> tuple[Path, Path]:
     """Return a folder of so many logs and a store that has them all."""
-    logs, store = directory / f"logs-{count}", Store(directory / f"store-{count}")
-    if Path(store.root).exists():
-        return logs, store
+    logs, root = directory / f"logs-{count}", directory / f"store-{count}"
+    if root.exists():
+        return logs, root
+    os.fsync = lambda _: None  # type: ignore[assignment]  all of it can be made again
     write_mcap(directory / "one.mcap", wheel_drive())
     ingest([directory / "one.mcap"], store=directory / "one", recipe=Recipe())
-    (run,) = Store(directory / "one").runs()
+    (one,) = Store(directory / "one").runs()
     logs.mkdir(parents=True)
     for number in range(count):
-        (logs / f"drive_{number:05d}.mcap").write_bytes(b"%08d" % number)
-    open_store(store.root, create=True)
-    log, sources = open_log(store), find_sources([logs], as_one=False, staging=Path()).sources
-    segments = run.table("segments")
-    for start in range(0, count, 100):
-        made = [
-            _copy(run, segments, store, source, start + at) for at, source in enumerate(sources[start : start + 100])
-        ]
-        log.commit(
-            "ingested",
-            Entries(runs=tuple(of for each in made for of in each.runs), seen=tuple(of.seen[0] for of in made)),
-        )
-    return logs, store
+        (logs / f"{STEM}{number:06d}.mcap").write_bytes(b"%08d" % number)
+    store = open_store(root, create=True)
+    add_world(store)
+    with record_call(store, INGEST, [str(logs.absolute())], CallOptions()) as call:
+        call.begin()
+        first = _add_first(store, one.manifest)
+        call.state, table = store.scan(), first.table("segments")
+        for source in find_sources([logs.absolute()], as_one=False, staging=Path()).sources:
+            _add_copy(store, call.state, first, table, source)
+        forget_tables(store, call.state, first.facts)
+    return logs, root
 
 
-def _copy(run: RunDirectory, segments: pa.Table, store: Store, source: LogSource, number: int) -> Entries:
+def _add_first(store: Store, run: Run) -> StoredRun:
+    """Add a run of a drive straight ahead, with all that the run of a real log has beside its segments."""
+    table = segments("first", *lanes(0.0, -2.0, 2.0), start_ns=FIRST_NS)
+    shared = {name: getattr(run, name) for name in SHARED}
+    add_run(store, "first", table, track=driven(table), facts=run.info.report.facts, recording=run.recording, **shared)
+    (first,) = store.runs()
+    return first
+
+
+def _add_copy(store: Store, state: State, first: StoredRun, table: pa.Table, source: LogSource) -> None:
+    number = int(source.stem.removeprefix(STEM))
     sha256 = hashlib.sha256(str(number).encode()).hexdigest()
-    run_id = f"{source.stem}-{sha256[:8]}"
-    there = run.file("segments.parquet").parent
-    place = Path(store.root) / "runs" / run_id / run.recipe_id / there.name
-    place.mkdir(parents=True)
+    run_id, offset_ns, blob = f"{source.stem}-{sha256[:8]}", number * DAY_NS, make_blob_name()
+    changed = {name: pc.add(table.column(name), offset_ns) for name in ("start_ns", "end_ns")}
+    changed["run_id"] = pa.array([run_id] * table.num_rows)
+    changed["segment_id"] = pa.array([f"{run_id}-{stamp}" for stamp in changed["start_ns"].to_pylist()])
+    for name, column in changed.items():
+        at = table.schema.get_field_index(name)
+        table = table.set_column(at, table.schema.field(at), column)
+    folder = Path(store.root) / BLOBS / blob
+    folder.mkdir()
     for name in ("track", "rejections"):
-        _link(there / f"{name}.parquet", place / f"{name}.parquet")
-    for stream in there.parents[1].glob("streams/*/*.parquet"):
-        linked = place.parents[1] / stream.relative_to(there.parents[1])
-        linked.parent.mkdir(parents=True, exist_ok=True)
-        _link(stream, linked)
-    for name in ("start_ns", "end_ns"):
-        at, column = segments.schema.get_field_index(name), pc.add(segments.column(name), number * DAY_NS)
-        segments = segments.set_column(at, segments.schema.field(name), column)
-    pq.write_table(segments, place / "segments.parquet")
-    new, old = compute_checksum(place / "segments.parquet"), run.checksum("segments.parquet")
-    log = run.facts.log.source
-    names = {run.run_id: run_id, log.sha256: sha256, log.paths[0]: source.origins[0], old.sha256: new.sha256}
-    names |= {f'"size_bytes": {old.size_bytes}': f'"size_bytes": {new.size_bytes}'}
-    for document in (Path(run.recipe_id, "manifest-1.json"), Path("run-1.json")):
-        (place.parents[1] / document).write_text(_renamed((there.parents[1] / document).read_text(), names))
-    return Entries(runs=tuple(store.read_rows(run_id).values()), seen=(source.sighting(sha256),))
+        _link(first.file(f"{name}.parquet"), folder / f"{name}.parquet")
+    pq.write_table(table, folder / "segments.parquet")
+    manifest, checksum = first.manifest, compute_checksum(folder / "segments.parquet")
+    assert manifest.recording is not None
+    run = replace(
+        manifest,
+        run_id=run_id,
+        info=replace(manifest.info, run_id=run_id),
+        log=LogOrigin(source.origins, sha256, source.size_bytes),
+        recording=replace(manifest.recording, first_ns=FIRST_NS + offset_ns, last_ns=FIRST_NS + offset_ns + 10**10),
+        start_ns=FIRST_NS + offset_ns,
+        end_ns=FIRST_NS + offset_ns + 10**10,
+        blob=blob,
+        streams_blob=blob,
+        tables={**manifest.tables, "segments.parquet": checksum},
+    )
+    store.put_run(state, run)
+    store.put(state, "seen", make_key(find_lineage(source.origins)), source.sighting(sha256))
 
 
 def _link(file: Path, link: Path) -> None:
@@ -107,58 +123,54 @@ def _link(file: Path, link: Path) -> None:
         os.link(file, link)
 
 
-def _renamed(text: str, names: dict[str, str]) -> str:
-    for old, new in names.items():
-        text = text.replace(old, new)
-    bare = hashlib.sha256(SEAL.sub("", text).encode()).hexdigest()
-    return SEAL.sub(lambda found: f'  "document_sha256": "{bare}"{found[2]}\n', text)
+def run_command(what: str, *words: str | Path, cwd: Path, codes: tuple[int, ...] = (0,)) -> tuple[float, float]:
+    """Run a whole command and print its wall time, CPU time and memory; return the CPU time [s] and the memory [MB]."""
+    begin = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tcpipe", *map(str, words)], cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    said = process.stdout.read() if process.stdout else b""
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    cpu_s, memory_mb, wall_s = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, time.perf_counter() - begin
+    print(f"{what:<24} {wall_s:6.2f} s wall, {cpu_s:6.2f} s CPU, {memory_mb:5.0f} MB", flush=True)
+    assert process.returncode in codes, said.decode()
+    return cpu_s, memory_mb
 
 
-def timed(what: str, act: Callable[[], T]) -> T:
-    wall, cpu = time.perf_counter(), time.process_time()
-    found = act()
-    print(f"{what:<32} {time.perf_counter() - wall:6.2f} s wall, {time.process_time() - cpu:6.2f} s CPU", flush=True)
-    return found
-
-
-def once(store: Store, chosen: SelectedRuns) -> int:
-    return len(remove_duplicates(store, chosen.runs, chosen.logs).runs)
-
-
-def ingest_new_logs(directory: Path, count: int) -> None:
-    """Ingest a new log into an empty store, twice, as the first one loads libraries, and into the store of many runs."""
-    logs, store = many_runs(directory, count)
-    stores = {"into an empty store, first": None, "into an empty store, again": None, "one new log": store.root}
-    for what, root in stores.items():
-        new = directory / f"new-{time.time_ns()}.mcap"
-        write_mcap(new, wheel_drive(seed=time.time_ns() % 2**31))
-        given, where = [new] if root is None else [logs, new], root or new.with_suffix("")
-        summary = timed(what, lambda given=given, where=where: ingest(given, store=where, recipe=Recipe()))
-        assert [result.status for result in summary.results].count("done") == 1
-        print(f"largest memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB", flush=True)
+def measure(what: str, directory: Path, logs: Path, root: Path) -> list[str]:
+    """Measure a command twice with the index and once without it; return what is above its limits."""
+    store = ["--store", root]
+    new = directory / f"new-{root.name}"
+    words: dict[str, list[str | Path]] = {
+        "status": ["status", root],
+        "ingest": ["ingest", logs, *store, "--quiet"],
+        "new": ["ingest", logs, new, *store, "--quiet"],
+        "build-dataset": ["build-dataset", directory / f"dataset-{root.name}", *store],
+    }
+    figures = []
+    for how in ("first", "warm", "warm", "cold"):
+        if how == "cold":
+            (root / INDEX).unlink(missing_ok=True)
+        if what == "new":
+            new.mkdir(exist_ok=True)
+            seed = time.time_ns() % 2**31
+            write_mcap(new / f"{seed}.mcap", wheel_drive(seed=seed, start_ns=time.time_ns()))
+        codes = (0, 3) if what == "build-dataset" else (0,)
+        figures.append(run_command(f"{what}, {how}", *words[what], cwd=directory, codes=codes))
+    limits = [(of, limit) for of, limit in zip(np.min(figures[1:3], axis=0), LIMITS[what], strict=True) if limit]
+    return [f"{what}: {found:.3g}, expected {limit:g}" for found, limit in limits if found > limit]
 
 
 def main() -> None:
-    directory, count = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 10_000
-    if sys.argv[3:] == ["new"]:
-        ingest_new_logs(directory, count)
-        return
+    directory, count = Path(sys.argv[1]).absolute(), int(sys.argv[2]) if len(sys.argv) > 2 else 10_000
     directory.mkdir(parents=True, exist_ok=True)
-    logs, store = timed("synthesise", lambda: many_runs(directory, count))
-    timed("read the log", store.state)
-    for again in ("first", "again"):
-        summary = timed(f"nothing to ingest, {again}", lambda: ingest([logs], store=store.root, recipe=Recipe()))
-        assert {result.status for result in summary.results} == {"unchanged"}
-        found = timed(
-            f"status, {again}",
-            lambda: find_status(IngestOptions([logs], store=store.root, recipe=Recipe(), min_age_s=600.0)),
-        )
-        assert found.counts == {"done": count}, found.counts
-        chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
-        assert timed(f"each drive once, {again}", lambda chosen=chosen: once(store, chosen)) >= count
-        assert not timed(
-            f"prune --dry-run, {again}", lambda: prune(store=store.root, recipe=Recipe(), dry_run=True)
-        ).removed
+    begin_s = time.process_time()
+    logs, root = make_many_runs(directory, count)
+    print(f"{'synthesise':<24} {time.process_time() - begin_s:22.2f} s CPU", flush=True)
+    wrong = [line for what in sys.argv[3:] or [*LIMITS] for line in measure(what, directory, logs, root)]
+    if count == 10_000 and wrong:
+        sys.exit("\n".join(wrong))
 
 
 if __name__ == "__main__":

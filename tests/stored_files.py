@@ -2,37 +2,25 @@
 
 from pathlib import Path
 
-from tcpipe.formats.run_documents import find_highest_numbers, name_document
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.store import Store
 
 
-def last(directory: Path, stem: str) -> Path:
-    """The document of the highest number in a directory."""
-    number = find_highest_numbers(path.name for path in directory.iterdir())[stem]
-    return directory / name_document(stem, number)
+def manifest(run: StoredRun) -> Path:
+    return Path(run.place.where(run.document))
 
 
-def manifest(run: RunDirectory) -> Path:
-    return last(Path(run.where), "manifest")
-
-
-def run_document(run: RunDirectory) -> Path:
-    return last(Path(run.where).parent, "run")
-
-
-def table(run: RunDirectory, name: str) -> Path:
+def table(run: StoredRun, name: str) -> Path:
     """The file of ``segments`` and such."""
-    (path,) = Path(run.where).glob(f"*/{name}.parquet")
-    return path
+    return Path(run.folder.where(f"{name}.parquet"))
 
 
 def tables(store: Path, name: str = "segments") -> list[Path]:
-    """The files of ``segments`` and such of all runs of a store, by path."""
+    """The files of ``segments`` and such of all runs of a store, by run."""
     return [table(run, name) for run in Store(store).runs()]
 
 
-def only_run(store: Path) -> RunDirectory:
+def only_run(store: Path) -> StoredRun:
     (run,) = Store(store).runs()
     return run
 

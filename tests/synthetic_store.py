@@ -3,6 +3,7 @@
 import atexit
 import os
 import shutil
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -13,22 +14,24 @@ import pyproj
 from map_worlds import World
 
 from tcpipe import __version__
-from tcpipe.formats.commits import Entries, Superseded
+from tcpipe.formats.documents import make_run_key, read_record
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
-from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
-from tcpipe.pipeline.calls import open_log
+from tcpipe.formats.runs import Counts, LogOrigin, Recording, Run
+from tcpipe.formats.stored_runs import write_streams
+from tcpipe.pipeline.ingest_run import describe_recording, put_run, tag_log, write_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.facts import FuseFacts, NoiseFacts, PowerSign, StageFacts, StretchFacts
-from tcpipe.tables.findings import StageReport, judge
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     LABELLED_SEGMENTS,
     MASKED_TRACK,
     REJECTIONS,
+    RESULTS_VERSION,
     STREAMS,
     TRACK,
     Datum,
@@ -169,42 +172,74 @@ def add_run(
     includes=(),
     facts=None,
     streams=None,
+    state=None,
+    **values,
 ):
-    """Put a run with these segments, and this masked track, into the store, as ingestion would."""
+    """Put a run with these segments, and this masked track, into the store, as ingestion would; ``values`` of its record differ."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
     found = StageReport(tuple(findings), facts or (StageFacts(power=power) if includes else StageFacts()))
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
-    identity = make_recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
     distance_by_reason_m = distance_by_reason_m or {"kept": metres, "stationary": 0.0, "accelerating": 2.5}
-    files = store.write_streams(run_id, streams, key="k") if streams else {}
-    sensors = sensors or (streams.sensors if streams else {})
-    origin = LogOrigin((f"/logs/{run_id}.mcap",), sha256 or run_id, 1)
-    store.write_run_json(run_id, RunJson(origin, robot=None, sensors=sensors, streams=files, streams_key="k"))
-    manifest = Manifest(
+    stamps = [table.column(name).to_numpy() for name in ("start_ns", "end_ns")] if table.num_rows else None
+    run = Run(
         run_id=run_id,
-        recipe_id=identity,
+        recipe_id=make_recipe_id(recipe, robot),
         data_model_version=DATA_MODEL_VERSION,
+        results_version=RESULTS_VERSION,
         tcpipe_version=__version__,
         ingest_key=ingest_key(recipe),
-        recipe=recipe.ingest,
+        read_key="k",
         robot=robot,
-        tags=tags or {},
-        counts=Counts(table.num_rows),
+        log=LogOrigin((f"/logs/{run_id}.mcap",), sha256 or run_id, 1),
+        recording=describe_recording(streams) if streams else None,
+        sensors=sensors or (streams.sensors if streams else {}),
+        segments=table.num_rows,
+        start_ns=stamps and int(stamps[0][0]),
+        end_ns=stamps and int(stamps[1][-1]),
         distance_by_reason_m=distance_by_reason_m,
-        verdict=judge(findings),
-        damage=(),
+        findings=tuple(findings),
+        blob="",
+        tables={},
+        streams_blob="",
+        streams={},
+        recipe=recipe.ingest,
+        counts=Counts(table.num_rows),
         info=info,
     )
-    store.write_run(
-        manifest,
-        track=Track(TRACK.empty(), REJECTIONS.empty(), info),
-        masked=MaskedTrack(MASKED_TRACK.empty() if track is None else track, info),
-        labelled=LabelledSegments(table, info, distance_by_reason_m),
-    )
-    commit_run(store, run_id)
+    run, state = replace(run, **values), state or store.scan()
+    with store.place.workshop() as directory:
+        if streams:
+            write_streams(directory, streams, key="k")
+        masked = MaskedTrack(MASKED_TRACK.empty() if track is None else track, info)
+        labelled = LabelledSegments(table, info, distance_by_reason_m)
+        write_tables(directory, run, Track(TRACK.empty(), REJECTIONS.empty(), info), masked, labelled)
+        put_run(store, state, run, directory, None)
+    if tags:
+        tag_run(store, run_id, tags)
+
+
+def tag_run(store, run_id, tags):
+    """Add tags to those of the log of a run."""
+    state = store.scan()
+    for row in state.list_rows(run_id):
+        tag_log(store, state, row.log.sha256, tags)
+
+
+def change_run(store, run_id, **values):
+    """Write the manifests of a run again, with other values."""
+    state = store.scan()
+    for row in state.list_rows(run_id):
+        document = state.names["runs", make_run_key(row.log.sha256, row.recipe_id)]
+        store.put_run(state, replace(read_record(store.place, document, Run), **values))
+
+
+def supersede(store, run_id, by):
+    """Let the run ``by`` be a longer recording of what another run has the beginning of."""
+    for number, name in enumerate((run_id, by), 1):
+        change_run(store, name, recording=Recording(first_ns=0, last_ns=number, rows=number, beginning=by))
 
 
 def make_fixes(stamp_ns, *, drive=0, late_ns=0, topic="/fix"):
@@ -238,16 +273,6 @@ def make_noise_facts():
     return StageFacts(fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, sections))
 
 
-def commit_run(store, run_id):
-    """Commit what lies in the directory of a run."""
-    open_log(store).commit("ingested", Entries(runs=tuple(store.read_rows(run_id).values())))
-
-
-def supersede(store, run_id, by):
-    """Commit that the run ``by`` takes the place of a run."""
-    open_log(store).commit("superseded", Entries(superseded=(Superseded(run_id, by),)))
-
-
 _BUILT = Path(mkdtemp(prefix="tcpipe-test-"))
 
 
@@ -273,8 +298,9 @@ def _build_world(name, layers):
 
 def add_world(store, *, name="site", layers=("ortho", "terrain")):
     """Put the analytic map into the store."""
-    with store.new_map(name, after=store.map_number(name)) as path:
+    with store.new_map(name) as (path, put):
         shutil.copytree(_build_world(name, layers), path)
+        put(store.scan())
 
 
 def open_world(directory: Path, **how) -> Store:
@@ -286,8 +312,9 @@ def open_world(directory: Path, **how) -> Store:
 
 def put_map(store, name, **how):
     """Put a map into the store, over one that is there, without a quick look."""
-    with store.new_map(name, after=store.map_number(name)) as path:
+    with store.new_map(name) as (path, put):
         build_map(path, name=name, **{"agreed": PAPER_SCHEME, **how})
+        put(store.scan())
 
 
 def small_store(directory: Path) -> Store:

@@ -21,18 +21,19 @@ from __future__ import annotations
 import gc
 import hashlib
 import logging
-import secrets
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from tcpipe import __version__
 from tcpipe.errors import StoreError
-from tcpipe.formats.cache import fetch_cached
+from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.json_files import digest, parse_typed_json, to_compact_json, to_json
+from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.runs import RunFacts
 from tcpipe.formats.store_records import Call, Failure, LogSnapshot, Output, Problem, StoredMap, Tags, find_lineage
@@ -53,6 +54,9 @@ _HEX = 16
 _UNREAD = 16
 _UNREAD_SHARE = 50
 """The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
+
+_SEAL = b"sha256"
+"""Key of the metadata of the index."""
 
 T = TypeVar("T")
 
@@ -87,11 +91,6 @@ def make_key(*parts: object) -> str:
 def make_run_key(sha256: str, recipe_id: str) -> str:
     """Return the key of the run of a content under a recipe."""
     return make_key(sha256, recipe_id)
-
-
-def make_blob_name() -> str:
-    """Return the name of a folder that nobody else writes to."""
-    return secrets.token_hex(_HEX // 2)
 
 
 @dataclass(slots=True)
@@ -295,7 +294,7 @@ def _decode(
         if (text := str(name)) in decoded:
             continue
         if text in indexed:
-            decoded[text] = parse_typed_json(indexed[text], RECORDS[name.kind], place.where(text))
+            decoded[text] = parse_typed_json(indexed[text], RECORDS[name.kind], text)
         else:
             unread.append(name)
     found: list[bytes | None] = place.map(lambda name: _read_document(place, name), unread)
@@ -321,28 +320,42 @@ def _hash_bytes(data: bytes) -> str:
 
 
 def _read_index(place: Place) -> dict[str, bytes]:
-    for read in (lambda: place.read(INDEX), lambda: _find_own_index(place).read_bytes()):
-        with suppress(pa.ArrowException, KeyError, StoreError, OSError):
-            if data := read():
-                table = pq.ParquetFile(pa.BufferReader(data)).read()
-                return dict(zip(table["name"].to_pylist(), table["facts"].to_pylist(), strict=True))
+    """Return what is cached of documents by name: in the store, and by this machine where it may not write there."""
+    indexed, own = dict[str, bytes](), f"index of {place.where()}"
+    with suppress(StoreError):
+        indexed |= _parse_index(place.read(INDEX) or b"")
+    if is_cached(own):
+        with suppress(StoreError, OSError):
+            indexed |= _parse_index(fetch_cached(own, Path.touch).read_bytes())
+    return indexed
+
+
+def _parse_index(data: bytes) -> dict[str, bytes]:
+    with suppress(StoreError, KeyError):
+        table = read_parquet_bytes(data, INDEX)
+        rows = dict(zip(table["name"].to_pylist(), table["facts"].to_pylist(), strict=True))
+        if (table.schema.metadata or {}).get(_SEAL) == _seal(rows):
+            return rows
     return {}
 
 
 def _write_index(place: Place, rows: Mapping[str, bytes]) -> None:
-    sink = pa.BufferOutputStream()
     columns = [pa.array([*rows], pa.string()), pa.array([*rows.values()], pa.binary())]
-    pq.write_table(pa.Table.from_arrays(columns, ["name", "facts"]), sink, compression="zstd")
-    data = sink.getvalue().to_pybytes()
+    table = pa.Table.from_arrays(columns, ["name", "facts"]).replace_schema_metadata({_SEAL: _seal(rows)})
+    data = write_parquet_bytes(table)
     try:
         place.put(INDEX, data)
     except StoreError:  # a reader that may not write here keeps it in its own cache
         with suppress(StoreError, OSError):
-            _find_own_index(place).write_bytes(data)
+            fetch_cached(f"index of {place.where()}", Path.touch).write_bytes(data)
 
 
-def _find_own_index(place: Place) -> Any:
-    return fetch_cached(f"index of {place.where()}", lambda path: path.write_bytes(b""))
+def _seal(rows: Mapping[str, bytes]) -> bytes:
+    """Return a hash of the rows of an index, and of the version that wrote them: another one may have other fields."""
+    found = hashlib.sha256(__version__.encode())
+    for name, facts in rows.items():
+        found.update(name.encode() + facts)
+    return found.hexdigest().encode()
 
 
 def put_document(place: Place, state: State, kind: Kind, key: str, record: object, *, facts: object = None) -> str:

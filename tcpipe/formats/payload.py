@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.dataset_files import REPORT
+from tcpipe.formats.dataset_files import REPORT, is_desktop_file
 from tcpipe.formats.documents import BLOBS, State, read_record
 from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.runs import RunFacts
@@ -17,7 +17,6 @@ from tcpipe.formats.stored_runs import STREAMS
 BLOB = re.compile(r"[0-9a-f]{16}")
 """Name of a folder of payload."""
 _TABLES = ("track.parquet", "segments.parquet", "rejections.parquet", REPORT)
-_NOTES = re.compile(r"(.*/)?(\.DS_Store|\.directory|Thumbs\.db|[^/]*\.aux\.xml)")
 
 
 class Unnamed(NamedTuple):
@@ -58,7 +57,7 @@ def find_unnamed(payload: Mapping[str, Sequence[Entry]], named: Collection[str])
     used = {name.partition("/")[0] for name in named}
     for blob, entries in payload.items():
         if blob not in used:
-            foreign = (entry.name for entry in entries if not (_is_payload(entry.name) or is_note(entry.name)))
+            foreign = (entry.name for entry in entries if not (_is_payload(entry.name) or is_desktop_file(entry.name)))
             yield Unnamed(f"{BLOBS}/{blob}", sum(entry.size_bytes for entry in entries), next(foreign, None))
             continue
         for entry in entries:
@@ -70,11 +69,6 @@ def find_unnamed(payload: Mapping[str, Sequence[Entry]], named: Collection[str])
 def _is_payload(name: str) -> bool:
     folder, _, file = name.partition("/")
     return name in _TABLES or folder.endswith((".zarr", ".png")) or (folder == STREAMS and file.endswith(".parquet"))
-
-
-def is_note(name: str) -> bool:
-    """Return whether file managers, QGIS or GDAL write a file of this name into folders that they look at."""
-    return _NOTES.fullmatch(name) is not None
 
 
 def read_records(place: Place, state: State, but: Collection[str] = ()) -> tuple[list[RunFacts | StoredMap], list[str]]:

@@ -195,14 +195,12 @@ class Place:
     def delete(self, name: str) -> None:
         """Remove a file, or a folder with all files in it; nothing happens if there is none."""
 
-        def remove(each: str) -> None:
-            with suppress(MissingFileError):
-                self._do(
-                    each, lambda path: atomic.remove(path, self._top), lambda s, key: s.delete(key), what="written"
-                )
+        def remove_objects(store: ObjectStore, key: str) -> None:
+            below = [meta["path"] for batch in store.list(key or None) for meta in batch]
+            store.delete(below or key)
 
-        below = [] if self.path is not None else [entry.name for entry in self.entries(name)]
-        self.map(remove, below or [name])
+        with suppress(MissingFileError):
+            self._do(name, lambda path: atomic.remove(path, self._top), remove_objects, what="written")
 
     def clear(self) -> None:
         """Remove temporaries of killed writers."""

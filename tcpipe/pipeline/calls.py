@@ -193,10 +193,18 @@ def _close_killed_calls(running: RunningCall) -> None:
         close_call(running.store, running.state, each, f"its work was done by {CALL_PREFIX}{running.key}")
 
 
+def make_blob_name() -> str:
+    """Return the name of a folder of payload that nobody else writes to: random."""
+    return secrets.token_hex(8)
+
+
 def close_call(store: Store, state: State, killed: OpenCall, message: str) -> None:
     """Write the end of a killed call, unless it has written it itself meanwhile."""
     key = killed.key
-    if not any(file.startswith(f"{key}.") and not file.startswith(f"{key}.1.") for file in store.place.list("calls")):
+    ends = [
+        file for file in store.place.list("calls") if file.startswith(f"{key}.") and not file.startswith(f"{key}.1.")
+    ]
+    if not any(f"calls/{file}" not in state.damaged for file in ends):
         with suppress(StoreError):
             store.put(state, "calls", key, replace(killed.call, exit_code=1, message=message))
 

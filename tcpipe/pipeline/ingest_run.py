@@ -30,6 +30,7 @@ from tcpipe.formats.stored_runs import (
     write_streams,
 )
 from tcpipe.logs.topics import split_notes
+from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.log_sources import LogSource, find_damaged_log, find_total_loss
 from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
@@ -114,8 +115,8 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         return_freed_memory()
         track, masked, labelled = run_stages(read.streams, task.recipe.ingest, run_id=run_id)
         run = make_run(task, log, read, track, labelled, sha256=sha256, key=key)
-        _write_tables(directory, run, track, masked, labelled)
-        run = _put_run(store, state, run, directory, read.stored)
+        write_tables(directory, run, track, masked, labelled)
+        run = put_run(store, state, run, directory, read.stored)
         tag_log(store, state, sha256, task.tags)
     row = next(row for row in state.runs.values() if row.blob == run.blob)
     return make_result(source, "done", row, sha256, same_as=same_as)
@@ -129,7 +130,7 @@ def tag_log(store: Store, state: State, sha256: str, given: Mapping[str, str]) -
 
 
 def _find_hash(state: State, log: AnyLog) -> str:
-    """Return the hash by which the store knows a log, or is to know it (ADR-30).
+    """Return the hash by which the store knows a log, or is to know it (ADR-36).
 
     That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage
     is not taken for it: what was broken there may be whole here.
@@ -209,7 +210,7 @@ def make_run(
         robot_requested=task.robot,
         message_definitions=task.definitions,
         log=LogOrigin(task.source.origins, sha256, log.size_bytes, "index" if by_index else "log", log.outline or ""),
-        recording=_describe_recording(streams),
+        recording=describe_recording(streams),
         sensors=streams.sensors,
         segments=table.num_rows,
         start_ns=int(to_integers(table, "start_ns")[0]) if table.num_rows else None,
@@ -238,7 +239,7 @@ _IDENTIFYING = ("gnss", "pose", "imu", "wheel_odometry", "visual_odometry")
 """Sensors whose values seldom repeat."""
 
 
-def _describe_recording(streams: Streams) -> Recording | None:
+def describe_recording(streams: Streams) -> Recording | None:
     """Return when a log was recorded, and a hash of the first measurements of its sensors of motion."""
     tables = {role: table for role, table in streams.tables.items() if table.num_rows}
     if not tables:
@@ -253,7 +254,8 @@ def _describe_recording(streams: Streams) -> Recording | None:
     return Recording(first_ns, last_ns, sum(table.num_rows for table in tables.values()), found.hexdigest()[:16])
 
 
-def _write_tables(directory: Path, run: Run, track: Track, masked: MaskedTrack, labelled: LabelledSegments) -> None:
+def write_tables(directory: Path, run: Run, track: Track, masked: MaskedTrack, labelled: LabelledSegments) -> None:
+    """Write track, segments and rejections of a run into a directory."""
     metadata = {
         "run_id": run.run_id, "recipe_id": run.recipe_id, "datum": to_plain(run.info.datum), "robot": run.robot,
     }  # fmt: skip
@@ -266,11 +268,11 @@ def _write_tables(directory: Path, run: Run, track: Track, masked: MaskedTrack, 
         write_table(add_metadata(table, metadata), directory / f"{name}.parquet")
 
 
-def _put_run(store: Store, state: State, run: Run, directory: Path, stored: RunFacts | None) -> Run:
+def put_run(store: Store, state: State, run: Run, directory: Path, stored: RunFacts | None) -> Run:
     """Put the files of a run into the store, then its manifest; ``stored`` has streams that are there already."""
     files = compute_checksums(directory)
     streams = {name: checksum for name, checksum in files.items() if name.startswith(f"{STREAMS}/")}
-    blob = store.put_blob(directory)
+    store.put_blob(blob := make_blob_name(), directory)
     run = replace(
         run,
         blob=blob,

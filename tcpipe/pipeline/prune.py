@@ -1,6 +1,6 @@
 """Removal of what a store no longer needs: replaced documents, given-up runs, payload that no document names; nothing of a dataset.
 
-A removal is safe beside other calls (ADR-28): only documents that did not count in a first scan go, and only payload that was listed before
+A removal is safe beside other calls (ADR-36): only documents that did not count in a first scan go, and only payload that was listed before
 a second scan and that no document of this scan names. While another call may run, nothing goes.
 """
 
@@ -14,12 +14,12 @@ from pathlib import Path
 
 from tcpipe.errors import TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.bucket_directories import find_newest
 from tcpipe.formats.dataset_files import CARD, parse_card
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.object_storage import make_absolute
 from tcpipe.formats.payload import find_unnamed, list_named_files, list_payload, read_records
 from tcpipe.formats.place import Entry
+from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.formats.store_records import Output

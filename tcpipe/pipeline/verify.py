@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
-from tcpipe.formats.bucket_directories import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
+from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, find_foreign_files, is_desktop_file, parse_card
 from tcpipe.formats.documents import (
     BLOBS,
     INDEX,
@@ -27,17 +25,17 @@ from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.parquet import read_row_count, read_table
-from tcpipe.formats.payload import BLOB, find_unnamed, is_note, list_named_files, list_payload, read_records
+from tcpipe.formats.parquet import read_column_names, read_row_count
+from tcpipe.formats.payload import BLOB, find_unnamed, list_named_files, list_payload, read_records
 from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.published_outputs import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.pipeline.calls import list_open_calls
-from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.pipeline.named_runs import find_named_runs
 from tcpipe.pipeline.problems import find_incomplete_runs
 from tcpipe.store import Store, is_store
 from tcpipe.tables.facts import LEFT_OUT
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import COORDINATES, DATA_MODEL_VERSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +64,7 @@ _REPAIRS: Mapping[Kind, str] = {
     "outputs": "remove it and build the dataset again",
 }  # fmt: skip
 """By kind of document: how to repair one that is damaged."""
+_DESKTOP = "a file manager or a GIS program left it; tcpipe ignores it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +77,7 @@ class Verified:
     read: Mapping[str, int]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    """How to repair the problems; limits of a redacted dataset."""
+    """How to repair the problems."""
 
     def __str__(self) -> str:
         """Return a line of what was read, and one for each problem."""
@@ -93,7 +92,7 @@ def verify(path: Path | str, *, store: Path | str = "tcpipe-store") -> Verified:
 
     Raises `UsageError`: the path is none of these.
     """
-    kind, findings, notes = _find_kind(path, store)
+    kind, findings = _find_kind(path, store)
     read: dict[str, int] = {}
     problems, repairs = list[str](), list[str]()
     try:
@@ -109,28 +108,23 @@ def verify(path: Path | str, *, store: Path | str = "tcpipe-store") -> Verified:
     if kind not in ("store", "run") and not is_url(path):
         again = "the next command that writes it removes it"
         problems += [f"{left}: was left by a killed command; {again}" for left in find_leftovers(Path(path))]
-    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), (*dict.fromkeys(repairs), *notes))
+    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), tuple(dict.fromkeys(repairs)))
 
 
-def _find_kind(path: Path | str, store: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str, ...]]:
-    """Return what a path is, its findings, which are made as they are asked for, and notes."""
+def _find_kind(path: Path | str, store: Path | str) -> tuple[str, Iterator[CheckResult]]:
+    """Return what a path is, and its findings, which are made as they are asked for."""
     if not is_url(path) and not Path(path).exists():
         place = Store(store).place
-        return "run", _verify_runs(place, [(run.facts, run.document) for run in find_named_runs(path, store)]), ()
+        return "run", _verify_runs(place, [(run.facts, run.document) for run in find_named_runs(path, store)])
     if is_store(path):
-        return "store", _verify_store(Store(path)), ()
+        return "store", _verify_store(Store(path))
     place = open_place(path)
     if place.path and place.path.resolve().suffix == ".zarr" and not (place.path.resolve().parent / CARD).is_file():
-        return "map", _verify_map(place.path), ()
+        return "map", _verify_map(place.path)
     found = find_newest(str(path), CARDS)
     if found is None:
         raise UsageError(f"{path}: is no {_KNOWN}; give one of these directories")
-    card: DatasetCard | None = None
-    with suppress(TcpipeError):  # a problem that is found again
-        card = parse_card(found.data, found.place.where(CARD), proved=False) if found.name == CARD else None
-    redaction = None if card is None else card.redaction
-    notes = () if redaction is None else ("It is redacted.", *redaction.lines())
-    return _KINDS[found.name], _verify_directory(found, str(path)), notes
+    return _KINDS[found.name], _verify_directory(found, str(path))
 
 
 def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
@@ -148,22 +142,26 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     wrong = list(find_wrong_files(place, checksums))
     yield from _repair_by(Repair(f"{repair} with --force"), wrong)
     yield "files", len(checksums)
-    yield from (f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not is_note(name))
+    is_local = kind == "dataset" and place.path is not None
+    for name in find_foreign_files(Path(path), checksums) if is_local else find_unlisted_files(path):
+        full = place.where(name) if is_local else name
+        yield Repair(f"{full}: {_DESKTOP}") if is_desktop_file(name) else f"{full}: is no file of this {kind}"
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
         yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 
 
 def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[CheckResult]:
-    """Compare how many samples there are; of a redacted dataset also that it reveals nothing."""
+    """Compare how many samples there are, and with a card without coordinates the columns."""
     rows = read_row_count(samples)
     yield "samples", rows
     counts = {"splits": sum(card.splits.values()), "runs": sum(run.samples for run in card.runs)}
     for name, count in {"samples": card.samples, **counts}.items():
         if count != rows:
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
-    if card.redaction is not None:
-        table = read_table(samples)
-        yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
+    coordinates = [name for name in read_column_names(samples) if name in COORDINATES]
+    if card.without_coordinates and coordinates:
+        columns = ", ".join(coordinates)
+        yield f"{where}: states that it has no coordinates, but {SAMPLES} has the columns {columns}; build it again"
 
 
 def _repair_by(repair: Repair, findings: Iterable[CheckResult]) -> Iterator[CheckResult]:
@@ -184,7 +182,7 @@ def _verify_map(path: Path) -> Iterator[CheckResult]:
     place, checksums = Place(path), read_checksums(path)
     yield from _verify_files(place, checksums, Repair(f"{path}: copy it again, or add the map again with --force"))
     strange = [entry.name for entry in place.entries() if entry.name not in {*checksums, CHECKSUMS}]
-    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_note(name))
+    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_desktop_file(name))
 
 
 def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator[CheckResult]:
@@ -284,4 +282,4 @@ def _verify_names(place: Place, state: State) -> Iterator[CheckResult]:
     yield from (f"{name}: {_KILLED}" for name in sorted(left))
     for name in strange:
         line = f"{place.where(name)}: is no file of this store"
-        yield Repair(line) if is_note(name) else line
+        yield Repair(line) if is_desktop_file(name) else line

@@ -5,11 +5,11 @@ import re
 
 import pytest
 from synthetic_store import add_run, lanes, make_noise_facts, segments
+from tcpipe.formats.run_documents import Manifest
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.integrity import write_sealed
 from tcpipe.formats.json_files import read_as
-from tcpipe.formats.run_documents import Manifest
 from tcpipe.store import Store, open_store
 
 
