@@ -1,4 +1,4 @@
-"""Calls on one store that are killed, or interrupted by another call, before any of their requests; see `tests/unit/pipeline/test_store_attacks.py`."""
+"""Calls on one store that are killed, or interrupted by another call, before any of their requests."""
 
 import shutil
 import threading
@@ -23,7 +23,7 @@ from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.formats.store_records import Output, Process, StoredMap
 from tcpipe.formats.stored_runs import STREAMS
 from tcpipe.pipeline import calls, ingest_run, prune
-from tcpipe.pipeline.calls import ADD_MAP, BUILD, list_open_calls, record_call
+from tcpipe.pipeline.calls import ADD_MAP, BUILD, list_open_calls, make_blob_name, record_call
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.plan import IngestTask, make_result
 from tcpipe.pipeline.problems import acknowledge
@@ -90,7 +90,7 @@ class World:
 
     def patch(self, monkeypatch: pytest.MonkeyPatch, *, is_light: bool = True) -> None:
         """Let each request to the store, on disk or in a bucket in memory, begin with a `step`."""
-        do, put_files = Place._do, Place.put_files  # noqa: SLF001  every request goes through it
+        do, put_files = Place._do, Place.put_files
 
         def do_stepwise(self_: Place, *args: object, **how: object) -> object:
             if self_.path is not None:
@@ -161,7 +161,7 @@ class World:
         opened = open_store(self.root, create=True)
         with record_call(opened, ADD_MAP, ["site"], {"content": text}) as call:
             call.begin()
-            with opened.new_map("site") as (path, put):
+            with opened.new_map("site", make_blob_name()) as (path, put):
                 (path / "height").mkdir(parents=True)
                 (path / "zarr.json").write_text(text)
                 (path / "height" / "zarr.json").write_text(text)
@@ -186,7 +186,7 @@ class World:
         return next(row.run_id for row in self.scan().list_rows() if row.run_id.startswith(stem))
 
     def scan(self) -> State:
-        documents._DECODED.clear()  # noqa: SLF001  as another process
+        documents._DECODED.clear()
         return Store(self.root).scan()
 
     def save(self) -> dict[str, bytes]:
@@ -239,7 +239,7 @@ class World:
         return seen | {("output", where) for where in state.outputs}
 
     def check_end(self, before: dict[str, bytes]) -> None:
-        """Check that no call is open but those that were killed ``before``, and that prune leaves the documents that count and exactly the payload that they name."""
+        """Check that no call is open but those that were killed ``before``, and that prune leaves what counts and its payload alone."""
         assert all(any(f"calls/{call.key}" in name for name in before) for call in list_open_calls(self.scan()))
         for _ in range(2):
             self.run(self.prune)
@@ -289,7 +289,7 @@ def _ingest_lightly(task: IngestTask, *, hashed: list[str]) -> object:
     return make_result(task.source, "done", row, sha256, same_as=None)
 
 
-_REAL_INGEST, _REAL_DO, _REAL_PUT_FILES = ingest_run._ingest, Place._do, Place.put_files  # noqa: SLF001
+_REAL_INGEST, _REAL_DO, _REAL_PUT_FILES = ingest_run._ingest, Place._do, Place.put_files
 
 
 def write_logs(folder: Path) -> Path:

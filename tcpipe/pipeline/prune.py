@@ -12,7 +12,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tcpipe.errors import TcpipeError, UsageError, clean_lines
+from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
 from tcpipe.formats.dataset_files import CARD, parse_card
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
@@ -91,7 +91,7 @@ def prune(
     changes.
     """
     ruling, opened = ingest_key(resolve_recipe(recipe)), open_store(store)
-    forgotten = [make_absolute(name) for name in forget]
+    forgotten, left = [make_absolute(name) for name in forget], _find_temporaries(opened)
     with nullcontext() if dry_run else record_call(opened, PRUNE, runs, {"forget": forgotten}) as call:
         first, mine = (opened.scan(), "") if call is None else (call.state, call.key)
         if unknown := [name for name in forgotten if name not in first.outputs]:
@@ -108,6 +108,7 @@ def prune(
             if waits_for is None:
                 removal.choose_documents(second)
                 removal.choose_payload(second, payload)
+                removal.removed += left
                 removal.execute()
         found = removal.describe(waits_for)
         if call is not None:
@@ -214,9 +215,14 @@ class _Removal:
             if why := held.get((row.run_id, row.recipe_id)):
                 self.kept.append(_describe(row, what, why))
                 continue
-            self.chosen[key], self.earlier[key] = (row, what), self.first.names["runs", key]
-            if not self.dry_run:
-                forget_tables(self.store, self.first, row)
+            document = self.first.names["runs", key]
+            try:
+                if not self.dry_run:
+                    forget_tables(self.store, self.first, row)
+            except StoreError as error:
+                self.kept.append(_describe(row, what, error.problems[0]))
+                continue
+            self.chosen[key], self.earlier[key] = (row, what), document
 
     def take_back(self, second: State, *, is_all: bool) -> None:
         """Let runs count again if an output refers to them that was written meanwhile, or if nothing can be removed now."""
@@ -262,12 +268,8 @@ class _Removal:
 
     def execute(self) -> None:
         """Remove what is chosen, and what killed calls left on disk."""
-        place = self.store.place
-        for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
-            if is_abandoned(path):
-                size = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
-                self.removed.append(Leftover("left by a killed call", str(path), size))
         if not self.dry_run:
+            place = self.store.place
             for names in (*self.documents, self.payload):
                 place.map(place.delete, names)
             place.clear()
@@ -277,6 +279,17 @@ class _Removal:
         size_bytes, documents = sum(each.size_bytes for each in self.removed), sum(map(len, self.documents))
         told = tuple(self.removed), tuple(self.kept), documents, size_bytes
         return Pruned(str(self.store.root), self.dry_run, *told, waits_for)
+
+
+def _find_temporaries(store: Store) -> list[Leftover]:
+    """Return what killed calls left on disk: the next call that writes removes it."""
+    paths = sorted(store.place.path.glob(f"{TEMPORARY_PREFIX}*")) if store.place.path else []
+    sizes = {
+        path: sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+        for path in paths
+        if is_abandoned(path)
+    }
+    return [Leftover("left by a killed call", str(path), size_bytes) for path, size_bytes in sizes.items()]
 
 
 def _describe(row: RunFacts, what: str, why: str) -> Leftover:
