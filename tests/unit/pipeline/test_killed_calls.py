@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -13,22 +13,21 @@ from types import SimpleNamespace
 import pytest
 from click.testing import CliRunner
 from object_gateway import open_bucket
-from tcpipe.formats.commits import Begun, Entries
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.store_records import Call
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import status as status_module
-from tcpipe.pipeline.calls import commit_call, identify_process, list_begun_calls, open_log
+from tcpipe.pipeline.calls import identify_process, list_open_calls, record_call
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.verify import verify
-from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 
-OTHER = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
 NIGHT_S = 86_400
 
 
@@ -66,7 +65,6 @@ def kill(logs, store, monkeypatch, **how):
 
     with monkeypatch.context() as patch, suppress(SystemExit):
         patch.setattr(ingest_module, "_iterate_results", died)
-        patch.setattr(ingest_module, "remove_if_empty", lambda _: nullcontext())
         patch.setattr(calls, "identify_process", lambda: replace(identify_process(), start="1"))
         ingest([logs], store=store, **{"recipe": Recipe(), **how})
 
@@ -84,23 +82,24 @@ def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_i
     (finding,) = json.loads(found.stdout)["problems"]
     assert (finding["code"], finding["names"]["command"]) == ("call-killed", "ingest")
     lines = CliRunner().invoke(cli, ["status", str(tmp_path / "store")], standalone_mode=False).stderr
-    assert "was killed. To acknowledge it: 'tcpipe acknowledge call-1' [call-killed]" in lines
+    assert f"was killed. To acknowledge it: 'tcpipe acknowledge {finding['subject']['name']}' [call-killed]" in lines
     assert json.loads(found.stdout)["counts"] == {"pending": 2}
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0
-    assert (ask_status(tmp_path / "store").exit_code, ask_status(tmp_path / "store").begun) == (0, ())
+    assert (ask_status(tmp_path / "store").exit_code, ask_status(tmp_path / "store").open_calls) == (0, ())
 
 
-def test_a_call_that_runs_is_no_problem_and_one_with_nothing_to_do_writes_nothing(root, logs):
+def test_a_call_that_runs_is_no_problem_and_one_with_nothing_to_do_writes_its_record_alone(root, logs):
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
     store = open_store(root)
-    with commit_call(open_log(store), "ingest", [str(logs)]):
+    with record_call(store, "ingest", [str(logs)]):
         found = ask_status(root)
-        assert (found.exit_code, [call.state for call in found.begun]) == (0, ["running"])
+        assert (found.exit_code, [call.state for call in found.open_calls]) == (0, ["running"])
         assert "running: ingest of 20" in str(found)
-    before = store.place.entries()
+    before = {entry.name for entry in store.place.entries()}
     again = ingest([logs], store=root, recipe=Recipe())
     assert [result.status for result in again.results] == ["unchanged"] * 2
-    assert store.place.entries() == before
+    new = {entry.name for entry in store.place.entries()} - before
+    assert [name.partition("/")[0] for name in new] == ["calls"] * 2
     assert verify(root).problems == ()
 
 
@@ -108,13 +107,14 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
     kill(logs, root, monkeypatch)
     assert ask_status(root).exit_code == 3
     ingest([logs / "one.mcap"], store=root, recipe=Recipe())
-    ingest([logs], store=root, recipe=OTHER)
-    assert len(list_begun_calls(open_store(root).state())) == 1, "other logs, another recipe: none is its work"
+    ingest([logs], store=root, recipe=Recipe(), robot="husky")
+    assert len(list_open_calls(open_store(root).scan())) == 1, "other logs, another robot: none is its work"
     ingest([logs], store=root, recipe=Recipe(), shard=(2, 2))
     assert ask_status(root).exit_code == 3, "a task of an array does its share alone"
     ingest([logs], store=root, recipe=Recipe())
     assert ask_status(root).exit_code == 0
-    kill(logs, root, monkeypatch, shard=(2, 2), force=True)
+    for shard in ((1, 2), (2, 2)):  # one of them has a log, or both
+        kill(logs, root, monkeypatch, shard=shard, force=True)
     assert ask_status(root).exit_code == 3
     assert ingest([logs.parent / "logs"], store=root, recipe=Recipe()).exit_code == 0
     assert ask_status(root).exit_code == 0
@@ -125,21 +125,36 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
 
 def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
-    (call,) = ask_status(root).begun
+    (call,) = ask_status(root).open_calls
     with pytest.raises(UsageError, match="nosuch: is no run or log with a known problem"):
         acknowledge(["nosuch"], store=root)
     assert [of.finding.code for of in acknowledge([call.name], store=root).acknowledged] == ["call-killed"]
-    assert (ask_status(root).exit_code, ask_status(root).begun) == (0, ())
+    assert (ask_status(root).exit_code, ask_status(root).open_calls) == (0, ())
     kill(logs, root, monkeypatch)
     assert ask_status(root).exit_code == 3
 
 
-def test_an_error_ends_a_call_and_an_interrupt_leaves_it(tmp_path):
+def test_an_error_ends_a_call_with_its_message_and_an_interrupt_leaves_it(tmp_path):
     store = open_store(tmp_path, create=True)
-    for error, left in ((StoreError("full"), 0), (KeyboardInterrupt(), 1)):
-        with suppress(StoreError, KeyboardInterrupt), commit_call(open_log(store), "ingest", ["/logs"]):
+    for error, left in ((StoreError("full"), 0), (ValueError("a bug"), 0), (KeyboardInterrupt(), 1)):
+        with suppress(StoreError, ValueError, KeyboardInterrupt), record_call(store, "ingest", ["/logs"]) as call:
+            call.begin()
             raise error
-        assert len(list_begun_calls(store.state())) == left
+        assert len(list_open_calls(store.scan())) == left
+    ended = [(call.exit_code, call.message) for _, call in reversed(store.scan().calls)]
+    assert ended == [(1, "full"), (1, "ValueError: a bug"), (None, "")]
+
+
+def test_calls_of_one_time_have_keys_of_their_own_and_the_latest_is_the_first(tmp_path):
+    store = open_store(tmp_path, create=True)
+    with record_call(store, "ingest", ["/one"]) as one, record_call(store, "ingest", ["/two"]) as two:
+        one.begin()
+        two.begin()
+    with record_call(store, "ingest", ["/three"]):
+        pass
+    found = store.scan().calls
+    assert found[0][1].works_on == ("/three",)
+    assert len({key for key, _ in found}) == 3
 
 
 HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid": os.getpid()}
@@ -167,9 +182,9 @@ def test_a_call_that_runs_is_told_from_a_killed_one_as_far_as_can_be_seen(tmp_pa
     monkeypatch.setattr(calls, "identify_process", lambda: here)
     begin = (datetime.now(UTC) - timedelta(seconds=age_s)).isoformat(timespec="milliseconds")
     store = open_store(tmp_path, create=True)
-    begun = Begun("ingest", "0.9", ("/logs",), "", 1, begin, replace(here, **other))
-    open_log(store).commit("begun", Entries(begun=(begun,)))
-    (call,) = list_begun_calls(store.state())
+    begun = Call(command="ingest", version="2.0", works_on=("/logs",), process=replace(here, **other), begin=begin)
+    store.put(store.scan(), "calls", "0" * 16, begun)
+    (call,) = list_open_calls(store.scan())
     assert call.state == state
     if state == "killed":
         assert call.problem.finding.code == ("call-lost" if "host" in other else "call-killed")
@@ -196,7 +211,7 @@ def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_pa
         ("log-waiting", str(logs / "new.mcap"), "pending"),
         ("log-waiting", str(logs / "future.mcap"), "growing"),
     }
-    with commit_call(open_log(open_store(store)), "ingest", [str(logs)]):
+    with record_call(open_store(store), "ingest", [str(logs)]):
         assert after(2).exit_code == 0, "somebody is at it"
     elsewhere = drive_at(tmp_path / "archive" / "old.mcap", seed=4)
     os.utime(elsewhere, ns=(10**18, 10**18))
@@ -216,12 +231,12 @@ def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path
     def refused(*_, **__):
         raise StoreError("read-only")
 
-    for verb in ("put", "put_new", "delete"):
+    for verb in ("put", "put_files", "delete"):
         monkeypatch.setattr(type(store.place), verb, refused)
-    with commit_call(open_log(store), "build-dataset", ["/out"]):
-        assert list_begun_calls(store.state()) == []
+    with record_call(store, "build-dataset", ["/out"]):
+        assert list_open_calls(store.scan()) == []
     assert ask_status(tmp_path / "store").exit_code == 0
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0, "there is nothing new"
     drive_at(logs / "later.mcap", seed=7)
-    with pytest.raises(StoreError, match="read-only; name another with --store"):
-        ingest([logs], store=tmp_path / "store", recipe=Recipe())
+    (result,) = [each for each in ingest([logs], store=tmp_path / "store", recipe=Recipe()).results if each.problems]
+    assert "read-only" in result.problems[0]
