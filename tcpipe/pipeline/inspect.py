@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -45,7 +45,7 @@ class InspectedRecipe(RunFacts):
     """A run under one recipe: its facts, and the verdict by the catalogue of this version."""
 
     counts: Counts
-    verdict: Verdict
+    verdict: Verdict = field()  # else its default were the property of `RunFacts`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
