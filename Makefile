@@ -69,7 +69,7 @@ kernels: .venv/installed-dev
 	$(BIN)/python tests/tiny_pipeline.py .venv/tiny
 	@rm -rf .venv/tiny
 
-# The definitions for Dagster, executed (docs/how-to/dagster.md); its pins want an environment of their own.
+# The definitions for Dagster, executed (docs/how-to/run-unattended.md); its pins want an environment of their own.
 .venv-dagster/installed: pyproject.toml
 	$(PYTHON) -m venv .venv-dagster
 	.venv-dagster/bin/python -m pip --disable-pip-version-check install --quiet --no-compile dagster==1.13.27 hypothesis pytest pytest-randomly --editable '.[tables]'

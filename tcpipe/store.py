@@ -98,7 +98,8 @@ class Store:
         return found
 
     def _list_runs(self, state: State, rows: Mapping[str, RunFacts]) -> list[StoredRun]:
-        found = [StoredRun(self.place, row, state.names["runs", key]) for key, row in rows.items()]
+        place = self.place
+        found = [StoredRun(place, row, state.names["runs", key]) for key, row in rows.items()]
         return sorted(found, key=lambda run: (run.run_id, run.recipe_id))
 
     def map_at(self, record: StoredMap) -> tuple[Path, FetchedShards | None]:

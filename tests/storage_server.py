@@ -7,6 +7,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -179,7 +180,7 @@ def _listing(bucket: Path, prefix: str, delimiter: str, after: str) -> bytes:
     names = [name for name in names if name.startswith(prefix) and name > after]
     deeper = {name for name in names if delimiter and delimiter in name[len(prefix) :]}
     contents = "".join(
-        f"<Contents><Key>{escape(name)}</Key><LastModified>2020-09-13T12:26:40.000Z</LastModified>"
+        f"<Contents><Key>{escape(name)}</Key><LastModified>{_format_time((bucket / name).stat().st_mtime)}</LastModified>"
         f"<Size>{(bucket / name).stat().st_size}</Size></Contents>"
         for name in names
         if name not in deeper
@@ -187,3 +188,7 @@ def _listing(bucket: Path, prefix: str, delimiter: str, after: str) -> bytes:
     folders = sorted({prefix + name[len(prefix) :].partition(delimiter)[0] + delimiter for name in deeper})
     contents += "".join(f"<CommonPrefixes><Prefix>{escape(name)}</Prefix></CommonPrefixes>" for name in folders)
     return f"<ListBucketResult><IsTruncated>false</IsTruncated>{contents}</ListBucketResult>".encode()
+
+
+def _format_time(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -65,6 +65,11 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 
     ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     options = replace(options, recipe=ruling)
+    from tcpipe.errors import StoreError
+    from tcpipe.store import is_store
+
+    if options.existing_store and not is_store(options.store):
+        raise StoreError(f"{options.store}: no store here (--existing-store)")
     if not as_json:
         print_line(f"recipe: {source}")
     if dry_run:
@@ -341,26 +346,24 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 
 
 @click.command()
-@click.argument("runs", nargs=-1, metavar="[RUN...]", shell_complete=complete_runs)
+@click.argument("runs", nargs=-1, metavar="[RUN]...", shell_complete=complete_runs)
 @store_option
 @recipe_option
-@click.option(
-    "--forget", multiple=True, metavar="DATASET", help="Remove what only this deleted dataset needs; repeatable."
-)
+@click.option("--forget", multiple=True, metavar="OUT", help="Remove what only this deleted dataset needs; repeatable.")
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
 @json_option
 def prune(
-    runs: tuple[str, ...], *, store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool, as_json: bool
+    *, runs: tuple[str, ...], store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool, as_json: bool
 ) -> int:
-    """Remove results of earlier recipes that the current recipe replaces, superseded runs, and files of killed calls; or RUN.
+    """Remove superseded runs, and those of earlier recipes that the current recipe replaces; or each RUN (or RUN/RECIPE).
 
-    tcpipe keeps everything that a dataset built from this store needs, and files of others. While another call works on the store,
-    nothing is removed.
+    tcpipe also removes files of killed calls. It keeps runs that a dataset needs and folders that contain files of others. While
+    another call works on the store it removes nothing.
     """
     from tcpipe.pipeline.prune import prune as run
 
-    ruling = resolve_recipe_with_source(recipe)[0]
-    print_result(run(runs, store=store, recipe=ruling, forget=forget, dry_run=dry_run), as_json=as_json)
+    found = run(runs, store=store, recipe=resolve_recipe_with_source(recipe)[0], forget=forget, dry_run=dry_run)
+    print_result(found, as_json=as_json)
     return 0
 
 

@@ -151,8 +151,9 @@ def remove(path: Path, staging: Path) -> None:
 def _sync_files(directory: Path) -> None:
     """Sync a directory and all files and directories below it."""
     for above, _, files in os.walk(directory):
-        for name in (*files, ""):
-            _sync(Path(above, name))
+        for path in (Path(above, name) for name in (*files, "")):
+            if not path.is_symlink():
+                _sync(path)
 
 
 @contextmanager

@@ -32,7 +32,7 @@ import pyarrow as pa
 from tcpipe import __version__
 from tcpipe.errors import StoreError
 from tcpipe.formats.cache import fetch_cached, is_cached
-from tcpipe.formats.json_files import digest, parse_typed_json, to_compact_json, to_json
+from tcpipe.formats.json_files import parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.runs import RunFacts
@@ -85,7 +85,7 @@ def parse_name(kind: Kind, file: str) -> Name | None:
 
 def make_key(*parts: object) -> str:
     """Return the key of a document about something."""
-    return digest(parts)[:_HEX]
+    return _hash_bytes(to_compact_json(parts))
 
 
 def make_run_key(sha256: str, recipe_id: str) -> str:

@@ -136,7 +136,7 @@ def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Path | 
         with _CONVERTING:
             return msgspec.json.decode(text, type=cls)
     except msgspec.DecodeError as error:
-        raise StoreError(f"{path}: is not what this version writes: {error}") from None
+        raise StoreError(f"{path}: is not what this version writes: {_format_validation_error(str(error))}") from None
 
 
 def _format_validation_error(message: str) -> str:

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
-from tcpipe.formats.bucket_directories import fetch_directory_by_range, has_card
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.logs.log_file import is_log_file, list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.logs.table_folders import find_table_logs, is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
+from tcpipe.formats.published_outputs import CARDS, find_newest
 from tcpipe.formats.runs import Counts, LogOrigin, RunFacts
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
@@ -142,7 +143,7 @@ def _inspect_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspect
         with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
             if is_store(url):
                 return _inspect_store(Store(url))
-        if has_card(url):
+        if find_newest(url, CARDS):
             from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
 
             return _inspect_dataset(fetch_directory_by_range(url, by_range=is_shard)[0], url)

@@ -281,15 +281,18 @@ def _resolve_path(path: Path, folders: dict[str, str]) -> str:
 
 def _as_named(path: Path) -> Path:
     """Return a log's path in full, as the user names it; what lies above a ``..`` may be a link, and is followed."""
+    if ".." not in str(path):  # of thousands: no parts of each
+        return path.absolute()
     if path.name == "..":
         return path.resolve()
     return path.parent.resolve() / path.name if ".." in path.parts else path.absolute()
 
 
 def _place_in(path: Path, entry: Path) -> str:
-    if path == entry:
+    text, above = str(path), str(entry)  # of thousands: no parts of each
+    if text == above:
         return path.name or path.resolve().name
-    return str(path).removeprefix(f"{entry}/").lstrip("/")
+    return text.removeprefix(f"{above}/").lstrip("/")
 
 
 def _list_file_states(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:

@@ -76,6 +76,7 @@ class IngestOptions:
             shown="0",
         ),
     )
+    existing_store: bool = option(False, Option("Fail if there is no store."))
     retry_failed: bool = option(False, Option("Try logs again that failed before."))
     existing_store: bool = option(False, Option("Fail if there is no store, so that an unmounted one is not replaced."))
     force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
@@ -145,7 +146,7 @@ class BuildDatasetOptions:
     """Which runs and maps a dataset is made from, and how."""
 
     out: str | Path = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
-    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a generation."""
+    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a folder of its own."""
     _: KW_ONLY
     split: str | Path | None = option(
         None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")

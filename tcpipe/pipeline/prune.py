@@ -15,11 +15,11 @@ from pathlib import Path
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.bucket_directories import find_newest
-from tcpipe.formats.dataset_files import CARD, REPORT, parse_card
+from tcpipe.formats.dataset_files import CARD, REPORT, is_desktop_file, parse_card
 from tcpipe.formats.documents import BLOBS, State, make_run_key, read_record
 from tcpipe.formats.object_storage import make_absolute
 from tcpipe.formats.place import Entry
+from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.formats.store_records import Output, StoredMap
@@ -33,8 +33,6 @@ TABLES = ("track.parquet", "segments.parquet", "rejections.parquet", REPORT)
 """Files of a run in its folder of payload, beside the folder of its streams."""
 BLOB = re.compile(r"[0-9a-f]{16}")
 """Name of a folder of payload."""
-_NOTES = re.compile(r"(.*/)?(\.DS_Store|\.directory|Thumbs\.db|[^/]*\.aux\.xml)")
-"""Files that other programs put beside those that they look at."""
 _MAX_CALLS = 50
 """Ended calls of each command that are kept."""
 
@@ -108,7 +106,7 @@ def prune(
         removal = _Removal(opened, first, dry_run, forgotten)
         if (waits_for := _find_running(first, dead, mine)) is None:
             removal.give_up(chosen)
-            payload = _list_payload(opened)
+            payload = list_payload(opened)
             second = opened.scan()
             waits_for = _find_running(second, dead, mine)
             removal.take_back(second, is_all=waits_for is not None)
@@ -195,7 +193,7 @@ def _read_inputs(where: str) -> str | None:
         return None
 
 
-def _list_payload(store: Store) -> dict[str, list[Entry]]:
+def list_payload(store: Store) -> dict[str, list[Entry]]:
     """Return the files of each folder of payload."""
     found: dict[str, list[Entry]] = {name: [] for name in store.place.list(BLOBS) if BLOB.fullmatch(name)}
     for entry in store.place.entries(BLOBS):
@@ -220,11 +218,6 @@ def is_payload(name: str) -> bool:
     return name in TABLES or folder.endswith((".zarr", ".png")) or (folder == STREAMS and file.endswith(".parquet"))
 
 
-def is_note(name: str) -> bool:
-    """Return whether file managers or GDAL write a file of this name into folders that they look at."""
-    return _NOTES.fullmatch(name) is not None
-
-
 def read_beaten(store: Store, names: Iterable[str]) -> tuple[list[RunFacts | StoredMap], list[str]]:
     """Return the runs and maps in documents that do not count, and the names of damaged documents."""
     records, damaged = list[RunFacts | StoredMap](), list[str]()
@@ -232,7 +225,11 @@ def read_beaten(store: Store, names: Iterable[str]) -> tuple[list[RunFacts | Sto
         kind = name.partition("/")[0]
         if kind in ("runs", "maps"):
             try:
-                records.append(read_record(store.place, name, RunFacts if kind == "runs" else StoredMap))
+                records.append(
+                    read_record(store.place, name, RunFacts)
+                    if kind == "runs"
+                    else read_record(store.place, name, StoredMap)
+                )
             except StoreError:
                 damaged.append(name)
     return records, damaged
@@ -309,7 +306,9 @@ class _Removal:
             if parts and not over:
                 continue
             where, size = self.store.place.where(f"{BLOBS}/{blob}"), sum(entry.size_bytes for entry in over)
-            foreign = next((entry.name for entry in over if not (is_payload(entry.name) or is_note(entry.name))), None)
+            foreign = next(
+                (entry.name for entry in over if not (is_payload(entry.name) or is_desktop_file(entry.name))), None
+            )
             why = f"it contains {foreign}, which tcpipe did not write" if foreign else None
             if damaged:
                 why = f"{damaged[0]} is damaged and may name it; 'tcpipe verify' lists repairs"

@@ -17,16 +17,15 @@ from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear
-from tcpipe.formats.bucket_directories import require_card
 from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
+from tcpipe.formats.published_outputs import require_card, write_output
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.learning.models import Model
 from tcpipe.pipeline.dataset.map_checks import register_runs
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import Reason, check_model, predict_segments
 from tcpipe.planning.path_cost import find_added_turning
 from tcpipe.recipe import Recipe, SampleConfig
@@ -330,7 +329,7 @@ def evaluate_drives(
     Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
     """
     if is_url(out):
-        with write_generation(str(out), JSON) as made:
+        with write_output(str(out), JSON) as made:
             result = evaluate_drives(model, data, source, logs, store=store, out=made)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place, opened = Path(out), open_store(store)

@@ -1,27 +1,23 @@
-"""The protocol of the store, on disk and in a bucket: what readers see of writers that are killed, race, replace or copy by halves."""
+"""The store, on disk and in a bucket: what readers see of writers that are killed, race, replace or copy by halves."""
 
 import os
 import shutil
 import tempfile
 from contextlib import suppress
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
 from object_gateway import open_bucket
-from storage_server import OVERWRITING, READ_ONLY
+from storage_server import READ_ONLY
 from stored_files import manifest, table
-from synthetic_store import add_run, commit_run, lanes, segments
+from synthetic_store import add_run, change_run, lanes, segments, supersede, tag_run
 
 from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.documents import scan
 from tcpipe.formats.place import Place
-from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.report import report
-from tcpipe.pipeline.verify import verify
-from tcpipe.recipe import Recipe
-from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Subject, make_finding
+from tcpipe.pipeline.problems import forget_tables
+from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.store import Store, check_map_name, is_store, name_run, open_store
 
 RUN = "north"
 
@@ -35,15 +31,8 @@ def root(request, tmp_path, monkeypatch):
     return f"{url}/a store"
 
 
-def put(store: Store, length_m: float = 10.0, **how: object) -> None:
-    add_run(store, RUN, segments(RUN, *lanes(0.0, 0.0, length_m)), **how)
-
-
-def contents(store: Store) -> dict[str, bytes | None]:
-    """What is there, but for when and by whom it was committed."""
-    return {
-        entry.name: store.place.read(entry.name) for entry in store.place.entries() if not entry.name.startswith("log/")
-    }
+def put(store: Store, length_m: float = 10.0, name: str = RUN, **how: object) -> None:
+    add_run(store, name, segments(name, *lanes(0.0, 0.0, length_m)), **how)
 
 
 def counted(store: Store) -> list[int]:
@@ -55,7 +44,7 @@ class _Killed(BaseException):
     pass
 
 
-def test_killed_at_any_step_a_reader_finds_the_generation_before_and_the_next_call_completes(root, monkeypatch):
+def test_killed_at_any_step_a_reader_finds_the_run_before_and_the_next_call_completes(root, monkeypatch):
     left = [0]
 
     def step():
@@ -72,12 +61,10 @@ def test_killed_at_any_step_a_reader_finds_the_generation_before_and_the_next_ca
 
         return acts
 
-    undisturbed, store = (open_store(f"{root}-{name}", create=True) for name in "ab")
-    for each in (undisturbed, store):
-        put(each)
-    put(undisturbed, 12.0)
+    store = open_store(root, create=True)
+    put(store)
     with monkeypatch.context() as patch:
-        for name in ("put", "put_new", "put_files", "delete"):
+        for name in ("put", "put_files", "delete"):
             patch.setattr(Place, name, killing(getattr(Place, name)))
         for steps in range(100):
             left[0] = steps
@@ -87,88 +74,155 @@ def test_killed_at_any_step_a_reader_finds_the_generation_before_and_the_next_ca
             assert counted(store) in ([10], [12])
     assert steps > 3
     assert counted(store) == [12]
-    assert contents(store) == contents(undisturbed)
-    assert [replace(row, commit=0) for row in store.state().runs.values()] == [
-        replace(row, commit=0) for row in undisturbed.state().runs.values()
-    ]
-    assert verify(store.root).problems == ()
+    state = store.scan()
+    assert state.damaged == []
+    assert all(state.has_payload(row) for row in state.list_rows())
 
 
-def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_number(root):
+def test_a_run_that_is_written_again_replaces_the_one_before_and_recipes_live_side_by_side(root):
+    store, other = open_store(root, create=True), Recipe(read=ReadConfig(ignore_topics=["/none"]))
+    put(store)
+    put(store, 12.0)
+    assert counted(store) == [12]
+    put(store, 8.0, recipe=other)
+    assert sorted(counted(store)) == [8, 12]
+    both = store.find_runs(RUN)
+    assert [run.name for run in both] == [f"{RUN}/{recipe_id}" for recipe_id in sorted(run.recipe_id for run in both)]
+    for run in both:
+        assert [found.name for found in store.find_runs(run.name)] == [run.name]
+        assert run.manifest.recipe_id == run.recipe_id
+    assert store.find_runs(f"{RUN}/nosuch") == store.find_runs("nosuch") == []
+
+
+def test_a_run_whose_tables_were_given_up_does_not_count_in_the_call_that_gives_them_up_either(root):
     store = open_store(root, create=True)
     put(store)
-    (first,) = store.runs()
-    tables = {"track": first.track().table, "segments": first.segments(), "rejections": first.rejections()}
-
-    class _Level:
-        def __init__(self, table: object, rejections: object = None) -> None:
-            self.table, self.rejections = table, rejections
-
-    def write(file: str, *, force: bool = False) -> object:
-        made = replace(first.manifest, damage=(make_finding("file-cut", Subject("file", file)),), checksums={})
-        levels = {"track": _Level(None, tables["rejections"]), "masked": _Level(tables["track"])}
-        made = store.write_run(made, **levels, labelled=_Level(tables["segments"]), settled=lambda _: not force)
-        return [of.subject.name for of in made.damage]
-
-    assert write("mine") == []
-    assert write("mine", force=True) == ["mine"]
-    assert write("mine", force=True) == ["mine"]
-    assert store.runs()[0].manifest.damage == (), "no commit names the new one yet"
-    commit_run(store, RUN)
-    assert store.runs()[0].place.files() == ["manifest-1.json", "manifest-2.json"]
-    assert [of.subject.name for of in store.runs()[0].manifest.damage] == ["mine"]
+    state = store.scan()
+    (row,) = state.list_rows()
+    forget_tables(store, state, row)
+    for found in (state, store.scan()):
+        (row,) = found.list_rows()
+        assert (row.blob, found.has_payload(row), store.runs(found)) == ("", False, [])
 
 
-def test_tags_of_two_writers_are_both_kept(root, monkeypatch):
+def test_two_that_write_one_run_at_once_write_to_folders_of_their_own_and_all_readers_find_the_same_one(root):
     store = open_store(root, create=True)
-    put(store)
-    place = type(store.place)
-    put_new = place.put_new
+    before = store.scan()
+    for length_m in (10.0, 12.0):
+        put(store, length_m, state=before)
+        before.highest.clear()  # as the second has not seen what the first has written
+    found = store.scan()
+    assert len(found.blobs) == 2
+    assert len(found.beaten) == 1
+    assert counted(store) in ([10], [12])
+    assert counted(store) == counted(Store(root))
 
-    def later(self, name, data):
-        monkeypatch.setattr(place, "put_new", put_new)
-        assert store.tag_run(RUN, {"driver": "Eva"})
-        return put_new(self, name, data)
 
-    monkeypatch.setattr(place, "put_new", later)
-    assert store.tag_run(RUN, {"weather": "wet"})
-    assert not store.tag_run(RUN, {"driver": "Eva"})
+def test_tags_are_added_to_those_of_a_log_and_outlive_its_runs(root):
+    store = open_store(root, create=True)
+    put(store, sha256="f" * 64)
+    for tags in ({"driver": "Eva"}, {"weather": "wet"}, {"driver": "Eva"}):
+        tag_run(store, RUN, tags)
     wanted = {"driver": "Eva", "weather": "wet"}
-    commit_run(store, RUN)
-    assert store.run_json(RUN).tags == store.runs()[0].manifest.tags == wanted
+    assert len(store.place.list("tags")) == 2, "tags that a log has are not written"
+    put(store, 12.0, sha256="f" * 64)
+    (run,) = store.runs()
+    assert run.facts.tags == run.manifest.tags == wanted
+    put(store, 9.0, sha256="f" * 64, recipe=Recipe(read=ReadConfig(ignore_topics=["/none"])))
+    assert [run.facts.tags for run in store.runs()] == [wanted, wanted]
+    assert b"Eva" not in store.place.read(run.document), "no fact is written twice"
 
 
-def test_what_a_copier_left_by_halves_is_named_and_not_used(tmp_path):
+def test_a_manifest_that_is_read_is_the_record_that_was_written(root):
+    store = open_store(root, create=True)
+    put(store, tags={"soil": "dry"})
+    change_run(store, RUN, idle_watt=7.0)
+    (run,) = store.runs()
+    assert (run.manifest.idle_watt, run.facts.idle_watt) == (7.0, 7.0)
+    for field in ("run_id", "recipe_id", "log", "segments", "distance_by_reason_m", "findings", "tags", "tables"):
+        assert getattr(run.manifest, field) == getattr(run.facts, field)
+
+
+def test_runs_that_are_superseded_without_payload_or_of_another_data_model_do_not_count(root):
+    store = open_store(root, create=True)
+    for name in ("a", "b", "c", "d"):
+        put(store, name=name)
+    supersede(store, "b", "a")
+    change_run(store, "c", data_model_version="3.0")
+    (blob,) = [row.blob for row in store.scan().list_rows("d")]
+    for entry in store.place.entries(f"blobs/{blob}"):
+        store.place.delete(entry.name)
+    assert [run.run_id for run in store.runs()] == ["a"]
+    assert [row.run_id for row in store.scan().list_rows()] == ["a", "b", "c", "d"]
+    assert [run.run_id for run in store.find_runs("b")] == ["b"], "its tables can be looked at"
+    with pytest.raises(StoreError, match=rf"run d: its tables are not in .*{Path(root).name}; ingest its log again"):
+        store.find_runs("d")
+
+
+@pytest.mark.parametrize("how", ["cut", "gone", "empty"])
+def test_a_table_that_is_not_as_it_was_written_is_named_and_not_used(tmp_path, how):
     store = open_store(tmp_path / "store", create=True)
     put(store)
     (run,) = store.runs()
     path = table(run, "track")
     whole = path.read_bytes()
-    path.write_bytes(whole[:-10])
-    assert store.runs() == []
-    assert f"track.parquet: has {len(whole) - 10} bytes, expected {len(whole)}" in next(
-        iter(store.ingestions().damaged.values())
-    )
-    path.unlink()
-    assert "track.parquet: is missing" in next(iter(store.ingestions().damaged.values()))
+    path.unlink() if how == "gone" else path.write_bytes(b"" if how == "empty" else whole[:-10])
+    wrong = {
+        "cut": rf"\({len(whole) - 10} bytes, expected {len(whole)}\)",
+        "gone": "is missing",
+        "empty": r"\(0 bytes, ",
+    }
+    with pytest.raises(StoreError, match=rf"track\.parquet: .*{wrong[how]}") as caught:
+        run.track()
+    assert store.prove([run]) == {RUN: caught.value.problems[0]}
     path.write_bytes(whole)
-    manifest(run).unlink()
-    (line,) = inspect(store.root, recipe=Recipe()).damaged_runs.values()
-    assert line.endswith("manifest-1.json: is missing; ingest the log again")
-    (store.root / "store.json").unlink()
-    with pytest.raises(UsageError, match="an incomplete copy of a store"):
-        open_store(store.root)
+    assert store.prove([run]) == {}
 
 
-def test_a_store_is_moved_by_copying_its_files(root, tmp_path):
-    store = open_store(root, create=True)
-    put(store)
-    for entry in store.place.entries():
-        path = tmp_path / "moved" / entry.name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(store.place.read(entry.name))
-    assert counted(Store(tmp_path / "moved")) == [10]
-    assert verify(tmp_path / "moved").problems == ()
+def test_a_manifest_that_is_gone_costs_one_run_and_nothing_else(tmp_path):
+    store = open_store(tmp_path / "store", create=True)
+    for name in ("a", "b"):
+        put(store, name=name)
+    manifest(store.runs()[0]).unlink()
+    assert [run.run_id for run in store.runs()] == ["b"]
+    put(store, name="a")
+    assert counted(store) == [10, 10]
+
+
+def test_tables_that_were_compared_are_compared_again_only_when_they_are_written_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "cache"))
+    store = open_store(tmp_path / "store", create=True)
+    for name in ("a", "b", "c"):
+        put(store, name=name)
+    hashed = []
+    real = Place.proved if hasattr(Place, "proved") else Place.fetch
+    monkeypatch.setattr(Place, real.__name__, lambda place, *rest: (hashed.append(rest[0]), real(place, *rest))[1])
+
+    def compare():
+        hashed.clear()
+        return store.prove(store.runs()), hashed.count("segments.parquet")
+
+    assert compare() == ({}, 3)
+    assert compare() == ({}, 0)
+    path = table(store.runs()[1], "segments")
+    data = path.read_bytes()
+    os.utime(path, ns=(0, 0))
+    assert compare() == ({}, 1)
+    path.write_bytes(data[:-9] + b"x" + data[-8:])
+    for _ in range(2):
+        damaged, count = compare()
+        assert (list(damaged), count) == (["b"], 1)
+
+
+def test_a_store_is_moved_by_copying_its_files_and_two_are_put_together_in_the_same_way(root, tmp_path):
+    stores = [open_store(root, create=True), open_store(tmp_path / "second", create=True)]
+    for store, name in zip(stores, ("a", "b"), strict=True):
+        put(store, name=name)
+        for entry in store.place.entries():
+            path = tmp_path / "moved" / entry.name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(store.place.read(entry.name))
+    assert counted(open_store(tmp_path / "moved")) == [10, 10]
 
 
 def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp_path, monkeypatch, served):
@@ -178,31 +232,54 @@ def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp
     assert not list(tmp_path.glob("tcpipe-*"))
 
 
-def test_a_store_of_another_data_model_is_refused_in_one_line(tmp_path, monkeypatch):
-    with monkeypatch.context() as later:
-        later.setattr("tcpipe.formats.run_documents.DATA_MODEL_VERSION", "3.0")
-        open_store(tmp_path / "store", create=True)
-    for ask in (open_store, verify, report, partial(inspect, recipe=Recipe())):
+# --- where there is no store ----------------------------------------------------------------------------------------
+
+
+def test_a_place_is_a_store_as_soon_as_a_document_is_there(root):
+    store = open_store(root, create=True)
+    assert not is_store(root)
+    store.place.put("tags/notes.txt", b"")
+    store.place.put("index.parquet", b"")
+    assert not is_store(root)
+    with pytest.raises(UsageError, match=r"a?.?store: there is no store here; run 'tcpipe ingest' first, or name "):
+        open_store(root)
+    put(store)
+    assert is_store(root)
+    assert open_store(root) == store
+
+
+def test_a_store_of_1_x_is_refused_in_one_line(root):
+    Store(root).place.put("store.json", b"{}")
+    for create in (False, True):
         with pytest.raises(UsageError) as caught:
-            ask(tmp_path / "store")
-        expected = f"{tmp_path / 'store'}: made by tcpipe 1.x (data model 3.0), expected 4.0: ingest the logs again"
-        assert caught.value.problems == (expected,)
+            open_store(root, create=create)
+        assert caught.value.problems == (f"{root}: made by tcpipe 1.x: ingest the logs again, into a new store",)
 
 
-def test_a_bucket_that_keeps_no_two_writers_apart_or_cannot_be_written_is_refused(tmp_path, served):
-    for name in (OVERWRITING, READ_ONLY):
-        (tmp_path / "served" / name).mkdir(parents=True)
-    overwrites = r"s3://overwriting/x: this object store overwrites what is there"
-    with pytest.raises(StoreError, match=overwrites):
-        open_store("s3://overwriting/x", create=True)
-    with pytest.raises(StoreError, match=overwrites):
-        open_store("s3://overwriting/x", create=True).check_writable()
-    with pytest.raises(
-        StoreError, match=r"s3://read-only/x/store.json: it cannot be written \(the credentials .*; name another"
-    ):
-        open_store("s3://read-only/x", create=True)
+@pytest.mark.parametrize("url", ["https://example.org/store", "ftp://example.org/store"])
+def test_a_url_of_no_bucket_is_refused(url):
+    assert not is_store(url)
+    with pytest.raises(UsageError, match=r"no place for a store; expected a directory, s3://bucket/name, gs:// or az:"):
+        open_store(url, create=True)
+
+
+def test_a_file_is_no_store(tmp_path):
+    (tmp_path / "store").write_bytes(b"")
+    with pytest.raises(UsageError, match="store: is a file, expected a directory for the store"):
+        open_store(tmp_path / "store", create=True)
+
+
+def test_a_bucket_that_cannot_be_written_says_so_where_something_is_written(tmp_path, served):
+    (tmp_path / "served" / READ_ONLY).mkdir(parents=True)
+    with pytest.raises(StoreError, match=r"s3://read-only/x/.*it cannot be written \(the credentials do not"):
+        put(open_store("s3://read-only/x", create=True))
     with pytest.raises(UsageError, match="s3://read-only/x: there is no store here"):
         open_store("s3://read-only/x")
+    with pytest.raises(StoreError, match="s3://nosuch"):
+        open_store("s3://nosuch/x", create=True)
+
+
+# --- files in a bucket, maps and names ------------------------------------------------------------------------------
 
 
 def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, served):
@@ -217,60 +294,62 @@ def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, served):
     (path,) = (tmp_path / "served").rglob("segments.parquet")
     path.write_bytes(b"x" * path.stat().st_size)
     shutil.rmtree(tmp_path / "cache")
-    with pytest.raises(StoreError, match=r"s3://tests/store/runs/north/.*/segments.parquet: its sha256 is"):
+    with pytest.raises(StoreError, match=r"s3://tests/store/blobs/.*/segments.parquet: its sha256 is"):
         store.runs()[0].segments()
-    assert any("segments.parquet: its sha256 is" in problem for problem in verify("s3://tests/store").problems)
 
 
-def test_a_map_whose_answer_is_lost_is_there_and_one_that_another_adds_first_stays(served):
+def add_map(store, text, *, before=lambda: None):
+    with store.new_map("site") as (directory, put_map):
+        directory.mkdir()
+        (directory / "tile").write_text(text)
+        before()
+        put_map(store.scan())
+
+
+def read_tile(store, record):
+    path, fetched = store.map_at(record)
+    return (fetched.fetch_file(path / "tile") if fetched else path / "tile").read_bytes()
+
+
+def test_a_map_that_a_reader_has_found_stays_where_it_is_when_another_takes_its_place(root):
+    store = open_store(root, create=True)
+    add_map(store, "old")
+    old = store.find_map("site")
+    add_map(store, "new")
+    assert [read_tile(store, record) for record in (old, store.find_map("site"))] == [b"old", b"new"]
+    assert list(store.scan().maps) == ["site"]
+    with pytest.raises(StoreError, match="no map 'other' in the store"):
+        store.find_map("other")
+
+
+def test_a_map_that_two_add_at_once_is_one_of_them_for_all_readers(root):
+    store = open_store(root, create=True)
+    add_map(store, "mine", before=lambda: add_map(store, "another's"))
+    assert read_tile(store, store.find_map("site")) == b"mine", "it was put later, by one that had seen the other"
+
+
+def test_a_map_whose_answer_is_lost_is_there(served):
     store = open_store("s3://tests/store", create=True)
 
-    def add(text):
-        with store.new_map("site") as directory:
-            directory.mkdir()
-            (directory / "tile").write_text(text)
-            served.lost = 3
+    def lose():
+        served.lost = 3
 
-    add("mine")
-    assert store.maps() == ["site"]
-    with pytest.raises(StoreError, match="another process has written it meanwhile"):
-        add("another's")
+    add_map(store, "mine", before=lose)
+    assert read_tile(store, store.find_map("site")) == b"mine"
 
 
-@pytest.mark.parametrize("name", ["store.json", "manifest-1.json", "run-1.json", "track.parquet"])
-def test_a_file_of_no_bytes_is_named_and_nothing_is_made_of_it(tmp_path, name):
-    store = open_store(tmp_path / "store", create=True)
-    put(store)
-    next(store.root.rglob(name)).write_bytes(b"")
-    assert any(name in problem for problem in verify(store.root).problems)
-    if name == "store.json":
-        with pytest.raises(StoreError, match=r"store\.json: "):
-            open_store(store.root)
-    elif name != "run-1.json":
-        assert store.runs() == []
-        put(store)
-        assert counted(store) == [10]
+@pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "Ä"])
+def test_a_name_that_is_no_name_of_a_map_is_refused(name):
+    with pytest.raises(StoreError, match="expected letters, digits"):
+        check_map_name(name)
 
 
-def test_paths_lead_to_runs_and_recipes(root):
-    store = open_store(root, create=True)
-    put(store)
-    (run,) = store.runs()
-    for path in (f"{root}/runs/{RUN}", run.where):
-        found = verify(path if "://" in str(path) else Path(path))
-        assert (found.kind, found.problems) == ("run", ())
-
-
-def test_the_map_of_a_document_stays_where_it_is_when_another_takes_its_place(root):
-    store = open_store(root, create=True)
-
-    def add(text, after):
-        with store.new_map("site", after=after) as directory:
-            directory.mkdir()
-            (directory / "tile").write_text(text)
-
-    add("old", 0)
-    old = store.map_document("site")
-    add("new", 1)
-    for (path, fetched), text in ((store.map_at(old), b"old"), (store.map_files("site"), b"new")):
-        assert (fetched.fetch_file(path / "tile") if fetched else path / "tile").read_bytes() == text
+def test_two_logs_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_path):
+    store, names = Store(tmp_path), []
+    hashes = ["abcdef01" + digit * 56 for digit in "012"] + ["abcdef01" + "0" * 55 + "9"]
+    for sha256 in hashes:
+        names.append(name_run(store.scan(), "latest", sha256))
+        put(store, name=names[-1], sha256=sha256)
+    assert names == ["latest-abcdef01", "latest-abcdef011111", "latest-abcdef012222", "latest-abcdef010000"]
+    for sha256, name in zip(hashes, names, strict=True):
+        assert name_run(scan(store.place), "renamed", sha256) == name

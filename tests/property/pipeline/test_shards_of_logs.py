@@ -1,4 +1,4 @@
-"""Shares of a batch: each log is in one of them, wherever the folder is mounted, and their sizes differ by one log at most."""
+"""Shares of a batch: each log is in one of them, wherever the folder is mounted, and stays there when other logs are added."""
 
 from pathlib import Path
 
@@ -15,14 +15,13 @@ def sources(places, folder="/data"):
 
 
 @given(PLACES, st.integers(1, 12))
-def test_shares_are_disjoint_together_whole_and_even(places, count):
+def test_shares_are_disjoint_and_together_whole_and_no_other_log_moves_one(places, count):
     shares = [select_shard(sources(places), (index, count)) for index in range(1, count + 1)]
     assert sorted(at for share in shares for at in share) == list(range(len(places)))
-    assert max(map(len, shares)) - min(map(len, shares)) <= 1
     for index, share in enumerate(shares, start=1):
         assert select_shard(sources(places, folder="/mnt/elsewhere"), (index, count)) == share
-        later = select_shard(sources([*places, "z"]), (index, count))
-        assert [at for at in later if at < len(places)] == share, "a log with a later name moves no other"
+        more = select_shard(sources(["A", *places]), (index, count))
+        assert [at - 1 for at in more if at] == share
 
 
 @given(st.lists(st.sampled_from([b"", b"x", b"y", b"x" * 5000, b"y" + b"x" * 4999]), max_size=8))

@@ -80,14 +80,14 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 from tcpipe.formats.json_files import parse_typed, to_plain
-from tcpipe.formats.run_documents import LogOrigin, RunJson
+from tcpipe.formats.runs import LogOrigin
 
 sys.setswitchinterval(1e-6)
-known, together = RunJson(LogOrigin(("a.mcap",), "b", 1)), Barrier(8)
+known, together = LogOrigin(("a.mcap",), "b", 1), Barrier(8)
 
 def read(_):
     together.wait()
-    return parse_typed(to_plain(known), RunJson, "run-1.json")
+    return parse_typed(to_plain(known), LogOrigin, "a document")
 
 with ThreadPoolExecutor(8) as pool:
     assert set(map(repr, pool.map(read, range(8)))) == {repr(known)}
