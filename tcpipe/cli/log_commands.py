@@ -65,11 +65,6 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 
     ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     options = replace(options, recipe=ruling)
-    from tcpipe.errors import StoreError
-    from tcpipe.store import is_store
-
-    if options.existing_store and not is_store(options.store):
-        raise StoreError(f"{options.store}: no store here (--existing-store)")
     if not as_json:
         print_line(f"recipe: {source}")
     if dry_run:

@@ -76,7 +76,6 @@ class IngestOptions:
             shown="0",
         ),
     )
-    existing_store: bool = option(False, Option("Fail if there is no store."))
     retry_failed: bool = option(False, Option("Try logs again that failed before."))
     existing_store: bool = option(False, Option("Fail if there is no store, so that an unmounted one is not replaced."))
     force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
