@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from pyproj import Geod, Transformer
+from tcpipe.formats.commits import Entries
+from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 
 from tcpipe import __version__
-from tcpipe.formats.commits import Entries
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
-from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe

@@ -142,13 +142,10 @@ def cpu_s() -> float:
 def on_paper(of: Mapping[str, float]) -> list[tuple[str, str, str]]:
     """Return what each step takes at `HOURS` and `SAMPLES`, and where a machine of `CORES` and `MEMORY_GB` ends, from measured figures."""
     logs = HOURS * of["logs_an_hour"]
-    night_s = logs * (of["night_ms"] + of["objects_a_log"] / 1_000 * of["listing_ms"]) / 1e3
+    night_s = logs * (of["night_ms"] + of["names_a_log"] / 1_000 * of["listing_ms"]) / 1e3
     state_gb, build_gb = logs * of["state_kb_a_log"] / 1e6, SAMPLES * of["build_bytes_a_sample"] / 1e9
     ingest_h, build_h = HOURS * of["ingest_s_an_hour"] / 3_600, SAMPLES * of["build_us_a_sample"] / 3.6e9
-    room_tb, epoch_s = (
-        (SAMPLES * of[f"{name}_bytes_a_sample"] / 1e12 for name in ("spool", "dataset")),
-        SAMPLES / of["epoch_a_core"],
-    )
+    dataset_tb, epoch_s = SAMPLES * of["dataset_bytes_a_sample"] / 1e12, SAMPLES / of["epoch_a_core"]
     return [
         (
             "ingest",
@@ -162,25 +159,21 @@ def on_paper(of: Mapping[str, float]) -> list[tuple[str, str, str]]:
             f"an hour at {HOURS * 3_600 / night_s:,.0f} hours",
         ),
         (
-            "the state of the log in memory",
+            "the state of the store in memory",
             f"{state_gb:.1f} GB",
             f"{MEMORY_GB} GB at {HOURS * MEMORY_GB / state_gb:,.0f} hours",
         ),
         (
             "build: CPU",
             f"{build_h:,.0f} core hours, {build_h / CORES:,.1f} h on {CORES} cores",
-            "no end: a batch is a task",
+            f"a day at {SAMPLES * 24 * CORES / build_h:,.0f} samples",
         ),
         (
             "build: memory of the caller",
             f"{build_gb:,.0f} GB",
             f"{MEMORY_GB} GB at {SAMPLES * MEMORY_GB / build_gb:,.0f} samples",
         ),
-        (
-            "build: pixels on their way, dataset",
-            " TB, ".join(f"{tb:.1f}" for tb in room_tb) + " TB",
-            "no end: a bucket",
-        ),
+        ("build: local disk", f"{dataset_tb:.1f} TB", "its disk"),
         (
             "a shuffled epoch",
             f"{epoch_s / 3_600:.1f} core hours, {epoch_s / 60 / CORES:.0f} min on {CORES} cores",

@@ -137,8 +137,9 @@ def digest_files(directory: Path, before: frozenset[Path] = frozenset()) -> dict
 
 
 def _find_tables(directory: Path) -> frozenset[Path]:
-    found = {path for pattern in ("*.parquet", "*.zarr") for path in directory.rglob(pattern)}
-    return frozenset(path for path in found if not {"index", "maps"} & set(path.relative_to(directory).parts))
+    """Return the tables of runs or of a dataset below a directory: neither the index of a store nor its maps."""
+    found = {path for path in directory.rglob("*.parquet") if path.name != "index.parquet"}
+    return frozenset(found | {path for path in directory.rglob("*.zarr") if "blobs" not in path.parts})
 
 
 def ingest_log(log: Path, store: Path, recipe: Path, tags: dict[str, str]) -> dict[str, Any]:

@@ -118,7 +118,7 @@ def _documents() -> str:
 _FILES = """# JSON documents and answers
 
 `schemas/` has every key with its type and meaning as JSON Schema. Load the folder as a whole: the schemas refer to
-`defs.schema.json`. Files also have a checksum (`document_sha256`).
+`defs.schema.json`. Cards also have a checksum (`document_sha256`), documents of a [store](store.md) one in their names.
 
 ## Files
 """
@@ -251,7 +251,7 @@ page for the code, or for words such as dropout, lever arm, time offset, drift, 
 
 An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
 unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
-ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect STORE/runs/RUN` lists all
+ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all
 findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints;
 of a suspect sensor it also prints the line that excludes it by name.
 """

@@ -1,4 +1,4 @@
-"""The store: where runs and maps lie, in a directory or a bucket, as documents and the payload that they name (ADR-28).
+"""The store: where runs and maps lie, in a directory or a bucket, as documents and the payload that they name (ADR-36).
 
 ::
 
@@ -26,7 +26,6 @@ from tcpipe.formats.documents import (
     KINDS,
     Kind,
     State,
-    make_blob_name,
     make_key,
     make_run_key,
     put_document,
@@ -72,11 +71,9 @@ class Store:
         facts = convert_record(run, RunFacts)
         self.put(state, "runs", make_run_key(run.log.sha256, run.recipe_id), strip_repeated(run), facts=facts)
 
-    def put_blob(self, directory: Path) -> str:
-        """Put the files of a directory in the workshop of this place into a new folder of payload, and return its name."""
-        name = make_blob_name()
+    def put_blob(self, name: str, directory: Path) -> None:
+        """Put the files of a directory in the workshop of this place into a folder of payload with a fresh random name."""
         self.place.put_files(f"{BLOBS}/{name}", directory)
-        return name
 
     def runs(self, state: State | None = None) -> list[StoredRun]:
         """Return the runs that count, by run and recipe: of this data model, with payload, and not superseded."""
@@ -119,13 +116,14 @@ class Store:
         return found
 
     @contextmanager
-    def new_map(self, name: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
+    def new_map(self, name: str, blob: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
         """Yield where a map is to be written, and beside it a picture ``.png``, and a function that puts both into the store."""
         with self.place.workshop() as directory, convert_run_errors(self.place.where(name), directory):
 
             def put(state: State) -> None:
                 files = compute_checksums(directory)
-                record = StoredMap(name, DATA_MODEL_VERSION, self.put_blob(directory), files)
+                self.put_blob(blob, directory)
+                record = StoredMap(name, DATA_MODEL_VERSION, blob, files)
                 self.put(state, "maps", make_key(name), record)
 
             yield directory / f"{name}.zarr", put

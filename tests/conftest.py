@@ -27,8 +27,8 @@ def dataset_page(request: pytest.FixtureRequest) -> Iterator[None]:
     """Leave out page and pictures of each dataset, most of a small build, but in modules that say ``DRAWS_DATASET_PAGES = True``."""
     with pytest.MonkeyPatch.context() as patch:
         if not getattr(request.module, "DRAWS_DATASET_PAGES", False):
-            patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_, **__: "<!doctype html>")
-            patch.setattr("tcpipe.pipeline.dataset.build.draw_maps", lambda *_: np.zeros((2, 2), np.uint8))
+            patch.setattr("tcpipe.pipeline.dataset.writing.render_dataset_report", lambda *_, **__: "<!doctype html>")
+            patch.setattr("tcpipe.pipeline.dataset.writing.draw_maps", lambda *_: np.zeros((2, 2), np.uint8))
         yield
 
 

@@ -6,7 +6,8 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -83,17 +84,23 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(*((200, b"") if allowed else (412, b"<Error><Code>PreconditionFailed</Code></Error>")))
 
     def do_DELETE(self) -> None:
-        (self.server.root / unquote(urlsplit(self.path).path).lstrip("/")).unlink(missing_ok=True)
+        self.server.fetched.requests += 1
+        self._delete(unquote(urlsplit(self.path).path).lstrip("/"))
         self._send(204, b"")
 
     def do_POST(self) -> None:
+        self.server.fetched.requests += 1
         text = self.rfile.read(int(self.headers["Content-Length"])).decode()
         bucket = urlsplit(self.path).path.lstrip("/")
         names = re.findall("<Key>(.*?)</Key>", text)
         for name in names:
-            (self.server.root / bucket / unescape(name)).unlink(missing_ok=True)
+            self._delete(f"{bucket}/{unescape(name)}")
         deleted = "".join(f"<Deleted><Key>{name}</Key></Deleted>" for name in names)
         self._send(200, f"<DeleteResult>{deleted}</DeleteResult>".encode())
+
+    def _delete(self, name: str) -> None:
+        with suppress(FileNotFoundError, NotADirectoryError, IsADirectoryError):  # there is no such object
+            (self.server.root / name).unlink()
 
     def _answer(self, *, with_body: bool) -> None:
         self.server.fetched.requests += 1
@@ -173,7 +180,7 @@ def _listing(bucket: Path, prefix: str, delimiter: str, after: str) -> bytes:
     names = [name for name in names if name.startswith(prefix) and name > after]
     deeper = {name for name in names if delimiter and delimiter in name[len(prefix) :]}
     contents = "".join(
-        f"<Contents><Key>{escape(name)}</Key><LastModified>2020-09-13T12:26:40.000Z</LastModified>"
+        f"<Contents><Key>{escape(name)}</Key><LastModified>{_format_time((bucket / name).stat().st_mtime)}</LastModified>"
         f"<Size>{(bucket / name).stat().st_size}</Size></Contents>"
         for name in names
         if name not in deeper
@@ -181,3 +188,7 @@ def _listing(bucket: Path, prefix: str, delimiter: str, after: str) -> bytes:
     folders = sorted({prefix + name[len(prefix) :].partition(delimiter)[0] + delimiter for name in deeper})
     contents += "".join(f"<CommonPrefixes><Prefix>{escape(name)}</Prefix></CommonPrefixes>" for name in folders)
     return f"<ListBucketResult><IsTruncated>false</IsTruncated>{contents}</ListBucketResult>".encode()
+
+
+def _format_time(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -13,10 +13,11 @@ from tcpipe.cli.options import (
     OUTPUT_DIRECTORY,
     SEALED,
     add_options,
-    add_path_or_store,
+    add_path_or_run,
     json_option,
     msgdef_option,
     quiet_option,
+    recipe_option,
     store_option,
 )
 from tcpipe.cli.output import (
@@ -82,7 +83,7 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 
 
 @click.command()
-@add_path_or_store(SEALED)
+@add_path_or_run("path", "[PATH|RUN]", required=False)
 @click.option(
     "--no-runs", is_flag=True, help="For a store: write only its own page, with links to existing pages of runs."
 )
@@ -91,14 +92,17 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
     is_flag=True,
     help="For a dataset: write images of all patches to a folder next to the page, and show them.",
 )
-def report(path: str, *, no_runs: bool, patches: bool) -> None:
-    """Write report.html for PATH: a run directory, a dataset, or (default) the store and its runs; and print the robots' physics.
+@recipe_option
+def report(path: str, *, store: str, no_runs: bool, patches: bool, recipe: str | None) -> None:
+    """Write report.html for PATH, a dataset or a store, or for RUN or RUN/RECIPE of the store; and print the robots' physics.
 
-    The page needs no network.
+    Without an argument: for the store and all of its runs. The page of the store sums over the runs of the current recipe. A page needs no
+    network; tcpipe does not write a page again whose inputs have not changed.
     """
     from tcpipe.pipeline.report import report as run
 
-    written = run(path, runs=not no_runs, patches=patches)
+    ruling = resolve_recipe_with_source(recipe)[0]
+    written = run(path, store=store, recipe=ruling, runs=not no_runs, patches=patches)
     for page in written:
         print_line(page.path)
         for line in page.physics:
@@ -168,16 +172,16 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
 
 
 @click.command()
-@add_path_or_store(SEALED)
+@add_path_or_run("path", "[PATH|RUN]", required=False)
 @json_option
-def verify(path: str, *, as_json: bool) -> int:
-    """Read the dataset, run, map, model or cost map at PATH, or the store, again: compare checksums and counts.
+def verify(path: str, *, store: str, as_json: bool) -> int:
+    """Read the dataset, map, model or cost map at PATH, or RUN of the store, or the whole store, again: compare checksums and counts.
 
     Exit code 1: a file has changed, is missing or contradicts another.
     """
     from tcpipe.pipeline.verify import verify as run
 
-    found = run(path)
+    found = run(path, store=store)
     print_result(found, as_json=as_json)
     return 1 if found.problems else 0
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import LOG, add_path_or_store, json_option, msgdef_option, recipe_option, robot_option
+from tcpipe.cli.options import add_path_or_run, json_option, msgdef_option, recipe_option, robot_option
 from tcpipe.cli.output import print_json, print_line, print_lines, resolve_recipe_with_source
 
 if TYPE_CHECKING:
@@ -19,19 +19,24 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@add_path_or_store(LOG)
+@add_path_or_run("path", "[PATH|RUN]", required=False)
 @click.option("--full", is_flag=True, help="Read the whole file to find damage and gaps, not only the index.")
 @robot_option()
 @recipe_option
 @msgdef_option
 @json_option
-def inspect(path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool) -> int:
-    """List the content of PATH: a log's topics, types, rates and roles, with reasons; a map; a dataset; a run; without it, the store."""
+def inspect(
+    path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, store: str, as_json: bool
+) -> int:
+    """List the content of PATH: a log's topics, types, rates and roles, with reasons; a map; a dataset; without it, the store.
+
+    RUN, or RUN/RECIPE, is a run of the store.
+    """
     from tcpipe.pipeline.inspect import inspect as run
 
     ruling, _ = resolve_recipe_with_source(recipe)
     definitions = Path(msgdef) if msgdef else None
-    found = run(path, recipe=ruling, robot=robot, full=full, message_definitions=definitions)
+    found = run(path, recipe=ruling, robot=robot, full=full, message_definitions=definitions, store=store)
     if as_json:
         print_json(found)
     else:
@@ -192,10 +197,12 @@ def _print_store(found: InspectedStore) -> None:
     ]
     header = ["run", "recipe", "robot", "segments", "metres", "position", "time", "energy", "findings", "damage"]
     _print_table(header, rows)
-    for run_id, version in found.outdated.items():
-        print_line(f"{run_id} has data model {version}; ingest its log again")
-    for line in dict.fromkeys(found.damaged_runs.values()):
-        print_line(f"damaged: {line}")
+    for name, version in found.outdated.items():
+        print_line(f"{name} has data model {version}; ingest its log again")
+    for name in found.incomplete:
+        print_line(f"{name}: its tables are missing; ingest its log again")
+    for document in found.damaged:
+        print_line(f"damaged: {document}")
     for run_id, by in found.superseded.items():
         print_line(f"superseded by {by}: {run_id}; its log was completed or repaired")
 
@@ -203,7 +210,7 @@ def _print_store(found: InspectedStore) -> None:
 def _print_run(found: InspectedRun) -> None:
     from tcpipe.formats.finding_lines import describe_power, list_verdict
 
-    print_line(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
+    print_line(f"{found.run_id}: from {' + '.join(found.log.paths)}")
     if found.tags:
         print_line("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
     _print_damage("note", found.notes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -14,8 +15,8 @@ from tcpipe.cli.options import (
     LOG,
     ONE_OF_SEVERAL,
     OUTPUT_FILE,
-    SEALED,
     add_options,
+    add_path_or_run,
     complete_runs,
     dry_run_option,
     json_option,
@@ -88,13 +89,13 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             if as_json:
                 print_json_line(convert_record(result, LogLine))
             else:
-                is_silent = quiet and result.status == "unchanged" and not result.is_new_problem
-                for line in () if is_silent else _list_outcome(result, options.store, several=several):
+                for line in _list_outcome(result, options.store, several=several, quiet=quiet):
                     shown.result(line)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
 
-        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result))
+        note = partial(print_line, err=True) if as_json else shown.result
+        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=note))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
@@ -105,8 +106,11 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     return summary.exit_code
 
 
-def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
-    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
+def _list_outcome(result: IngestResult, store: Path | str, *, several: bool, quiet: bool) -> Iterator[str]:
+    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken.
+
+    With ``quiet`` an unchanged log without a new problem has no line.
+    """
     from tcpipe.formats.finding_lines import (
         describe_finding,
         describe_power,
@@ -119,6 +123,8 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
 
     aside = " (acknowledged)" if result.acknowledged else ""
     is_new, run = result.status != "unchanged", result.run
+    if quiet and not (is_new or result.is_new_problem):
+        return
     budget = run.energy_budget if run and is_new else None
     problems = select_problems(result.findings)
     if run is None:
@@ -149,7 +155,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
     if is_new and not several:
         yield from (f"  verdict: {line}" for line in list_verdict(result.verdict))
         yield from (f"  {line}" for line in describe_power(result.verdict))
-        where = f"tcpipe inspect {shlex.quote(f'{store}/runs/{run.run_id}')}"
+        where = shlex.join(("tcpipe", "inspect", run.run_id, "--store", str(store)))
         yield from (f"  {line}" for line in format_findings(result.findings, more=where))
     elif is_new or result.is_new_problem:
         yield from (
@@ -277,14 +283,16 @@ def preflight(
 
 
 @click.command()
-@click.argument("run", type=LOG, metavar="LOG|RUN")
+@add_path_or_run("run", "LOG|RUN", required=True)
 @robot_option()
 @recipe_option
 @msgdef_option
 @json_option
 @quiet_option
-def audit(run: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool) -> int:
-    """Judge the uncertainty of LOG, or of RUN (STORE/runs/ID), by measurements that its track does not use.
+def audit(
+    run: str, *, store: str, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
+) -> int:
+    """Judge the uncertainty of LOG, or of RUN or RUN/RECIPE of the store, by measurements that its track does not use.
 
     tcpipe fuses the run without its fixes in windows of 10, 30 and 60 s and prints the error of the predicted antenna, its σ, the share
     of errors inside 1σ and 2σ, and the error of a straight line. The same for wheels and camera, by the distance in 1 and 4 s.
@@ -298,6 +306,7 @@ def audit(run: str, *, robot: str | None, recipe: str | None, msgdef: str | None
             recipe=resolve_recipe_with_source(recipe)[0],
             robot=robot,
             message_definitions=Path(msgdef) if msgdef else None,
+            store=store,
         )
     print_result(found, as_json=as_json)
     return 0
@@ -332,58 +341,39 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 
 
 @click.command()
+@click.argument("runs", nargs=-1, metavar="[RUN]...", shell_complete=complete_runs)
 @store_option
 @recipe_option
 @click.option(
-    "--keep",
-    multiple=True,
-    metavar="RUN|RECIPE",
-    shell_complete=complete_runs,
-    help="Keep this run or recipe; repeatable.",
+    "--forget", multiple=True, metavar="OUT", help="Remove what only this deleted dataset needs; repeatable."
 )
-@click.option(
-    "--forget", multiple=True, metavar="DATASET", help="Remove what only this deleted dataset needs; repeatable."
-)
-@min_age_option("1d", "Remove files of killed calls that are older than this (90, 90s, 10m, 2h, 1d).")
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
 @json_option
 def prune(
-    *,
-    store: str,
-    recipe: str | None,
-    keep: tuple[str, ...],
-    forget: tuple[str, ...],
-    min_age_s: float,
-    dry_run: bool,
-    as_json: bool,
+    *, runs: tuple[str, ...], store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool, as_json: bool
 ) -> int:
-    """Remove results of earlier recipes that the current recipe replaces, superseded runs, and files of killed calls.
+    """Remove superseded runs, and those of earlier recipes that the current recipe replaces; or each RUN (or RUN/RECIPE).
 
-    tcpipe keeps everything that a dataset built from this store needs, and directories that contain files of others.
+    tcpipe also removes files of killed calls. It keeps runs that a dataset needs and folders that contain files of others. While
+    another call works on the store it removes nothing.
     """
     from tcpipe.pipeline.prune import prune as run
 
-    found = run(
-        store=store,
-        recipe=resolve_recipe_with_source(recipe)[0],
-        keep=keep,
-        forget=forget,
-        min_age_s=min_age_s,
-        dry_run=dry_run,
-    )
+    found = run(runs, store=store, recipe=resolve_recipe_with_source(recipe)[0], forget=forget, dry_run=dry_run)
     print_result(found, as_json=as_json)
     return 0
 
 
 @click.command()
-@click.argument("run", type=SEALED, metavar="RUN")
+@click.argument("run", metavar="RUN", shell_complete=complete_runs)
 @click.argument("out", type=OUTPUT_FILE, metavar="OUT.mcap")
+@store_option
 @json_option
-def overlay(run: str, out: str, *, as_json: bool) -> None:
-    """Write OUT.mcap from RUN (STORE/runs/ID), on the clock of its log: open both together in Foxglove, or OUT in Rerun or PlotJuggler.
+def overlay(run: str, out: str, *, store: str, as_json: bool) -> None:
+    """Write OUT.mcap from RUN or RUN/RECIPE of the store, on the clock of its log: open both in Foxglove, or OUT in Rerun or PlotJuggler.
 
     OUT contains the fused track, segments with labels, masked sections with reasons, and rejected measurements.
     """
     from tcpipe.pipeline.overlay import write_overlay as write
 
-    print_result(write(run, Path(out)), as_json=as_json)
+    print_result(write(run, Path(out), store=store), as_json=as_json)

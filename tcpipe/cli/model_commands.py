@@ -46,7 +46,7 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
     RMSE and MAPE of power, velocity, time and energy by terrain class; baselines, centred by the same rule; the coverage of intervals;
     the ablation of the input layers; networks of each class, those of Wei and Isler, and the expected time; the noise floor of the
     labels; all with the values of the paper. OUT keeps the networks that the command trains, for the next call; predictions.parquet has
-    every prediction. OUT may be a URL in a bucket, where each evaluation is a generation.
+    every prediction. OUT may be a URL in a bucket, where each evaluation is a folder of its own.
 
     With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in drives.json of OUT;
     DATASET, which MODEL was trained on, shows whether a drive was held back.
@@ -133,7 +133,7 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     """Predict power, velocity, and time and energy per metre, along 16 courses in every cell of a map.
 
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with one band per course, the reasons where MODEL cannot predict, and
-    maps for Nav2. An interrupted call resumes; OUT may be a URL in a bucket, where each map is a generation.
+    maps for Nav2. An interrupted call resumes; OUT may be a URL in a bucket, where each map is a folder of its own.
     """
     from tcpipe.planning.cost_map import make_cost_map
 

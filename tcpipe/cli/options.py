@@ -101,6 +101,10 @@ def _store(context: click.Context) -> Store | None:
     return None if "://" in place else Store(Path(place))
 
 
+def _list_runs(store: Store) -> Iterable[str]:
+    return sorted({run.run_id for run in store.scan().runs.values()})
+
+
 def _list_scenarios(_: click.Context) -> Iterable[str]:
     from tcpipe.simulation.scenarios import SCENARIOS
 
@@ -111,9 +115,9 @@ complete_robots = _complete_names(_list_robots)
 """Offers the robots that the recipe knows."""
 complete_scenarios = _complete_names(_list_scenarios)
 """Offers the sites that can be simulated."""
-complete_runs = _complete_names(lambda context: store.run_ids() if (store := _store(context)) else ())
+complete_runs = _complete_names(lambda context: _list_runs(store) if (store := _store(context)) else ())
 """Offers the store's runs."""
-complete_maps = _complete_names(lambda context: store.maps() if (store := _store(context)) else ())
+complete_maps = _complete_names(lambda context: store.scan().maps if (store := _store(context)) else ())
 """Offers the store's maps."""
 
 OUTPUT_DIRECTORY = Place(atomic.check_output_directory, written=True)
@@ -121,13 +125,15 @@ OUTPUT_FILE = Place(atomic.check_output_file, written=True)
 INPUT_FILE = Place(atomic.check_input_file)
 INPUT_DIRECTORY = Place(atomic.check_input_directory)
 SEALED = Place(atomic.check_input_directory, urls=True)
-"""A dataset, a model, a store or a run, here or in a bucket."""
+"""A dataset, a model or a store, here or in a bucket."""
 PUBLISHED = Place(atomic.check_output_directory, written=True, urls=True)
 """Where a dataset, a model or a store is written, here or in a bucket."""
 LOG = Place(atomic.check_input_path, urls=True)
 """A log, here or in object storage."""
 ONE_OF_SEVERAL = Place(str)
 """A log or raster, by pattern or address; the command checks each one and reports all problems at once."""
+PATH_OR_RUN = Place(str)
+"""A path or URL, or the name of a run; the command looks up what it is."""
 
 
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -287,18 +293,21 @@ store_option = make_click_option("store", "tcpipe-store", options.STORE)
 """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
 
 
-def add_path_or_store(kind: Place) -> Option:
-    """Return the decorator that declares PATH, without which a command works on the store as all others do."""
+def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
+    """Return the decorator that declares an argument, a path or a run of the store, and ``--store``; without it, it is the store."""
 
     def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
         @click.pass_context
         @wraps(run)
-        def command(context: click.Context, /, *, path: str | None, store: str, **values: Any) -> Any:
-            if path is not None and context.get_parameter_source("store") is ParameterSource.COMMANDLINE:
-                raise UsageError(f"{path}: PATH and --store are given; give one of them")
-            return run(path=store if path is None else path, **values)
+        def command(context: click.Context, /, *, store: str, **values: Any) -> Any:
+            from tcpipe.pipeline.named_runs import is_path
 
-        declared: Callable[..., Any] = click.argument("path", type=kind, required=False, metavar="[PATH]")(
+            given = values[name]
+            if given and is_path(given) and context.get_parameter_source("store") is ParameterSource.COMMANDLINE:
+                raise UsageError(f"{given}: is a path, and --store is where a run is looked up; give one of them")
+            return run(store=store, **{**values, name: given or store})
+
+        declared: Callable[..., Any] = click.argument(name, type=PATH_OR_RUN, required=required, metavar=metavar)(
             store_option(command)
         )
         return declared

@@ -30,7 +30,6 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.bits import Quality, flag_name
-from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.layers import LAYERS
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ class SampleColumns:
         """Return one column, nulls as NaN or None, shape (N,)."""
         if name not in self._read:
             there = sample_columns(self.directory)
-            if name not in {*there, *SAMPLES.names()}:
+            if name not in there:
                 raise DatasetError(f"{self.directory}: its samples have no column {name!r}; it has {', '.join(there)}")
             self._read[name] = read_samples(self.directory, [name]).column(name).take(pa.array(self.rows)).to_numpy()
         return self._read[name]
@@ -119,6 +118,11 @@ class Split:
     def channels(self) -> tuple[str, ...]:
         """The tensor's channels: ortho, terrain, height, or those of them that the map has, unless others were asked for."""
         return self.view.form.channels
+
+    @property
+    def has_coordinates(self) -> bool:
+        """Whether its samples have longitude and latitude; else x and y of all runs are in one frame."""
+        return not self._card.without_coordinates
 
     @property
     def samples(self) -> pa.Table:

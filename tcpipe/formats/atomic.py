@@ -53,10 +53,9 @@ def write_atomic_file(path: Path) -> Iterator[Path]:
         temporary = holder / place.name
         temporary.touch()
         yield temporary
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
+        _sync(temporary)
         temporary.replace(place)
-        _sync_directory(place.parent)
+        _sync(place.parent)
 
 
 @contextmanager
@@ -66,7 +65,10 @@ def write_atomic_directory(path: Path) -> Iterator[Path]:
         temporary = holder / place.name
         temporary.mkdir()
         yield temporary
-        _put_synced(temporary, place)
+        _sync_files(temporary)
+        with lock_directory(place.parent):
+            _take_place(temporary, place)
+        _sync(place.parent)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -75,40 +77,22 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def put_file(path: Path, data: bytes, *, staging: Path, over: bool = False) -> bool:
-    """Write a file where there is none, or ``over`` what is there; of several writers the first wins. Return whether this one did.
-
-    ``staging`` is a directory of the same file system, above ``path``: what a killed process leaves behind lies there, and goes with the
-    next call.
-    """
+def put_file(path: Path, data: bytes, *, staging: Path) -> None:
+    """Write a file, synced, in place of an earlier one; `make_working_directory` in ``staging`` holds it until it is whole."""
     with _convert_os_errors(path), _make_parents(path) as place, make_working_directory(staging) as directory:
         temporary = directory / "new"
-        _write_synced(os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666), data)
-        if over:
-            temporary.replace(place)
-        elif not _is_link_made(temporary, place, data):
-            return False
-        _sync_directory(place.parent)
-    return True
-
-
-def _is_link_made(temporary: Path, place: Path, data: bytes) -> bool:
-    try:
-        os.link(temporary, place)
-    except FileExistsError:
-        return False
-    except OSError:  # a file system without hard links: whoever creates it
-        try:
-            descriptor = os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-        except FileExistsError:
-            return False
-        _write_synced(descriptor, data)
-    return True
+        with temporary.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(place)
+        _sync(place.parent)
 
 
 @contextmanager
 def make_working_directory(staging: Path) -> Iterator[Path]:
-    """Yield an empty directory among the temporaries in ``staging``; it goes in the end, or with the next call if this one is killed."""
+    """Yield an empty directory among the temporaries in ``staging``; it is removed at the end, or by the next call after a kill."""
+    staging.mkdir(parents=True, exist_ok=True)
     with _make_locked_holder(Path(os.path.realpath(staging), "new")) as holder:
         directory = holder / "new"
         directory.mkdir()
@@ -148,26 +132,27 @@ def make_lasting_scratch() -> Path:
 
 
 def put_directory(directory: Path, path: Path) -> None:
-    """Put a directory, from a `make_working_directory` of the same file system, to its place by one rename; what is there goes."""
+    """Rename a directory from a `make_working_directory`, synced, to a path of the same file system that does not exist."""
     with _convert_os_errors(path), _make_parents(path) as place:
-        _put_synced(directory, place, before="old")
+        _sync_files(directory)
+        directory.rename(place)
+        _sync(place.parent)
 
 
-def _put_synced(directory: Path, place: Path, before: str = _BEFORE) -> None:
+def remove(path: Path, staging: Path) -> None:
+    """Remove a file, or a directory after a rename into a `make_working_directory`: a kill leaves no half of it at ``path``."""
+    if not path.is_dir() or path.is_symlink():
+        path.unlink()
+        return
+    with make_working_directory(staging) as directory:
+        path.rename(directory / "removed")
+
+
+def _sync_files(directory: Path) -> None:
+    """Sync a directory and all files and directories below it."""
     for above, _, files in os.walk(directory):
-        for name in files:
-            with (Path(above) / name).open("rb") as stream:
-                os.fsync(stream.fileno())
-    with lock_directory(place.parent):
-        _take_place(directory, place, before)
-    _sync_directory(place.parent)
-
-
-def _write_synced(descriptor: int, data: bytes) -> None:
-    with os.fdopen(descriptor, "wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
+        for name in (*files, ""):
+            _sync(Path(above, name))
 
 
 @contextmanager
@@ -319,7 +304,7 @@ def _remove_if_abandoned(holder: Path, act: Callable[[], object]) -> bool:
     return False
 
 
-def _take_place(temporary: Path, place: Path, before: str) -> None:
+def _take_place(temporary: Path, place: Path) -> None:
     """Rename ``temporary`` to ``place``; if something is there they change places, in one step where the system can."""
     if not place.exists():
         try:
@@ -331,7 +316,7 @@ def _take_place(temporary: Path, place: Path, before: str) -> None:
             return
     if _exchange_directories(temporary, place):
         return
-    old = temporary.with_name(before)
+    old = temporary.with_name(_BEFORE)
     place.rename(old)
     try:
         temporary.rename(place)
@@ -348,7 +333,7 @@ def _exchange_directories(one: Path, other: Path) -> bool:
     return bool(renameat2(_AT_FDCWD, paths[0], _AT_FDCWD, paths[1], _RENAME_EXCHANGE) == 0)
 
 
-def _sync_directory(path: Path) -> None:
+def _sync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import to_json
-from tcpipe.formats.run_documents import Manifest, RunJson
+from tcpipe.formats.runs import Run
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import describe
 from tcpipe.tables.bits import flag_name
@@ -20,7 +20,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """Of every schema in ``schemas/``."""
 DEFINITIONS = "defs"
 """The schema whose definitions all documents and answers refer to."""
-DOCUMENTS = {"run": RunJson, "manifest": Manifest, "dataset": DatasetCard}
+DOCUMENTS = {"run": Run, "dataset": DatasetCard}
 """The JSON documents that others read, by the name of their schema."""
 
 

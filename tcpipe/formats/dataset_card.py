@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from tcpipe.formats.dataset_inputs import DatasetInputs
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
-from tcpipe.tables.facts import ABSENT, EnergyBudget, Floor, HeldOut, PhysicsFit
+from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import LEFT_OUT, Finding, Verdict, judge_by_code
 from tcpipe.terrain.classes import TerrainClass
 
@@ -106,7 +107,7 @@ class Exclusion:
 
     def __str__(self) -> str:
         """Return name, count and reason."""
-        return f"{self.name}: {self.samples} samples excluded: {self.reason or 'reason redacted'}"
+        return f"{self.name}: {self.samples} samples excluded: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,31 +200,6 @@ class Shard:
     rows: int
 
 
-@dataclass(frozen=True, slots=True)
-class Redacted:
-    """Facts that a redacted dataset omits, and facts that it does not hide."""
-
-    moved: str = (
-        "to 0 N 0 E as a whole, grid north up: lon, lat, x, y, course, heights, regions; distances are those of the ground, as chord_m, "
-        "to a centimetre"
-    )
-    cut: str = (
-        "names of logs, runs, maps, tables of covariates and lists of excluded samples, with their reasons; topics, frames, files, hosts "
-        "and times in findings, and their remedies; "
-        "what else the power feeds; checksums of rasters; the recipe's sections read, robots, power_sources and tables"
-    )
-    not_hidden: str = (
-        "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
-        "power, names of classes and layers, tags and covariates as they were given (their columns begin with "
-        "the table's name), codes, roles and the numbers of findings that the catalogue calls public, the sha256 of each log, and what "
-        "name, description and creator say"
-    )
-
-    def lines(self) -> tuple[str, str, str]:
-        """Return it in words."""
-        return f"Moved {self.moved}.", f"Cut: {self.cut}.", f"Not hidden: {self.not_hidden}."
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetCard:
     """All of dataset.json but its seal."""
@@ -232,7 +208,9 @@ class DatasetCard:
     data_model_version: str
     tcpipe_version: str
     inputs: str
-    """Hash of everything the dataset is made from; the same inputs make the same dataset."""
+    """Digest of ``made_from``: the same inputs make the same dataset."""
+    made_from: DatasetInputs
+    """Of a dataset without coordinates: without runs, maps, region and files."""
     name: str
     description: str
     licence: str = ""
@@ -245,9 +223,6 @@ class DatasetCard:
     terrain: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """Samples by split and terrain name."""
     label_statistics_of_train: Mapping[str, LabelStatistics] = field(default_factory=dict)
-    recipe: Recipe
-    format: str
-    """``zarr`` or ``parquet``."""
     patch_m: float
     patch_px: int
     layers: Mapping[str, Description]
@@ -264,8 +239,6 @@ class DatasetCard:
     repeatability: Mapping[str, Floor | None]
     """How well each label repeats itself; None where no place was driven twice."""
     runs: tuple[RunSource, ...]
-    run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
-    """The tags that a run had to carry; None in cards of redacted datasets."""
     maps: tuple[MapSource, ...]
     flagged_samples: FlaggedSamples
     """How many samples carry a quality flag."""
@@ -280,11 +253,21 @@ class DatasetCard:
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
     exclusions: tuple[Exclusion, ...] = field(default=(), metadata=LEFT_OUT)
     """A sample of two lists counts for the first one."""
-    redaction: Redacted | None = field(default=None, metadata=LEFT_OUT)
-    """Omitted facts; None for a dataset that is not redacted."""
+    without_coordinates: bool = field(default=False, metadata={"json": (False,)})
+    """Whether places are metres from an unpublished origin; then names, times, maps and regions are omitted too."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""
+
+    @property
+    def recipe(self) -> Recipe:
+        """The recipe that it was built with."""
+        return self.made_from.recipe
+
+    @property
+    def format(self) -> str:
+        """``zarr`` or ``parquet``."""
+        return self.made_from.file_format
 
     @property
     def findings_by_run(self) -> dict[str, tuple[Finding, ...]]:

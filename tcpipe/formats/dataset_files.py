@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
+from tcpipe.formats.file_checks import find_changed_files, prove_files
 from tcpipe.formats.integrity import verify_document
 from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
-from tcpipe.formats.place import Place, find_changed_files, prove_files
+from tcpipe.formats.place import Place
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS

@@ -6,7 +6,7 @@
     blobs/5f0c6a7be1d29c04/segments.parquet          payload in a folder with a random name; a document names the folder
     index.parquet                                    cache of what documents say, by name; it may be deleted
 
-Rules (ADR-28):
+Rules (ADR-36):
 
 1. Bytes whose sha256 does not begin with the digest in their name are no document: they are damaged, or half copied.
 2. For each kind and key the document with the highest number counts; of several with this number, the one with the smallest digest.
@@ -21,7 +21,6 @@ from __future__ import annotations
 import gc
 import hashlib
 import logging
-import secrets
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -29,12 +28,12 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from tcpipe import __version__
 from tcpipe.errors import StoreError
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json, to_json
+from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.runs import RunFacts
 from tcpipe.formats.store_records import Call, Failure, LogSnapshot, Output, Problem, StoredMap, Tags, find_lineage
@@ -47,7 +46,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 """In the order in which they are listed: calls first, so that a call that ends later is seen as open."""
 BLOBS = "blobs"
 INDEX = "index.parquet"
-_RECORDS: Mapping[Kind, type] = {
+RECORDS: Mapping[Kind, type] = {
     "calls": Call, "runs": RunFacts, "failed": Failure, "tags": Tags, "seen": LogSnapshot, "acknowledged": Problem, "maps": StoredMap,
     "outputs": Output,
 }  # fmt: skip
@@ -92,11 +91,6 @@ def make_key(*parts: object) -> str:
 def make_run_key(sha256: str, recipe_id: str) -> str:
     """Return the key of the run of a content under a recipe."""
     return make_key(sha256, recipe_id)
-
-
-def make_blob_name() -> str:
-    """Return the name of a folder that nobody else writes to."""
-    return secrets.token_hex(_HEX // 2)
 
 
 @dataclass(slots=True)
@@ -300,13 +294,13 @@ def _decode(
         if (text := str(name)) in decoded:
             continue
         if text in indexed:
-            decoded[text] = parse_typed_json(indexed[text], _RECORDS[name.kind], text)
+            decoded[text] = parse_typed_json(indexed[text], RECORDS[name.kind], text)
         else:
             unread.append(name)
     found: list[bytes | None] = place.map(lambda name: _read_document(place, name), unread)
     for name, data in zip(unread, found, strict=True):
         if data is not None:
-            record: object = parse_typed_json(data, _RECORDS[name.kind], place.where(str(name)))
+            record: object = parse_typed_json(data, RECORDS[name.kind], place.where(str(name)))
             decoded[str(name)], fresh[str(name)] = record, to_compact_json(record)
     return fresh
 
@@ -337,8 +331,8 @@ def _read_index(place: Place) -> dict[str, bytes]:
 
 
 def _parse_index(data: bytes) -> dict[str, bytes]:
-    with suppress(pa.ArrowException, OSError, KeyError, ValueError):  # what pyarrow raises for damaged files
-        table = pq.ParquetFile(pa.BufferReader(data)).read()
+    with suppress(StoreError, KeyError):
+        table = read_parquet_bytes(data, INDEX)
         rows = dict(zip(table["name"].to_pylist(), table["facts"].to_pylist(), strict=True))
         if (table.schema.metadata or {}).get(_SEAL) == _seal(rows):
             return rows
@@ -346,11 +340,9 @@ def _parse_index(data: bytes) -> dict[str, bytes]:
 
 
 def _write_index(place: Place, rows: Mapping[str, bytes]) -> None:
-    sink = pa.BufferOutputStream()
     columns = [pa.array([*rows], pa.string()), pa.array([*rows.values()], pa.binary())]
     table = pa.Table.from_arrays(columns, ["name", "facts"]).replace_schema_metadata({_SEAL: _seal(rows)})
-    pq.write_table(table, sink, compression="zstd")
-    data = sink.getvalue().to_pybytes()
+    data = write_parquet_bytes(table)
     try:
         place.put(INDEX, data)
     except StoreError:  # a reader that may not write here keeps it in its own cache

@@ -79,7 +79,7 @@ def describe_finding(finding: Finding) -> str:
         begin_s, end_s = finding.span_s
         digits = 0 if end_s - begin_s >= _SHORT_S else 1
         values["span"] = f"{begin_s:.{digits}f} to {end_s:.{digits}f} s"
-    missing = dict.fromkeys(entry.fields, "?")  # a redacted finding keeps only what is public
+    missing = dict.fromkeys(entry.fields, "?")  # in a dataset without coordinates findings keep only what is public
     line = entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
     numbers = finding.numbers.keys() - entry.fields
     details = [f"{name} {finding.names[name]}" for name in _EVIDENCE if name in finding.names.keys() - entry.fields]

@@ -76,7 +76,12 @@ def _iterate_lines(card: DatasetCard) -> Iterator[str]:
         f"({', '.join(map(_escape_markdown, card.robots)) or 'none'}): power, velocity, duration and energy, "
         f"each with its standard deviation, beside a patch of the ground under it: {side}."
     )
-    yield from ("", f"![the maps from above]({OVERVIEW})", "", "## Labels, over train alone", "")
+    if card.without_coordinates:
+        text = "Positions are metres from an origin that is not published; times begin with the first sample."
+        yield from ("", text)
+    else:
+        yield from ("", f"![the maps from above]({OVERVIEW})")
+    yield from ("", "## Labels, over train alone", "")
     yield from ("| label | mean | standard deviation | least | most |", "|---|---|---|---|---|")
     for name, statistics in card.label_statistics_of_train.items():
         figures = (statistics.mean, statistics.std, statistics.min, statistics.max)
@@ -98,8 +103,6 @@ def _iterate_lines(card: DatasetCard) -> Iterator[str]:
     yield from ("## Splits", "", _format_splits(card), "")
     verdict = (f"- {line}" for line in list_verdict(card.verdict))
     yield from ("## Verdict", "", *verdict, "", "`dataset.json` has the findings.", "")
-    if card.redaction is not None:
-        yield from ("## Redacted", "", *map(_escape_markdown, card.redaction.lines()), "")
     yield from (
         "## Licence and citation",
         "",

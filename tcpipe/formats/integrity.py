@@ -1,4 +1,4 @@
-"""Seals: what lets `tcpipe verify` find one changed byte in files that no list of checksums can name (ADR-28).
+"""Seals: what lets `tcpipe verify` find one changed byte in files that no list of checksums can name (ADR-36).
 
 A JSON document holds the sha256 of the rest of itself, a page that of all before its last line. What a sealed
 document lists, by path, size and sha256, is proved by it in turn.

@@ -1,4 +1,4 @@
-"""JSON documents (run.json, manifest.json, dataset.json): sorted keys, no clock, so that the same content is the same bytes."""
+"""JSON documents (manifests, cards): sorted keys, no clock, so that the same content is the same bytes."""
 
 from __future__ import annotations
 

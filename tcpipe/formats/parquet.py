@@ -110,6 +110,12 @@ def read_table(path: Path, columns: list[str] | None = None, *, group: int | Non
         return _read_bounded(file.read_buffer(), columns, group)
 
 
+def read_parquet_bytes(data: bytes, where: str) -> pa.Table:
+    """Read the content of a Parquet file that `write_parquet_bytes` made; `StoreError` names one that cannot be read."""
+    with _convert_damage(where), pq.ParquetFile(pa.BufferReader(data)) as file:
+        return file.read()
+
+
 def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None) -> pa.Table:
     """Return columns of a file, or of one of its row groups, once they are known to be in proportion to it; `ValueError` if not."""
     about = pq.read_metadata(pa.BufferReader(data))

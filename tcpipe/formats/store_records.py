@@ -94,6 +94,8 @@ class Output:
     """Its path or URL in full."""
     inputs: str = ""
     """Digest of what the dataset that lies there was made of; "" where no call has made one."""
+    parts: Mapping[str, str] = field(default_factory=dict)
+    """Digests of the parts of that: runs, maps, recipe and so on."""
     runs: tuple[tuple[str, str], ...] = ()
     """Runs and recipes of which it was made: `prune` keeps them."""
     options: Mapping[str, object] = field(default_factory=dict)

@@ -62,7 +62,7 @@ class StoredRun:
         checksum = self.facts.tables.get(name)
         if checksum is None:
             raise StoreError(f"run {self.name}: its manifest lists no {name}; ingest the log again with --force")
-        return self.folder.proved(name, checksum)
+        return self.folder.fetch(name, checksum)
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
@@ -101,7 +101,7 @@ def _read_manifest(place: Place, document: str) -> Run:
 def find_stream_files(place: Place, row: RunFacts) -> dict[str, Path]:
     """Return the files of L1 of a run on this machine by role, verified."""
     folder = place.below(f"{BLOBS}/{row.streams_blob}")
-    return {PurePosixPath(name).stem: folder.proved(name, checksum) for name, checksum in sorted(row.streams.items())}
+    return {PurePosixPath(name).stem: folder.fetch(name, checksum) for name, checksum in sorted(row.streams.items())}
 
 
 def write_streams(directory: Path, streams: Streams, *, key: str) -> None:

@@ -62,7 +62,7 @@ from tcpipe.learning.predictions import (
 from tcpipe.learning.predictor import Prediction, find_kind
 from tcpipe.learning.training import Variant, compute_dataset_checksum, select_train, train
 from tcpipe.robots import Robot
-from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.splits.audit import CLOSE, LOCAL_PLACES, PLACES, are_near, compute_middles
 from tcpipe.tables.facts import Floor
 from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding, read_threshold
 from tcpipe.terrain.classes import NODATA_ID
@@ -270,9 +270,10 @@ _UNKNOWN = {0: "unknown"}
 
 def measure_leakage(data: Dataset, held: Split) -> Leakage | None:
     """Return how near the samples of a split are to those of train; None where either has no samples with a place."""
-    ours, theirs = (compute_middles_deg({name: part.column(name) for name in PLACES}) for part in (held, data["train"]))
+    names = PLACES if held.has_coordinates else LOCAL_PLACES
+    ours, theirs = (compute_middles([part.column(name) for name in names]) for part in (held, data["train"]))
     within_m = CLOSE * data.card.recipe.segment.chord_m
-    near = are_near(ours, theirs, within_m=within_m)
+    near = are_near(ours, theirs, within_m=within_m, in_degrees=held.has_coordinates)
     if not len(near) or not len(theirs):
         return None
     audit = next((part for part in data.card.split.audit if part.split == held.name and part.samples), None)

@@ -14,13 +14,14 @@ from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
-from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, find_newest, require_card
+from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.integrity import seal_document
 from tcpipe.formats.json_files import digest, parse_json, parse_typed, read_as, read_json, write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.published_outputs import find_newest, require_card, write_output
 from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
@@ -31,7 +32,6 @@ from tcpipe.learning.models import load_model, read_model_card
 from tcpipe.learning.own_models import load_own_kind
 from tcpipe.learning.predictions import check_fit, collect_runs
 from tcpipe.learning.training import compute_dataset_checksum
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.tables.findings import PREDICTED
 
 SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
@@ -78,7 +78,7 @@ def run_evaluation(
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
 
-    It may be a URL in a bucket, where it becomes the newest generation. Where the same evaluation is already, only its page
+    It may be a URL in a bucket, where it becomes the newest build. Where the same evaluation is already, only its page
     is written again; at a URL nothing is.
     """
     rules = config or EvaluateConfig()
@@ -87,7 +87,7 @@ def run_evaluation(
     if is_url(out):
         if (known := _read_at_url(str(out), key)) is not None:
             return known
-        with write_generation(str(out), JSON) as made:
+        with write_output(str(out), JSON) as made:
             result = run_evaluation(model, dataset, made, config=config, plant=plant, predictor=predictor)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)

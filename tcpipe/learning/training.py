@@ -20,10 +20,11 @@ from tcpipe.dataset.extra_features import ExtraFeature, available_features, read
 from tcpipe.dataset.tensor import ONE_HOT
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
-from tcpipe.formats.bucket_directories import fetch_directory, has_card
+from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published_outputs import find_newest, write_output
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
 from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange, format_readme
@@ -43,7 +44,6 @@ from tcpipe.learning.predictor import (
     find_held_out,
     find_kind,
 )
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
 from tcpipe.terrain.layers import COLOURS, LAYERS, PAPER_LAYERS
 from tcpipe.terrain.sampling import compute_relief_m
@@ -165,7 +165,7 @@ def train(
     ----------
     dataset : what ``tcpipe build-dataset`` wrote.
     out : a new folder, or one with only a model, which is replaced unless it is complete and of the same dataset and options; or a URL in a
-        bucket, where it becomes the newest generation. ``<out>.KEY.checkpoint`` beside a folder keeps the state, so that a training
+        bucket, where it becomes the newest build. ``<out>.KEY.checkpoint`` beside a folder keeps the state, so that a training
         continues; another dataset, or other options, have another one.
     config : the options.
     variant : what another network than the paper's is trained on.
@@ -218,10 +218,10 @@ def train(
 
 def _train_into_bucket(url: str, key: str, run: Callable[[Path], TrainResult]) -> TrainResult:
     """Train on this machine, and put the model to a URL."""
-    known = read_model_card(fetch_directory(url)) if has_card(url) else None
+    known = read_model_card(fetch_directory(url)) if find_newest(url, [CARD]) else None
     if known is not None and known.training.key == key:
         return _make_result(url, "unchanged", known.training, TrainingTimes())
-    with write_generation(url, CARD) as place:
+    with write_output(url, CARD) as place:
         result = run(place)
     return replace(result, path=url)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import FusionError, StoreError, UsageError, clean_lines
+from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
@@ -29,12 +29,12 @@ from tcpipe.fusion.withheld import (
     score_comparisons,
 )
 from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
+from tcpipe.pipeline.named_runs import find_named_run, is_path
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, name_pose, prepare_inputs, prepare_pose
 from tcpipe.stages.read import find_read_config, read_run
-from tcpipe.store import is_store, run_at
 from tcpipe.tables.arrays import number_column, select_rows
 from tcpipe.tables.columns import read_float_columns, to_integers
 from tcpipe.tables.levels import Streams, Track
@@ -227,7 +227,12 @@ def _make_row(score: WithheldScore) -> tuple[str, ...]:
 
 
 def audit(
-    run: Path | str, *, recipe: Recipe, robot: str | None = None, message_definitions: Path | None = None
+    run: Path | str,
+    *,
+    recipe: Recipe,
+    robot: str | None = None,
+    message_definitions: Path | None = None,
+    store: Path | str = "tcpipe-store",
 ) -> Audit:
     """Withhold fixes, wheels and camera in windows, fuse the rest, and score the track by what was withheld.
 
@@ -236,11 +241,12 @@ def audit(
 
     Parameters
     ----------
-    run : a log, or ``STORE/runs/RUN``, which is fused as its own recipe says.
+    run : a log, or a run of the store (RUN or RUN/RECIPE), which is fused as its own recipe says.
     recipe, robot, message_definitions : how a log is read and fused, as `tcpipe.pipeline.ingest.ingest` takes them.
+    store : where a run is looked up.
     """
     name = format_path(run)
-    streams, config = read_audited(run, recipe, robot=robot, message_definitions=message_definitions)
+    streams, config = read_audited(run, recipe, robot=robot, message_definitions=message_definitions, store=store)
     found = compare_withheld(streams, config, run_id=name)
     skipped = tuple(f"{name_pose(role, streams)}, {reason}" for role, reason in found.skipped)
     if not found.comparisons and not found.length_ratios:
@@ -251,33 +257,19 @@ def audit(
 
 
 def read_audited(
-    run: Path | str, recipe: Recipe, *, robot: str | None = None, message_definitions: Path | None = None
+    run: Path | str,
+    recipe: Recipe,
+    *,
+    robot: str | None = None,
+    message_definitions: Path | None = None,
+    store: Path | str = "tcpipe-store",
 ) -> tuple[Streams, FuseConfig]:
     """Return the streams of a log or of a run of a store, and how these are fused; parameters and errors as for `audit`."""
-    stored = _read_stored(run)
-    if stored is not None:
-        return stored
+    if not is_path(run):
+        stored = find_named_run(run, store)
+        return stored.streams(), stored.manifest.recipe.fuse
     path = run if is_url(run) else Path(run)
     step("reading")
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as log:
         read = find_read_config(recipe, log.topics)
         return read_run(log, read, robot=robot or recipe.robot, known=load_profiles(recipe)), recipe.fuse
-
-
-def _read_stored(run: Path | str) -> tuple[Streams, FuseConfig] | None:
-    """Return the streams of a run of a store, and how it was fused; None for any other path."""
-    if is_store(run):
-        raise UsageError(f"{run}: is a store; give one of its runs, {run}/runs/RUN")
-    found = run_at(run)
-    if found is None:
-        return None
-    store, runs = found
-    if len(runs) > 1:
-        names = ", ".join(run.recipe_id for run in runs)
-        raise UsageError(f"{run}: was ingested under several recipes; give one of them: {run}/… {names}")
-    streams = store.read_streams(runs[0].run_id, key=runs[0].streams_key)
-    if streams is None:
-        raise StoreError(
-            f"{run}: its streams are gone or were read otherwise; audit its log, or ingest it again with --force"
-        )
-    return streams, runs[0].manifest.recipe.fuse

@@ -69,6 +69,11 @@ class OpenCall:
     """``perhaps running`` where its process cannot be looked at from here."""
     call: Call
 
+    @property
+    def key(self) -> str:
+        """Key of its documents."""
+        return self.name.removeprefix(CALL_PREFIX)
+
     def __str__(self) -> str:
         """Return it as one line."""
         process = self.call.process
@@ -182,17 +187,24 @@ def _close_killed_calls(running: RunningCall) -> None:
     A call counts as killed only if a listing that is made after its process was seen dead shows no end of it.
     """
     dead = [open_call for open_call in list_open_calls(running.state) if open_call.state == "killed"]
-    mine = [
-        each for each in dead if _is_done_by(each.call, running.call) and each.name != f"{CALL_PREFIX}{running.key}"
-    ]
-    for each in mine:
+    for each in dead:
+        if each.key == running.key or not _is_done_by(each.call, running.call):
+            continue
         close_call(running.store, running.state, each, f"its work was done by {CALL_PREFIX}{running.key}")
+
+
+def make_blob_name() -> str:
+    """Return the name of a folder of payload that nobody else writes to: random."""
+    return secrets.token_hex(8)
 
 
 def close_call(store: Store, state: State, killed: OpenCall, message: str) -> None:
     """Write the end of a killed call, unless it has written it itself meanwhile."""
-    key = killed.name.removeprefix(CALL_PREFIX)
-    if not any(file.startswith(f"{key}.") and not file.startswith(f"{key}.1.") for file in store.place.list("calls")):
+    key = killed.key
+    ends = [
+        file for file in store.place.list("calls") if file.startswith(f"{key}.") and not file.startswith(f"{key}.1.")
+    ]
+    if not any(f"calls/{file}" not in state.damaged for file in ends):
         with suppress(StoreError):
             store.put(state, "calls", key, replace(killed.call, exit_code=1, message=message))
 

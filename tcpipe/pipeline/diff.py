@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory
-from tcpipe.formats.dataset_card import DatasetCard, Exclusion, MapSource, RunSource
+from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
+from tcpipe.formats.dataset_inputs import Change, compare_records, format_value
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.json_files import to_plain
-from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Subject
@@ -28,9 +27,9 @@ _LABELLED = (*_LABELS, "fused_velocity_mps", *_STDS)
 _DRAWN = ("split", "fold")
 _SHARED = 0.9
 """So much of their time samples share that are compared."""
-_VERSIONS = ("tcpipe_version", "data_model_version")
 
 Ints = NDArray[np.int64]
+Describe = Callable[[Change, DatasetCard, DatasetCard], Iterator[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,66 +206,109 @@ def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict
 
 def _iterate_causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
     """Yield a line for everything that the two are made from differently."""
-    for name in _VERSIONS:
-        was, now = getattr(a, name), getattr(b, name)
-        if was != now:
-            yield f"code: {name} {was} → {now}"
-    ours, theirs = flatten_recipe(a.recipe), flatten_recipe(b.recipe)
-    for key in sorted({*ours, *theirs}):
-        if ours.get(key) != theirs.get(key):
-            yield f"recipe: {key} {_format_value(ours.get(key))} → {_format_value(theirs.get(key))}"
-    yield from _run_causes({run.run_id: run for run in a.runs}, {run.run_id: run for run in b.runs})
-    yield from _map_causes({entry.name: entry for entry in a.maps}, {entry.name: entry for entry in b.maps})
-    if a.split.region != b.split.region:
-        yield f"region: {'added' if a.split.region is None else 'removed' if b.split.region is None else 'another one'}"
-    if a.split.kept != b.split.kept:
-        yield f"kept split: {_format_value(to_plain(a.split.kept))} → {_format_value(to_plain(b.split.kept))}"
-    yield from _exclusion_causes(
-        {exclusion.name: exclusion for exclusion in a.exclusions},
-        {exclusion.name: exclusion for exclusion in b.exclusions},
-    )
-    if a.format != b.format:
-        yield f"format: {a.format} → {b.format}"
+    changes = list(compare_records(a.made_from, b.made_from))
+    for field, describe in _CAUSES.items():
+        yield from dict.fromkeys(
+            line for change in changes if change.path[0] == field for line in describe(change, a, b)
+        )
+    if a.inputs != b.inputs and not changes:
+        yield "inputs: differ, but a dataset without coordinates does not store them"
 
 
-def _run_causes(a: Mapping[str, RunSource], b: Mapping[str, RunSource]) -> Iterator[str]:
-    for run_id in sorted({*a, *b}):
-        if run_id not in a or run_id not in b:
-            which, run = ("added", b[run_id]) if run_id not in a else ("removed", a[run_id])
-            yield f"log: {which} {', '.join(run.logs)} (run {run_id}, {run.samples} samples)"
-        elif a[run_id].segments_sha256 != b[run_id].segments_sha256:
-            was, now = a[run_id].recipe_id, b[run_id].recipe_id
-            why = f"ingested with recipe {was} → {now}" if was != now else "the same log and recipe, ingested again"
-            yield f"log: run {run_id} has other segments: {why}"
+def _describe_change(word: str) -> Describe:
+    """Return a function that describes changes of plain values, whose name and values are all there is to say."""
+
+    def describe(change: Change, _a: DatasetCard, _b: DatasetCard) -> Iterator[str]:
+        name = f"{change.name} " if change.name else ""
+        yield f"{word}: {name}{format_value(change.was)} → {format_value(change.now)}"
+
+    return describe
 
 
-def _exclusion_causes(a: Mapping[str, Exclusion], b: Mapping[str, Exclusion]) -> Iterator[str]:
-    for name in sorted({*a, *b}):
-        if name not in a or name not in b:
-            which, exclusion = ("added", b[name]) if name not in a else ("removed", a[name])
-            yield f"exclusion: {which} {name} ({exclusion.samples} samples): {exclusion.reason}"
-        elif (was := a[name]) != (now := b[name]):
-            yield f"exclusion: {name} is another list: {was.samples} → {now.samples} samples, {was.reason} → {now.reason}"
+def _describe_file(word: str, kind: str) -> Describe:
+    """Return a function that describes changes of files, of which the content differs."""
+
+    def describe(change: Change, _a: DatasetCard, _b: DatasetCard) -> Iterator[str]:
+        which = "added" if change.was is None else "removed" if change.now is None else ""
+        yield f"{word}: {f'{which} {change.name}' if which else f'{change.name} is another {kind}'}".rstrip()
+
+    return describe
 
 
-def _map_causes(a: Mapping[str, MapSource], b: Mapping[str, MapSource]) -> Iterator[str]:
-    for name in sorted({*a, *b}):
-        if name not in a or name not in b:
-            yield f"map: {'added' if name not in a else 'removed'} {name}"
-        elif a[name].sha256 != b[name].sha256:
-            yield f"map: {name} is another one: {', '.join(_map_changes(a[name], b[name])) or 'its files were made again'}"
+def _describe_run(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
+    """Yield what differs in a run; of a run with other segments all but its tags follows from them."""
+    run_id, *key = change.path[1:]
+    was, now = a.made_from.runs.get(run_id), b.made_from.runs.get(run_id)
+    if (one := now or was) is not None and None in (was, now):
+        which, card = ("added", b) if was is None else ("removed", a)
+        samples = sum(run.samples for run in card.runs if run.run_id == run_id)
+        yield f"log: {which} {', '.join(one.logs)} (run {run_id}, {samples} samples)"
+    elif was is None or now is None:
+        return
+    elif key[0] == "tags":
+        yield f"tags: run {run_id} {'.'.join(key[1:])} {format_value(change.was)} → {format_value(change.now)}"
+    elif was.segments_sha256 != now.segments_sha256:
+        other = was.recipe_id != now.recipe_id
+        again = (
+            f"ingested with recipe {was.recipe_id} → {now.recipe_id}"
+            if other
+            else "the same log and recipe, ingested again"
+        )
+        yield f"log: run {run_id} has other segments: {again}"
+    else:
+        yield f"log: run {run_id} {key[0]} {format_value(change.was)} → {format_value(change.now)}"
+
+
+def _describe_exclusion(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
+    name = change.path[1]
+    was, now = (next((each for each in card.exclusions if each.name == name), None) for card in (a, b))
+    if was is not None and now is not None:
+        yield f"exclusion: {name} is another list: {was.samples} → {now.samples} samples, {was.reason} → {now.reason}"
+    elif (one := now or was) is not None:
+        yield f"exclusion: {'removed' if now is None else 'added'} {name} ({one.samples} samples): {one.reason}"
+
+
+def _describe_map(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
+    was, now = (next((each for each in card.maps if each.name == change.name), None) for card in (a, b))
+    if was is None or now is None:
+        yield f"map: {'added' if was is None else 'removed'} {change.name}"
+    else:
+        yield f"map: {change.name} is another one: {', '.join(_map_changes(was, now)) or 'its files were made again'}"
+
+
+def _describe_order(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
+    if a.made_from.maps.keys() == b.made_from.maps.keys():
+        yield f"map: order {format_value(change.was)} → {format_value(change.now)}"
+
+
+def _describe_region(_: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
+    yield f"region: {'added' if a.made_from.region is None else 'removed' if b.made_from.region is None else 'another one'}"
+
+
+_CAUSES: dict[str, Describe] = {
+    "versions": _describe_change("code"),
+    "recipe": _describe_change("recipe"),
+    "runs": _describe_run,
+    "robots": _describe_change("robots"),
+    "tags": _describe_change("chosen tags"),
+    "maps": _describe_map,
+    "map_names": _describe_order,
+    "region": _describe_region,
+    "covariates": _describe_file("covariates", "table"),
+    "exclusions": _describe_exclusion,
+    "kept_split": _describe_file("kept split", "one"),
+    "file_format": _describe_change("format"),
+    "without_coordinates": _describe_change("without coordinates"),
+}
+"""By field of `DatasetInputs`: what to say of a change."""
 
 
 def _map_changes(a: MapSource, b: MapSource) -> Iterator[str]:
     for key in ("crs", "pixel_size_m", "rows", "cols", "sources"):
         if getattr(a, key) != getattr(b, key):
-            yield f"{key} {_format_value(getattr(a, key))} → {_format_value(getattr(b, key))}"
+            yield f"{key} {format_value(getattr(a, key))} → {format_value(getattr(b, key))}"
     ours, theirs = ({} if entry.inputs is None else entry.inputs.files for entry in (a, b))
     yield from (f"another {role} file" for role in sorted({*ours, *theirs}) if ours.get(role) != theirs.get(role))
-
-
-def _format_value(value: object) -> str:
-    return "none" if value is None else str(value)
 
 
 def _iterate_lines(found: Difference) -> Iterator[str]:
@@ -274,7 +316,7 @@ def _iterate_lines(found: Difference) -> Iterator[str]:
         yield f"{found.a} and {found.b}: the same {found.samples['in both']} samples, made from the same"
         return
     yield f"{found.a} → {found.b}"
-    yield from found.causes or ("no recorded cause: same code, recipe, logs, maps and region",)
+    yield from found.causes or ("no recorded cause: they are made from the same",)
     yield "samples: " + ", ".join(
         f"{count} {name}"
         for name, count in found.samples.items()

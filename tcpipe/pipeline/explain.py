@@ -24,12 +24,14 @@ from tcpipe.formats.dataset_files import (
     read_samples,
     sample_columns,
 )
-from tcpipe.formats.json_files import convert_record, to_plain
+from tcpipe.formats.documents import State
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_table
-from tcpipe.formats.run_documents import Ingestion, LogOrigin
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.stored_runs import StoredRun, read_streams
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
@@ -118,9 +120,8 @@ class History:
     """Its row of samples.parquet by column, and which ``row`` it is."""
     labels: Mapping[str, float]
     quality: tuple[str, ...]
-    run: Ingestion
-    source: LogOrigin | None
-    """The log that the run was read from; None where run.json is gone."""
+    run: RunFacts
+    """The run, and the log that it was read from."""
     messages: Mapping[str, MessageRange]
     """By role."""
     masks: tuple[NearbyMask, ...]
@@ -152,22 +153,22 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     opened = open_store(store)
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     card, sample = read_intact_card(directory), _read_sample(directory, sample_id)
-    run = _run(opened, directory, card, sample)
-    streams = opened.read_streams(run.run_id, key=run.streams_key)
-    source = open_map(*opened.map_files(sample["map"]))
-    return Explained(sample_id, _read_history(opened, card, sample, run, streams=streams, source=source))
+    if card.without_coordinates:
+        raise DatasetError(
+            f"{directory}: is without coordinates, so that its samples have no known source; explain the dataset with them"
+        )
+    run = _find_run(opened, state := opened.scan(), directory, card, sample)
+    source = open_map(*opened.map_at(opened.find_map(sample["map"], state)))
+    return Explained(sample_id, _read_history(card, sample, run, source=source))
 
 
-def _read_history(
-    store: Store, card: DatasetCard, sample: Row, run: RunDirectory, *, streams: Streams | None, source: MapFile
-) -> History:
-    window, known = (sample["start_ns"], sample["end_ns"]), store.run_json(run.run_id)
+def _read_history(card: DatasetCard, sample: Row, run: StoredRun, *, source: MapFile) -> History:
+    window, streams = (sample["start_ns"], sample["end_ns"]), read_streams(run.place, run.facts)
     return History(
         sample=sample,
         labels={name: sample[name] for name in _LABELS},
         quality=flag_names(sample["quality"], Quality),
-        run=convert_record(run.manifest, Ingestion),
-        source=known.source if known else None,
+        run=run.facts,
         messages={} if streams is None else dict(_find_messages(streams, *window)),
         masks=tuple(_iterate_masks(run, *window)),
         rejected=tuple(_iterate_rejections(run, *window)),
@@ -204,19 +205,19 @@ def _read_sample(directory: Path, sample_id: str) -> Row:
     return {**group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0], "row": row}
 
 
-def _run(store: Store, directory: Path, card: DatasetCard, sample: Row) -> RunDirectory:
+def _find_run(store: Store, state: State, directory: Path, card: DatasetCard, sample: Row) -> StoredRun:
     recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample["run_id"]), None)
     if recipe_id is None:
         raise DatasetError(
             f"{directory}: its card lists no run {sample['run_id']}; 'tcpipe verify {directory}' lists all problems"
         )
-    for run in store.recipes_of(sample["run_id"]):
-        if run.recipe_id == recipe_id:
-            return run
-    raise DatasetError(
-        f"{store.root}: run {sample['run_id']} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
-        "name the store it was built from with --store"
-    )
+    found = store.find_runs(f"{sample['run_id']}/{recipe_id}", state)
+    if not found:
+        raise DatasetError(
+            f"{store.root}: run {sample['run_id']} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
+            "name the store it was built from with --store"
+        )
+    return found[0]
 
 
 def _find_messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, MessageRange]]:
@@ -242,7 +243,7 @@ def _find_messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tup
         )
 
 
-def _iterate_masks(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyMask]:
+def _iterate_masks(run: StoredRun, start_ns: int, end_ns: int) -> Iterator[NearbyMask]:
     table = run.track().table
     stamps, bits = to_integers(table, "stamp_ns"), to_integers(table, "dropped_by")
     near = slice(*np.searchsorted(stamps, [start_ns - _NEARBY_NS, end_ns + _NEARBY_NS]))
@@ -255,7 +256,7 @@ def _iterate_masks(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[Ne
             yield NearbyMask(names, "before" if before else "after", float(offset_ns) / 1e9, len(part))
 
 
-def _iterate_rejections(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyRefusal]:
+def _iterate_rejections(run: StoredRun, start_ns: int, end_ns: int) -> Iterator[NearbyRefusal]:
     table = run.rejections()
     stamps = to_integers(table, "stamp_ns")
     near = (stamps >= start_ns - _NEARBY_NS) & (stamps <= end_ns + _NEARBY_NS)
@@ -312,9 +313,8 @@ def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
         f"duration {labels['duration_s']:.3f} s, energy {labels['energy_joule']:.1f} J; "
         f"quality {', '.join(facts.quality) or 'clean'}"
     )
-    paths, sha256 = (facts.source.paths, facts.source.sha256) if facts.source else ((), "")
-    there = [path if Path(path).exists() else f"{path} (now missing)" for path in paths]
-    yield f"log      {', '.join(there) or 'unknown'} (sha256 {sha256[:12]}…), run {run.run_id}, robot {run.robot}"
+    there = [path if is_url(path) or Path(path).exists() else f"{path} (now missing)" for path in run.log.paths]
+    yield f"log      {', '.join(there)} (sha256 {run.log.sha256[:12]}…), run {run.run_id}, robot {run.robot}"
     yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
     for role, found in facts.messages.items():
         count = found.last - found.first + 1

@@ -21,7 +21,7 @@ from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.parquet import make_storable, read_schema, write_parquet_rows
 from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.log_sources import make_definitions_key
-from tcpipe.store import find_store_above, is_store
+from tcpipe.store import is_store
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import add_metadata, read_metadata
 
@@ -173,7 +173,7 @@ def _refuse_what_is_ours(out: Path) -> None:
     signs = {
         "dataset": "dataset.json", "map": "zarr.json", "model": "model.json", "cost map": "cost-map.json",
     }  # fmt: skip
-    ours = "store" if is_store(out) else "run" if find_store_above(out) else None
+    ours = "store" if is_store(out) else None
     kind = ours or next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
     if kind:
         raise UsageError(f"{out}: is a {kind}; give another directory for the topics")

@@ -81,12 +81,14 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     in its result.
     """
     refuse_import_of_script(options.jobs)
-    opened = open_store(options.store, create=not options.existing_store)
+    opened = open_store(options.store, create=True)
     options = replace(options, logs=list(options.logs))
     given = tuple(make_absolute(path) for path in options.logs if not is_presigned(path))  # signed URLs are not stored
     definitions = options.message_definitions and str(Path(options.message_definitions).absolute())
     how = CallOptions(options.robot, options.as_one, definitions or None)
     is_new = not is_store(opened.root)
+    if is_new and options.existing_store:
+        raise StoreError(f"{opened.root}: there is no store here (--existing-store); is a disk not mounted?")
     with record_call(opened, INGEST, given, how, jobs=options.jobs) as call:
         if is_new and options.on_note:
             options.on_note(f"new store: {opened.root}")

@@ -30,6 +30,7 @@ from tcpipe.formats.stored_runs import (
     write_streams,
 )
 from tcpipe.logs.topics import split_notes
+from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.log_sources import LogSource, find_damaged_log, find_total_loss
 from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
@@ -129,7 +130,7 @@ def tag_log(store: Store, state: State, sha256: str, given: Mapping[str, str]) -
 
 
 def _find_hash(state: State, log: AnyLog) -> str:
-    """Return the hash by which the store knows a log, or is to know it (ADR-30).
+    """Return the hash by which the store knows a log, or is to know it (ADR-36).
 
     That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage
     is not taken for it: what was broken there may be whole here.
@@ -271,7 +272,7 @@ def put_run(store: Store, state: State, run: Run, directory: Path, stored: RunFa
     """Put the files of a run into the store, then its manifest; ``stored`` has streams that are there already."""
     files = compute_checksums(directory)
     streams = {name: checksum for name, checksum in files.items() if name.startswith(f"{STREAMS}/")}
-    blob = store.put_blob(directory)
+    store.put_blob(blob := make_blob_name(), directory)
     run = replace(
         run,
         blob=blob,

@@ -11,19 +11,22 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
-from tcpipe.formats.bucket_directories import fetch_directory_by_range, has_card
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.logs.log_file import is_log_file, list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.logs.table_folders import find_table_logs, is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
-from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.published_outputs import CARDS, find_newest
+from tcpipe.formats.runs import Counts, LogOrigin, RunFacts
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_remote_logs
+from tcpipe.pipeline.named_runs import find_named_runs, is_path
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store, is_store, run_at
+from tcpipe.store import Store, is_store
 from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
@@ -39,31 +42,30 @@ class InspectedLogs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InspectedIngestion(Ingestion):
-    """A run under one recipe: what became of it."""
+class InspectedRecipe(RunFacts):
+    """A run under one recipe: its facts, and the verdict by the catalogue of this version."""
 
     counts: Counts
-    findings: tuple[Finding, ...]
     verdict: Verdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedRun:
-    """What a run is, under every recipe."""
+    """A run, under every recipe."""
 
     kind: Literal["run"] = "run"
     path: str
+    """Its store."""
     run_id: str
-    source: LogOrigin | None
-    """None where run.json is gone."""
+    log: LogOrigin
     tags: Mapping[str, str]
     notes: tuple[Finding, ...]
-    recipes: tuple[InspectedIngestion, ...]
+    recipes: tuple[InspectedRecipe, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StoredIngestion:
-    """A run under one recipe: its grades, and how much there is to say of it."""
+class GradedRun:
+    """A run under one recipe: its grades, and its number of findings."""
 
     run_id: str
     recipe_id: str
@@ -84,13 +86,15 @@ class InspectedStore:
     kind: Literal["store"] = "store"
     path: str
     maps: tuple[str, ...]
-    runs: tuple[StoredIngestion, ...]
+    runs: tuple[GradedRun, ...]
     outdated: Mapping[str, str]
-    """Runs of another data model, and which."""
-    damaged_runs: Mapping[str, str]
-    """By path, what is wrong."""
+    """Data model of each run of another one, by RUN/RECIPE."""
+    incomplete: tuple[str, ...]
+    """RUN/RECIPE of each run whose tables are missing."""
+    damaged: tuple[str, ...]
+    """Documents that are not as they were written."""
     superseded: Mapping[str, str]
-    """Runs, and which run supersedes each."""
+    """The run that supersedes each superseded run."""
 
 
 Inspected: TypeAlias = (
@@ -105,24 +109,25 @@ def inspect(
     robot: str | None = None,
     full: bool = False,
     message_definitions: Path | None = None,
+    store: Path | str = "tcpipe-store",
 ) -> Inspected:
-    """Return what the path holds; with ``full`` from every message of a log, for damage, gaps, stamps and clocks.
+    """Return what the path, or the run of a store, holds; with ``full`` from every message of a log, for damage, gaps, stamps and clocks.
 
-    ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `LogError`, `MapError`,
-    `DatasetError`, `StoreError`: it is none of these, or cannot be read.
+    ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `UsageError`, `LogError`,
+    `MapError`, `DatasetError`, `StoreError`: it is none of these, or cannot be read.
     """
     ask = partial(
         _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions
     )
     if is_url(path):
         return _inspect_url(str(path).rstrip("/"), ask)
+    if not is_path(path):
+        return _inspect_run(find_named_runs(path, store))
     path = Path(path)
-    if not path.exists():
-        raise UsageError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
         return _inspect_dataset(path, str(path))
-    if stored := _inspect_in_store(path):
-        return stored
+    if path.is_dir() and is_store(path):
+        return _inspect_store(Store(path))
     if path.suffix == ".zarr":
         from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
         from tcpipe.pipeline.inspected import InspectedMap  # noqa: PLC0415
@@ -136,9 +141,9 @@ def _inspect_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspect
         return ask(url)
     if not is_log_file(url):  # of a log nothing else need be readable
         with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
-            if stored := _inspect_in_store(url):
-                return stored
-        if has_card(url):
+            if is_store(url):
+                return _inspect_store(Store(url))
+        if find_newest(url, CARDS):
             from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
 
             return _inspect_dataset(fetch_directory_by_range(url, by_range=is_shard)[0], url)
@@ -152,13 +157,6 @@ def _inspect_dataset(directory: Path, name: str) -> InspectedDataset:
     from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
 
     return convert_record(read_intact_card(directory), InspectedDataset, kind="dataset", path=name)
-
-
-def _inspect_in_store(path: Path | str) -> InspectedStore | InspectedRun | None:
-    if is_store(path):
-        return _store(Store(path))
-    found = run_at(path)
-    return _run(path, *found) if found else None
 
 
 def _inspect_logs_or_tables(
@@ -200,38 +198,38 @@ def _try_inspect(path: Path | str, ask: Callable[[Path | str], InspectedLog]) ->
         return InspectedLog(path=format_path(path), problems=error.problems)
 
 
-def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedRun:
-    run_id = runs[0].run_id
-    known = store.run_json(run_id)
+def _inspect_run(runs: Sequence[StoredRun]) -> InspectedRun:
+    run, manifests = runs[0], [run.manifest for run in runs]
     return InspectedRun(
-        path=str(path),
-        run_id=run_id,
-        source=known.source if known else None,
-        tags=known.tags if known else {},
-        notes=known.notes if known else (),
-        recipes=tuple(
-            convert_record(run.manifest, InspectedIngestion, findings=run.manifest.info.report.findings) for run in runs
-        ),
+        path=run.place.where(),
+        run_id=run.run_id,
+        log=run.facts.log,
+        tags=run.facts.tags,
+        notes=manifests[0].notes,
+        recipes=tuple(convert_record(each, InspectedRecipe, verdict=each.verdict) for each in manifests),
     )
 
 
-def _store(store: Store) -> InspectedStore:
-    found = store.ingestions()
-    runs, outdated = found.finished, {run_id: row.data_model_version for run_id, row in found.outdated.items()}
+def _inspect_store(store: Store) -> InspectedStore:
+    state = store.scan()
+    rows = {f"{row.run_id}/{row.recipe_id}": row for row in state.list_rows() if row.blob}
     return InspectedStore(
         path=str(store.root),
-        maps=tuple(store.maps()),
-        runs=tuple(_make_stored(run) for run in runs),
-        outdated=outdated,
-        damaged_runs={store.runs_place.where("/".join(filter(None, run))): line for run, line in found.damaged.items()},
-        superseded=dict(found.superseded),
+        maps=tuple(state.maps),
+        runs=tuple(_grade_run(run) for run in store.runs(state)),
+        outdated={
+            name: row.data_model_version for name, row in rows.items() if row.data_model_version != DATA_MODEL_VERSION
+        },
+        incomplete=tuple(name for name, row in rows.items() if not state.has_payload(row)),
+        damaged=tuple(map(store.place.where, sorted(state.damaged))),
+        superseded={row.run_id: row.superseded_by for row in rows.values() if row.superseded_by},
     )
 
 
-def _make_stored(run: RunDirectory) -> StoredIngestion:
+def _grade_run(run: StoredRun) -> GradedRun:
     facts, verdict = run.facts, run.facts.verdict
     grades = {name: getattr(verdict, name) for name in AFFECTED}
-    return convert_record(facts, StoredIngestion, **grades, findings=len(facts.findings), damage=len(facts.damage))
+    return convert_record(facts, GradedRun, **grades, findings=len(facts.findings), damage=len(facts.damage))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

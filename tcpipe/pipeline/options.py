@@ -60,7 +60,7 @@ class IngestOptions:
     shard: tuple[int, int] | None = option(
         None,
         Option(
-            "Be task I of N of an array job: ingest every N-th log.",
+            "Be task I of N of an array job: ingest its share of the logs, by their names.",
             (),
             "shard",
             "I/N",
@@ -145,7 +145,7 @@ class BuildDatasetOptions:
     """Which runs and maps a dataset is made from, and how."""
 
     out: str | Path = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
-    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a generation."""
+    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a folder of its own."""
     _: KW_ONLY
     split: str | Path | None = option(
         None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")
@@ -200,11 +200,9 @@ class BuildDatasetOptions:
             (), Range(1, 1_000_000), "N"
         ),
     )  # fmt: skip
-    redact: bool = option(
+    without_coordinates: bool = option(
         False,
-        Option(
-            "For publication: move all positions to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
-        ),
+        Option("For publication: metres from an unstated origin, and no longitude, latitude, CRS, times or names."),
     )
     force: bool = option(
         False, Option("Replace a dataset that was made with other options (region, map, tags, recipe …).")

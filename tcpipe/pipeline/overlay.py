@@ -20,10 +20,10 @@ from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
-from tcpipe.store import Store, run_at
+from tcpipe.pipeline.named_runs import find_named_run
 from tcpipe.tables.arrays import make_text_column, to_numbers, to_texts
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.levels import GEOMETRY
@@ -64,29 +64,22 @@ class Overlay:
         return clean_lines((f"{self.path}: run {self.run_id} under recipe {self.recipe_id}, on its log's clock", *said))
 
 
-def write_overlay(path: Path | str, out: Path) -> Overlay:
+def write_overlay(name: str, out: Path, *, store: Path | str = "tcpipe-store") -> Overlay:
     """Write what became of a run as an MCAP of ROS 2 messages, whole or not at all; the same run gives the same bytes.
 
-    `UsageError`: the path is no run, or one under several recipes, or ``out`` is there and no overlay: a recording is never replaced;
-    `StoreError`: a file of the run is not as it was written, or its streams, which know the recorder's clock, were made otherwise or are
-    gone.
+    `UsageError`: there is no run of this name (RUN or RUN/RECIPE), or it is under several recipes, or ``out`` is there and no overlay: a
+    recording is never replaced; `StoreError`: a file of the run, or its streams, which know the recorder's clock, is not as it was written.
     """
-    found = run_at(path)
-    if found is None:
-        raise UsageError(f"{path}: is no run of a store; give STORE/runs/RUN, as 'tcpipe inspect STORE' lists them")
-    store, runs = found
-    if len(runs) > 1:
-        names = ", ".join(run.recipe_id for run in runs)
-        raise UsageError(f"{path}: was ingested under several recipes; give one of them: {path}/… {names}")
+    run = find_named_run(name, store)
     _refuse_others(out)
-    streams = list(_iterate_streams(store, runs[0]))
+    streams = list(_iterate_streams(run))
     write_mcap(out, streams)
     count: dict[str, int] = {}
     for stream in streams:
         count[stream.topic] = count.get(stream.topic, 0) + len(stream.log_time_ns)
     times = np.concatenate([stream.log_time_ns for stream in streams])
     ends = (int(times.min()), int(times.max())) if len(times) else (None, None)
-    return Overlay(str(out), runs[0].run_id, runs[0].recipe_id, count, *ends)
+    return Overlay(str(out), run.run_id, run.recipe_id, count, *ends)
 
 
 def _refuse_others(out: Path) -> None:
@@ -99,9 +92,9 @@ def _refuse_others(out: Path) -> None:
         raise UsageError(f"{out}: exists and is not an overlay; give another name")
 
 
-def _iterate_streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]:
+def _iterate_streams(run: StoredRun) -> Iterator[MessageStream]:
     """Yield every topic's messages."""
-    clock = _find_recorder_clock(store, run)
+    clock = _find_recorder_clock(run)
     track, segments, refused = run.track(), run.segments().drop_columns([GEOMETRY]), run.rejections()
     rows = _add_bit_names(track.table, "dropped_by", DropReason, "reasons", "kept")
     cut = _add_bit_names(segments, "quality", Quality, "quality_names", "clean")
@@ -153,13 +146,12 @@ class _Clock:
         return epoch
 
 
-def _find_recorder_clock(store: Store, run: RunDirectory) -> _Clock:
-    """Return the clock of a run's log; `StoreError` where its streams are not those that the run was made from."""
-    known = store.run_json(run.run_id)
-    if known is None or known.streams_key != run.streams_key or not known.streams:
-        raise StoreError(f"{run.where}: its streams are missing or were read again; ingest the log again")
+def _find_recorder_clock(run: StoredRun) -> _Clock:
+    """Return the clock of a run's log; `StoreError` if its streams are not as they were written."""
+    if not run.facts.streams:
+        raise StoreError(f"run {run.name}: its log has no measurements, so that the clock of its recorder is not known")
     columns = ["stamp_ns", "log_time_ns", "clock_epoch"]
-    tables = (read_table(path, columns) for path in store.stream_files(run.run_id, known).values())
+    tables = (read_table(path, columns) for path in run.stream_files().values())
     return _Clock(max(tables, key=lambda table: table.num_rows))
 
 

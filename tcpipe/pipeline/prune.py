@@ -1,46 +1,56 @@
-"""What a store no longer needs: replaced recipes and generations, superseded runs, what killed calls left; nothing of a dataset."""
+"""Removal of what a store no longer needs: replaced documents, given-up runs, payload that no document names; nothing of a dataset.
+
+A removal is safe beside other calls (ADR-36): only documents that did not count in a first scan go, and only payload that was listed before
+a second scan and that no document of this scan names. While another call may run, nothing goes.
+"""
 
 from __future__ import annotations
 
-import os
 import re
-import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, clear_scratch, is_abandoned
-from tcpipe.formats.commits import Dataset, Entries, State
-from tcpipe.formats.dataset_files import CARD, REPORT, read_card
-from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.place import Entry, Place
+from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
+from tcpipe.formats.dataset_files import CARD, REPORT, parse_card
+from tcpipe.formats.documents import BLOBS, State, make_run_key, read_record
+from tcpipe.formats.object_storage import make_absolute
+from tcpipe.formats.place import Entry
+from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.run_documents import find_highest_numbers, read_sealed_at, split_number
-from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.pipeline.calls import LogWriter, format_bytes
+from tcpipe.formats.runs import Run, RunFacts
+from tcpipe.formats.store_records import Output, StoredMap
+from tcpipe.formats.stored_runs import STREAMS
+from tcpipe.pipeline.calls import PRUNE, OpenCall, format_bytes, is_alive, list_open_calls, record_call
+from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.levels import STREAMS
 
-_CONTENT = re.compile(r"(?:^|/)[0-9a-f]{16}/")
-"""In the name of a file: a directory that is named after its content."""
+TABLES = ("track.parquet", "segments.parquet", "rejections.parquet", REPORT)
+"""Files of a run in its folder of payload, beside the folder of its streams."""
+BLOB = re.compile(r"[0-9a-f]{16}")
+"""Name of a folder of payload."""
+_NOTES = re.compile(r"(.*/)?(\.DS_Store|\.directory|Thumbs\.db|[^/]*\.aux\.xml)")
+"""Files that other programs put beside those that they look at."""
+_MAX_CALLS = 50
+"""Ended calls of each command that are kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class Leftover:
-    """Something that could go: what it is, where it lies, its size; and why it stays, if it does."""
+    """Something that could go: what it is, its name, its size; and why it stays, if it does."""
 
     what: str
-    path: str
-    size_bytes: int
+    name: str
+    size_bytes: int = 0
     stays: str | None = None
 
     def __str__(self) -> str:
         """Return it as one line."""
-        line = f"{self.what} {self.path}: {format_bytes(self.size_bytes)}"
+        line = f"{self.what} {self.name}: {format_bytes(self.size_bytes)}"
         return line if self.stays is None else f"{line}; stays: {self.stays}"
 
 
@@ -52,298 +62,296 @@ class Pruned:
     dry_run: bool
     removed: tuple[Leftover, ...]
     kept: tuple[Leftover, ...]
+    documents: int
+    """Documents that went: replaced ones, and calls before the latest."""
     size_bytes: int
-    """Of what went."""
+    """Of the payload that went."""
+    waits_for: str | None = None
+    """A call that may still run: nothing went."""
 
     def __str__(self) -> str:
         """Return the lines as one text."""
+        if self.waits_for is not None:
+            return clean_lines([f"{self.store}: nothing is removed: {self.waits_for}"])
         verb = "would be removed" if self.dry_run else "removed"
-        head = f"{self.store}: {len(self.removed)} {verb}, {format_bytes(self.size_bytes)}"
-        if not self.removed:
+        documents = f" and {self.documents} replaced documents" if self.documents else ""
+        head = f"{self.store}: {len(self.removed)}{documents} {verb}, {format_bytes(self.size_bytes)}"
+        if not (self.removed or self.documents):
             head = f"{self.store}: nothing to do: there is nothing to remove"
-        return clean_lines([head, *(str(each) for each in (*self.removed, *self.kept))])
+        return clean_lines([head, *map(str, (*self.removed, *self.kept))])
 
 
 def prune(
+    runs: Sequence[str] = (),
     *,
     store: str | Path = "tcpipe-store",
     recipe: Recipe | str | Path | None = None,
-    keep: Sequence[str] = (),
     forget: Sequence[str] = (),
-    min_age_s: float = 86_400.0,
     dry_run: bool = False,
 ) -> Pruned:
-    """Remove what a store no longer needs, each thing whole or not at all.
+    """Remove what a store no longer needs.
 
-    Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or something cannot be removed; what went before is gone.
+    Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, it cannot be written to, or a name is unknown.
 
-    Of a run that was ingested with the ``recipe`` that rules, what earlier calls made with others is old. Of what ``keep`` names, runs
-    and recipes, nothing goes. Datasets that lay at the paths ``forget`` are gone: what they refer to may go. What killed calls left goes
-    when it is ``min_age_s`` old; what waits for a dataset, when nothing was put there for so long. With ``dry_run`` nothing is removed.
+    Without ``runs`` (RUN or RUN/RECIPE), superseded runs go, and those under an old recipe whose log also has a run under the ``recipe``
+    that rules. What a dataset refers to stays, unless another dataset lies at its place or ``forget`` names it. With ``dry_run`` nothing
+    changes.
     """
-    ruling = resolve_recipe(recipe)
-    opened = open_store(store)
-    log = LogWriter(opened, opened.state())
-    _forget(log, forget, dry_run=dry_run)
-    found = opened.ingestions(state=log.state)
-    unknown = set(keep) - {name for key in found.rows for name in key}
-    if unknown:
-        raise UsageError(f"{opened.root}: no run or recipe is called {min(unknown)}; nothing is removed")
-    referred, unread = _find_references(log.state)
-    removed, kept, decided = list[Leftover](), list[Leftover](), set[str]()
-    for what, place, run_id, parts in _iterate_ingestions(opened, log.state, found, ingest_key(ruling), min_age_s):
-        why, size_bytes = unread or _find_reason_to_stay(place, parts, referred, keep), _measure_size(place)
-        if why is None and not dry_run and not _remove(log, found, place, run_id, parts):
-            why = "another call has changed its run meanwhile"
-        (removed if why is None else kept).append(Leftover(what, place.where(), size_bytes, why))
-        if why is None or what == BEGUN:
-            decided.add(place.where())
-    left = [
-        Leftover("left by a killed call", str(path), _measure_size(Place(path)))
-        for path in _iterate_temporaries(opened, min_age_s)
-    ]
-    removed += left
-    if left and not dry_run:
-        clear(Path(opened.root))
-    for what, place, entries, why in (*_iterate_replaced(opened, log.state, min_age_s, unread, decided),):
-        (removed if why is None else kept).extend(
-            Leftover(what, place.where(entry.name), entry.size_bytes, why) for entry in entries
-        )
-        for entry in entries if why is None and not dry_run else ():
-            place.delete(entry.name)
-    if not dry_run:
-        clear_scratch()
-        _remove_empty(opened, min_age_s)
-    if removed and not dry_run:
-        opened.write_index(log.state)
-    return Pruned(str(opened.root), dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
+    ruling, opened = ingest_key(resolve_recipe(recipe)), open_store(store)
+    forgotten = [make_absolute(name) for name in forget]
+    with nullcontext() if dry_run else record_call(opened, PRUNE, runs, {"forget": forgotten}) as call:
+        first, mine = (opened.scan(), "") if call is None else (call.state, call.key)
+        if unknown := [name for name in forgotten if name not in first.outputs]:
+            raise UsageError(*(f"{name}: is no output of this store; nothing is removed" for name in unknown))
+        chosen = _choose_named(opened, first, runs) if runs else _choose_replaced(first, ruling)
+        dead = {open_call.key for open_call in list_open_calls(first) if _is_dead(open_call)}
+        removal = _Removal(opened, first, dry_run, forgotten)
+        if (waits_for := _find_running(first, dead, mine)) is None:
+            removal.give_up(chosen)
+            payload = list_payload(opened)
+            second = opened.scan()
+            waits_for = _find_running(second, dead, mine)
+            removal.take_back(second, is_all=waits_for is not None)
+            if waits_for is None:
+                removal.choose_documents(second)
+                removal.choose_payload(second, payload)
+                removal.execute()
+        found = removal.describe(waits_for)
+        if call is not None:
+            call.result = {"counts": {"removed": len(found.removed), "documents": found.documents}}
+    return found
 
 
-BEGUN = "left by a killed prune"
-
-_Target = tuple[str, str, str]
-"""What something is, its run, and its recipe: "" where all of the run is to go."""
+def _is_dead(call: OpenCall) -> bool:
+    return call.call.process is not None and is_alive(call.call.process) is False
 
 
-def _iterate_ingestions(
-    store: Store, state: State, found: Ingestions, key: str, min_age_s: float
-) -> Iterator[tuple[str, Place, str, list[tuple[str, str]]]]:
-    """Yield what may go of runs that the log knows: what it is, where it lies, its run, and the ingestions in it."""
-    superseded = list(_iterate_superseded(store, found))
-    begun = _iterate_begun(store, state, min_age_s, except_runs={run_id for _, run_id, _ in superseded})
-    for what, run_id, recipe_id in (*begun, *_iterate_old_recipes(found, key), *superseded):
-        if recipe_id:
-            yield what, store.runs_place.below(f"{run_id}/{recipe_id}"), run_id, [(run_id, recipe_id)]
-        else:
-            parts = [part for part in {**found.rows, **state.pruned} if part[0] == run_id]
-            yield what, store.runs_place.below(run_id), run_id, parts
+def _find_running(state: State, dead: Collection[str], mine: str) -> str | None:
+    """Return a line about the first call that may still run, other than this one."""
+    for call in list_open_calls(state):
+        if call.key not in dead and call.key != mine:
+            if call.state == "running":
+                return f"{call} is running; run 'tcpipe prune' again after its end"
+            return f"{call} may still run; if it does not: 'tcpipe acknowledge {call.name}'"
+    return None
 
 
-def _remove(log: LogWriter, found: Ingestions, place: Place, run_id: str, parts: Sequence[tuple[str, str]]) -> bool:
-    """Remove ingestions, unless another call changed their run, or built a dataset of them, since they were ``found``.
-
-    The commit comes first, so that nobody looks for what is about to go; the next prune completes one that is killed after it.
-    """
-    is_as_found = True
-
-    def make(state: State) -> Entries:
-        nonlocal is_as_found
-        is_used = any(part in made.runs for made in state.datasets.values() for part in parts)
-        is_changed = any(found.rows.get((run_id, row.recipe_id)) != row for row in state.find_rows(run_id))
-        is_as_found = not (is_used or is_changed)
-        return Entries(removed=tuple(parts) if is_as_found else ())
-
-    log.commit("pruned", make)
-    for entry in sorted(place.entries() if is_as_found else (), key=_find_turn):
-        place.delete(entry.name)
-    return is_as_found
+_Chosen = dict[str, tuple[RunFacts, str]]
+"""By key: a run whose tables are to go, and why."""
 
 
-def _find_turn(entry: Entry) -> tuple[bool, bool]:
-    """Return when a file goes: pages first, then documents, so that no reader looks for the rest."""
-    return entry.name.endswith(".parquet"), split_number(entry.name) is not None
+def _choose_named(store: Store, state: State, names: Sequence[str]) -> _Chosen:
+    """Return the runs called RUN or RUN/RECIPE; `UsageError` if one does not exist."""
+    found = {name: name.partition("/")[::2] for name in names}
+    rows = {
+        name: [row for row in state.list_rows(run_id) if recipe_id in ("", row.recipe_id)]
+        for name, (run_id, recipe_id) in found.items()
+    }
+    if unknown := [name for name in names if not rows[name]]:
+        raise UsageError(*(f"{name}: no run of {store.root} has this name; nothing is removed" for name in unknown))
+    return {_make_key(row): (row, "run") for each in rows.values() for row in each if row.blob}
 
 
-def _iterate_begun(store: Store, state: State, min_age_s: float, *, except_runs: Collection[str]) -> Iterator[_Target]:
-    """Yield the ingestions that a prune took from the log and was killed before it had removed their files, if these are old enough.
-
-    Those of ``except_runs`` go with their runs.
-    """
-    before_ns, modified_ns = time.time_ns() - int(min_age_s * 1e9), dict[tuple[str, str], int]()
-    for entry in store.runs_place.entries() if state.pruned else ():
-        run_id, recipe_id, *_ = (*entry.name.split("/", 2), "")
-        modified_ns[run_id, recipe_id] = max(entry.modified_ns, modified_ns.get((run_id, recipe_id), 0))
-    for key in sorted(state.pruned.keys() & modified_ns.keys()):
-        if modified_ns[key] < before_ns and key[0] not in except_runs:
-            yield BEGUN, *key
-
-
-def _iterate_old_recipes(found: Ingestions, key: str) -> Iterator[_Target]:
-    """Yield the ingestions that are older than one of the same run under the ruling recipe."""
-    by_run: dict[str, list[RunFacts]] = {}
-    for row in found.rows.values():
-        by_run.setdefault(row.run_id, []).append(row)
-    for run_id, rows in by_run.items():
-        ruling = [row for row in rows if row.ingest_key == key and row.tcpipe_version == __version__]
-        if not ruling or run_id in found.superseded:
-            continue
-        latest = max(row.commit for row in ruling)
-        for row in rows:
-            if row.ingest_key != key and row.commit < latest:
-                yield "old recipe", run_id, row.recipe_id
+def _choose_replaced(state: State, ruling: str) -> _Chosen:
+    """Return the runs that another supersedes, and those under an old recipe; the other run has its tables."""
+    there = [row for row in state.list_rows() if row.blob and state.has_payload(row)]
+    names = {(row.run_id, row.ingest_key) for row in there}
+    logs = {row.log.sha256 for row in there if row.ingest_key == ruling}
+    chosen: _Chosen = {}
+    for row in state.list_rows():
+        if row.blob and (row.superseded_by, row.ingest_key) in names:
+            chosen[_make_key(row)] = row, "superseded run"
+        elif row.blob and row.ingest_key != ruling and row.log.sha256 in logs:
+            chosen[_make_key(row)] = row, "old recipe"
+    return chosen
 
 
-def _iterate_superseded(store: Store, found: Ingestions) -> Iterator[_Target]:
-    """Yield the runs whose place another has taken that is there."""
-    there = {run.run_id for run in found.finished}
-    for run_id, by in found.superseded.items():
-        if by in there and store.runs_place.folders(run_id):
-            yield "superseded run", run_id, ""
+def _make_key(row: RunFacts) -> str:
+    return make_run_key(row.log.sha256, row.recipe_id)
 
 
-def _find_reason_to_stay(
-    place: Place, parts: Sequence[tuple[str, str]], referred: Mapping[tuple[str, str], str], keep: Sequence[str]
-) -> str | None:
-    if any(name in keep for part in parts for name in part):
-        return "--keep names it"
-    if why := next((referred[part] for part in parts if part in referred), None):
-        return why
-    strange = next(_find_strangers(place), None)
-    return None if strange is None else f"{strange} is no file of this store"
-
-
-def _find_strangers(place: Place) -> Iterator[str]:
-    """Yield what no call of tcpipe has written into the directory of a run, or of one of its ingestions."""
-    known = (
-        {f"{role}.parquet" for role in STREAMS}
-        | {f"{name}.parquet" for name in ("track", "segments", "rejections")}
-        | {REPORT}
-    )
-    names = ((entry.name, entry.name.rpartition("/")[2]) for entry in place.entries())
-    yield from (place.where(name) for name, last in names if last not in known and not split_number(last))
-
-
-def _forget(log: LogWriter, names: Sequence[str], *, dry_run: bool) -> None:
-    """Commit that datasets are gone; `UsageError` where none lay at a path."""
-    paths = {name: {name.rstrip("/"), str(Path(name).absolute())} for name in names}
-    gone = {name: [dataset for dataset in log.state.datasets.values() if dataset.out in paths[name]] for name in names}
-    if unknown := [name for name in names if not gone[name]]:
-        raise UsageError(*(f"{name}: not a dataset of this store; nothing is removed" for name in unknown))
-    if not dry_run:
-        log.commit("pruned", Entries(forgotten=tuple(dataset for each in gone.values() for dataset in each)))
-
-
-def _find_references(state: State) -> tuple[dict[tuple[str, str], str], str | None]:
-    """Return the ingestions that datasets are made of, and why each stays; and why everything does, where a commit cannot be read."""
-    if state.problems:
-        return {}, f"{state.problems[0].log[0]} is missing or damaged: it may name what a dataset refers to"
+def _find_references(state: State, forgotten: Collection[str]) -> dict[tuple[str, str], str]:
+    """Return the runs and recipes that outputs are made of, and why each stays."""
     found = dict[tuple[str, str], str]()
-    for made in sorted(state.datasets.values(), key=is_replaced, reverse=True):
-        reason = f"dataset {made.out} refers to it"
-        if is_replaced(made):
-            reason = f"a dataset, formerly at {made.out}, refers to it; if it no longer exists: 'tcpipe prune --forget {made.out}'"
-        found.update(dict.fromkeys(made.runs, reason))
-    return found, None
+    for output in state.outputs.values():
+        inputs = None if output.where in forgotten or not output.runs else _read_inputs(output.where)
+        if output.where not in forgotten and inputs in (None, output.inputs):
+            hint = f"; if it no longer exists: 'tcpipe prune --forget {output.where}'" if inputs is None else ""
+            found |= dict.fromkeys(output.runs, f"dataset {output.where} refers to it{hint}")
+    return found
 
 
-def is_replaced(made: Dataset) -> bool:
-    """Tell whether another dataset lies where this one was."""
-    out = Path(made.out)
+def is_replaced(output: Output) -> bool:
+    """Return whether another dataset lies where this one was."""
+    return _read_inputs(output.where) not in (None, output.inputs)
+
+
+def _read_inputs(where: str) -> str | None:
+    """Return the digest of what the dataset at a path or URL is made of; None if there is none that can be read."""
     try:
-        return (out / CARD).is_file() and read_card(out, proved=False).inputs != made.inputs
-    except (DatasetError, StoreError):
-        return False
+        found = find_newest(where, [CARD])
+        return None if found is None else parse_card(found.data, found.place.where(CARD), proved=False).inputs
+    except TcpipeError:
+        return None
 
 
-def _iterate_temporaries(store: Store, min_age_s: float) -> Iterator[Path]:
-    """Yield what killed calls left on disk, if it is old enough."""
-    place = store.place
-    for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
-        if time.time() - path.stat().st_mtime >= min_age_s and is_abandoned(path):
-            yield path
+def list_payload(store: Store) -> dict[str, list[Entry]]:
+    """Return the files of each folder of payload."""
+    found: dict[str, list[Entry]] = {name: [] for name in store.place.list(BLOBS) if BLOB.fullmatch(name)}
+    for entry in store.place.entries(BLOBS):
+        _, blob, name = entry.name.split("/", 2) if entry.name.count("/") > 1 else ("", "", "")
+        if BLOB.fullmatch(blob):
+            found.setdefault(blob, []).append(entry._replace(name=name))
+    return found
 
 
-_Unnamed = tuple[str, Place, list[Entry], str | None]
-"""Files that no document names: what they are, where they lie, and why they stay, if they do."""
+def name_payload(records: Iterable[RunFacts | StoredMap]) -> dict[str, set[str]]:
+    """Return the folders of payload that records name, with the parts that they use: ``tables``, ``streams``."""
+    named = dict[str, set[str]]()
+    for record in records:
+        named.setdefault(record.blob, set()).add("tables")
+        named.setdefault(record.streams_blob if isinstance(record, RunFacts) else record.blob, set()).add(STREAMS)
+    return named
 
 
-def _iterate_replaced(
-    store: Store, state: State, min_age_s: float, unread: str | None, decided: Collection[str]
-) -> Iterator[_Unnamed]:
-    """Yield, by run and for the maps, documents and files that nothing names any more, if they are old enough.
-
-    Files of one directory go together: its content is put there together. Where a document cannot be read they stay; so do ingestions
-    that are whole and that no commit names, since ingesting the log again finds them. What is ``decided`` already is not looked at.
-    """
-    before_ns = time.time_ns() - int(min_age_s * 1e9)
-    by_run: dict[str, list[RunFacts]] = {}
-    for row in state.runs.values():
-        by_run.setdefault(row.run_id, []).append(row)
-    found: dict[str | None, list[Entry]] = {None: store.place.below("maps").entries()}
-    for entry in store.runs_place.entries():  # of all runs at once: in a bucket each listing is a request
-        run, _, name = entry.name.partition("/")
-        folders = run, f"{run}/{name.partition('/')[0]}"
-        if not any(store.runs_place.where(folder) in decided for folder in folders):
-            found.setdefault(run, []).append(entry._replace(name=name))
-    for run_id, entries in found.items():
-        place = store.place.below("maps") if run_id is None else store.runs_place.below(run_id)
-        rows = by_run.get(run_id or "", [])
-        try:
-            named = set(_iterate_named(place, {entry.name: entry.size_bytes for entry in entries}, rows))
-            why = unread
-        except StoreError as error:
-            named, why = set(), error.problems[0]
-        stems = (
-            [stem.partition("/") for stem in find_highest_numbers(entry.name for entry in entries)] if run_id else []
-        )
-        for recipe_id in {recipe for recipe, _, kind in stems if kind == "manifest"} - {row.recipe_id for row in rows}:
-            left = [entry for entry in entries if entry.name.startswith(f"{recipe_id}/")]
-            yield "no commit names it", place, left, "ingest its log again, or remove it"
-        young = {_find_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
-        content = [entry for entry in entries if split_number(entry.name) or _CONTENT.search(entry.name)]
-        over = [entry for entry in content if entry.name not in named and _find_folder(entry.name) not in young]
-        yield "no document names it", place, over, why
+def is_payload(name: str) -> bool:
+    """Return whether tcpipe writes a file of this name into a folder of payload."""
+    folder, _, file = name.partition("/")
+    return name in TABLES or folder.endswith((".zarr", ".png")) or (folder == STREAMS and file.endswith(".parquet"))
 
 
-def _iterate_named(place: Place, sizes: Mapping[str, int], rows: Sequence[RunFacts]) -> Iterator[str]:
-    """Yield the files that the log names, those that their documents name, and the same of what no commit names but the last document."""
-    last, committed = find_highest_numbers(sizes), {name: size for row in rows for name, size in row.files.items()}
-    recipes = {row.recipe_id for row in rows}
-    for name, size in sizes.items():
-        document = split_number(name)
-        if document is None:
-            continue
-        stem, number = document
-        is_last = number == last[stem]
-        if committed.get(name) == size and stem.endswith("/manifest"):  # the log names its tables too
-            yield name
-        elif name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
-            yield from (name, *_iterate_named_by(place, name))
-    yield from committed
+def is_note(name: str) -> bool:
+    """Return whether file managers or GDAL write a file of this name into folders that they look at."""
+    return _NOTES.fullmatch(name) is not None
 
 
-def _iterate_named_by(place: Place, name: str) -> Iterator[str]:
-    """Yield the files that a document names; `StoreError` where it is not as it was written."""
-    found, folder = read_sealed_at(place, name), name.rpartition("/")[0]
-    for key in ("checksums", "streams"):
-        listed = found.get(key)
-        yield from (f"{folder}/{file}" if folder else file for file in (listed if isinstance(listed, Mapping) else ()))
+def read_beaten(store: Store, names: Iterable[str]) -> tuple[list[RunFacts | StoredMap], list[str]]:
+    """Return the runs and maps in documents that do not count, and the names of damaged documents."""
+    records, damaged = list[RunFacts | StoredMap](), list[str]()
+    for name in names:
+        kind = name.partition("/")[0]
+        if kind in ("runs", "maps"):
+            try:
+                records.append(read_record(store.place, name, RunFacts) if kind == "runs" else read_record(store.place, name, StoredMap))
+            except StoreError:
+                damaged.append(name)
+    return records, damaged
 
 
-def _find_folder(name: str) -> str:
-    """Return the directory of content in which a file lies; a document is one for itself."""
-    found = _CONTENT.search(name)
-    return name[: found.end()] if found else name
+@dataclass(slots=True)
+class _Removal:
+    """What one call removes, decided step by step, then executed."""
+
+    store: Store
+    first: State
+    dry_run: bool
+    forgotten: list[str]
+    chosen: _Chosen = field(default_factory=dict)
+    """Runs that are given up."""
+    earlier: dict[str, str] = field(default_factory=dict)
+    """By key: the documents that named their tables."""
+    documents: list[list[str]] = field(default_factory=list)
+    """Group after group: a kill between them lets no replaced document count again."""
+    payload: list[str] = field(default_factory=list)
+    """Folders, and files of folders of which a part is used."""
+    removed: list[Leftover] = field(default_factory=list)
+    kept: list[Leftover] = field(default_factory=list)
+
+    def give_up(self, chosen: _Chosen) -> None:
+        """Write that runs have no tables, but those to which an output refers."""
+        held = _find_references(self.first, self.forgotten) if chosen else {}
+        for key, (row, what) in chosen.items():
+            name = row.run_id, row.recipe_id
+            if name in held:
+                self.kept.append(Leftover(what, "/".join(name), _measure_tables(row), held[name]))
+                continue
+            self.chosen[key], self.earlier[key] = (row, what), self.first.names["runs", key]
+            if not self.dry_run:
+                forget_tables(self.store, self.first, row)
+
+    def take_back(self, second: State, *, is_all: bool) -> None:
+        """Let runs count again if an output refers to them that was written meanwhile, or if nothing can be removed now."""
+        self.forgotten = [name for name in self.forgotten if self.first.outputs[name] == second.outputs.get(name)]
+        held = _find_references(second, self.forgotten) if self.chosen else {}
+        for key, (row, what) in [*self.chosen.items()]:
+            why = held.get((row.run_id, row.recipe_id))
+            if is_all or why is not None:
+                del self.chosen[key]
+                self.kept += [Leftover(what, f"{row.run_id}/{row.recipe_id}", _measure_tables(row), why)] if why else []
+                if not self.dry_run:
+                    self.store.put_run(second, read_record(self.store.place, self.earlier[key], Run))
+
+    def choose_documents(self, second: State) -> None:
+        """Choose the documents that did not count in the first scan, then calls before the latest and forgotten outputs."""
+        counting = {*second.names.values()} - ({*self.earlier.values()} if self.dry_run else set())
+        replaced = dict.fromkeys([*self.first.beaten, *self.earlier.values()])
+        self.documents.append([name for name in replaced if name not in counting])
+        last = [("calls", key) for key in _find_old_calls(self.first)]
+        outputs = second.facts["outputs"].items()
+        last += [("outputs", key) for key, output in outputs if output.where in self.forgotten]
+        names = [self.first.names[each] for each in last]  # type: ignore[index]
+        self.documents.append([name for name in names if name in counting])
+
+    def choose_payload(self, second: State, payload: Mapping[str, Sequence[Entry]]) -> None:
+        """Choose payload that no document names, also none that does not count and stays."""
+        going = {name for group in self.documents for name in group}
+        runs = [row for key, row in second.facts["runs"].items() if second.names["runs", key] not in going]
+        beaten, damaged = read_beaten(self.store, [name for name in second.beaten if name not in going])
+        named = name_payload([*runs, *second.facts["maps"].values(), *beaten])
+        damaged += [name for name in second.damaged if name.startswith(("runs/", "maps/"))]
+        sizes, labels = dict[str, int](), {row.blob: key for key, (row, _) in self.chosen.items()}
+        for blob, entries in payload.items():
+            parts = named.get(blob, set())
+            over = [
+                entry for entry in entries if (STREAMS if entry.name.startswith(STREAMS) else "tables") not in parts
+            ]
+            over = over if not parts else [entry for entry in over if is_payload(entry.name)]
+            if parts and not over:
+                continue
+            where, size = self.store.place.where(f"{BLOBS}/{blob}"), sum(entry.size_bytes for entry in over)
+            foreign = next((entry.name for entry in over if not (is_payload(entry.name) or is_note(entry.name))), None)
+            why = f"it contains {foreign}, which tcpipe did not write" if foreign else None
+            if damaged:
+                why = f"{damaged[0]} is damaged and may name it; 'tcpipe verify' lists repairs"
+            if why is not None:
+                self.kept.append(Leftover("payload", where, size, why))
+                continue
+            self.payload += [f"{BLOBS}/{blob}/{entry.name}" for entry in over] if parts else [f"{BLOBS}/{blob}"]
+            if blob in labels:
+                sizes[labels[blob]] = size
+            else:
+                self.removed.append(Leftover("payload that no document names", where, size))
+        rows = [(what, f"{row.run_id}/{row.recipe_id}", sizes.get(key, 0)) for key, (row, what) in self.chosen.items()]
+        self.removed = [*(Leftover(*row) for row in rows), *self.removed]
+
+    def execute(self) -> None:
+        """Remove what is chosen, and what killed calls left on disk."""
+        place = self.store.place
+        for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
+            if is_abandoned(path):
+                size = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+                self.removed.append(Leftover("left by a killed call", str(path), size))
+        if not self.dry_run:
+            for names in (*self.documents, self.payload):
+                place.map(place.delete, names)
+            place.clear()
+
+    def describe(self, waits_for: str | None) -> Pruned:
+        """Return what was removed, or would be."""
+        size_bytes, documents = sum(each.size_bytes for each in self.removed), sum(map(len, self.documents))
+        told = tuple(self.removed), tuple(self.kept), documents, size_bytes
+        return Pruned(str(self.store.root), self.dry_run, *told, waits_for)
 
 
-def _remove_empty(store: Store, min_age_s: float) -> None:
-    """Remove the directories, on disk, that a prune left empty which was killed between the last file and its directory."""
-    runs = store.runs_place.path
-    for above, _, files in os.walk(runs, topdown=False) if runs else ():
-        with suppress(OSError):  # it is not empty, or gone
-            if not files and Path(above) != runs and time.time() - Path(above).stat().st_mtime >= min_age_s:
-                Path(above).rmdir()
+def _measure_tables(row: RunFacts) -> int:
+    return sum(checksum.size_bytes for checksum in row.tables.values())
 
 
-def _measure_size(place: Place) -> int:
-    return sum(entry.size_bytes for entry in place.entries())
+def _find_old_calls(state: State) -> Iterator[str]:
+    """Yield the keys of ended calls of which many later ones of the same command are known."""
+    count = Counter[str]()
+    for key, call in state.calls:
+        if call.exit_code is not None:
+            count[call.command] += 1
+            if count[call.command] > _MAX_CALLS:
+                yield key

@@ -1,4 +1,4 @@
-"""Where every log of a store's sources stands, why, and what is still to do; the verdict on the store's runs, and what has changed.
+"""The state of every log of a store's sources and of its outputs, why, and what is to do.
 
 Nothing is read of a log but its size and time.
 """
@@ -13,16 +13,12 @@ from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
-import numpy as np
-
-from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_finding, group_findings
 from tcpipe.formats.object_storage import format_path, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.runs import RunFacts
 from tcpipe.formats.store_records import Call, Problem
 from tcpipe.pipeline.calls import (
     INGEST,
@@ -40,11 +36,9 @@ from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
-from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
-from tcpipe.robust import estimate_robust_std
-from tcpipe.store import open_store
-from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding, read_threshold
+from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
@@ -139,7 +133,7 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     if not create and len(killed) == len(open_calls) and all(is_below(make_absolute(log), [*asked]) for log in given):
         problems += _find_waiting(steps)
     problems += [make_missing(path, state) for path in missing if path in lately]
-    problems += [] if create else find_stale_outputs(state)
+    problems += [] if create else find_stale_outputs(opened, state)
     problems = [problem for problem in problems if problem.key not in acknowledged]
     groups, waiting = tuple(_iterate_groups(steps)), [step for step in steps if step.is_todo]
     current = [run.facts for run in opened.runs(state) if run.facts.ingest_key == ingest_key(ruling)]
@@ -215,13 +209,20 @@ def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str
     return f"to do now: tcpipe ingest ({waiting} logs)" if waiting else "nothing to do"
 
 
-def find_stale_outputs(state: State) -> Iterator[Problem]:
+def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
     """Yield the outputs whose last call failed, or that would be made of something else now."""
+    if not state.outputs:
+        return
+    from tcpipe.pipeline.dataset.build import find_changed_parts  # noqa: PLC0415  only for stores with datasets
+
     for output in state.outputs.values():
         subject = Subject("dataset", output.where)
         if output.exit_code not in (0, 3):
             names = {"message": output.message.partition("\n")[0], "at": output.at[:19]}
             yield Problem(make_finding("output-failed", subject, names=names), f"{output.where} {output.at}")
+        elif changes := find_changed_parts(store, state, output):
+            found = make_finding("output-outdated", subject, names={"changes": changes})
+            yield Problem(found, f"{output.where} {output.inputs}")
 
 
 def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
@@ -265,76 +266,3 @@ def _format_call(call: Call) -> str:
     times = f"{format_duration(call.wall_s)}, CPU {format_duration(call.cpu_s)}"
     why = f": {call.message.partition(chr(10))[0]}" if call.exit_code and call.message else ""
     return f"  {call.begin[:19]} {call.command}: {said}; {times}, exit code {call.exit_code}{why}"
-
-
-_CHANGE = "run-to-run-change"
-_IN_PERCENT = 100.0
-
-
-def judge_runs(runs: Iterable[RunFacts], changes: Iterable[Finding]) -> Verdict:
-    """Return the verdict on runs together and on their `find_changes`; of each code the worst finding is a reason."""
-    return judge_by_code([*changes, *(finding for run in runs for finding in run.findings)])
-
-
-def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
-    """Return a finding for each measure of a robot that its latest runs have changed, and for runs with another battery resistance."""
-    runs = tuple(runs)
-    series = dict[tuple[str, str, str], list[float]]()
-    dated = [run for run in runs if run.start_ns is not None]
-    for run in sorted(dated, key=lambda run: (run.start_ns or 0, run.run_id)):
-        for measure, unit, value in _iterate_measures(run):
-            series.setdefault((run.robot, measure, unit), []).append(value)
-    found = ((key, shift) for key, values in series.items() if (shift := find_shift(values)) is not None)
-    batteries = compare_batteries((run.run_id, run.robot, run.findings) for run in runs)
-    return *batteries, *(
-        make_finding(
-            _CHANGE,
-            Subject("column", measure),
-            severity="note" if measure == _USED else None,
-            names={"robot": robot, "unit": unit},
-            before=shift["before"],
-            after=shift["after"],
-            earlier_count=shift["earlier_count"],
-            latest_count=shift["latest_count"],
-        )
-        for (robot, measure, unit), shift in found
-    )
-
-
-_USED = "used share of the distance"
-
-
-def _iterate_measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
-    """Yield name, unit and value of measures that should stay the same from run to run."""
-    if run.driven_m > 0.0:
-        yield _USED, "%", _IN_PERCENT * run.kept_m / run.driven_m
-    if run.energy_budget is not None:
-        yield "noise floor of E", "%", _IN_PERCENT * run.energy_budget.total
-    if run.idle_watt is not None:
-        yield "idle power", PHYSICS_UNITS["idle"], run.idle_watt
-    for term, (value, std) in run.physics.items():
-        if not term.startswith("idle") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
-            yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
-
-
-def find_shift(values: Sequence[float]) -> dict[str, float] | None:
-    """Return the medians of a series' latest values and of those before, and how many they are; None where they do not differ.
-
-    The latest quarter of the values, at most 20, is compared with those before: the medians must differ by more than three robust standard
-    deviations (by the median absolute deviation) of the earlier values and by 5 % of their median (thresholds of the catalogue).
-    """
-    if len(values) < read_threshold(_CHANGE, "min_runs_count"):
-        return None
-    count = int(
-        min(len(values) * read_threshold(_CHANGE, "latest_fraction"), read_threshold(_CHANGE, "max_latest_count"))
-    )
-    earlier, latest = np.array(values[:-count], float), np.array(values[-count:], float)
-    before, after = float(np.median(earlier)), float(np.median(latest))
-    scatter = estimate_robust_std(earlier - before)
-    enough = max(
-        read_threshold(_CHANGE, "min_scatter_ratio") * scatter,
-        read_threshold(_CHANGE, "min_change_fraction") * abs(before),
-    )
-    if abs(after - before) <= enough:
-        return None
-    return {"before": before, "after": after, "earlier_count": len(earlier), "latest_count": count}

@@ -2,41 +2,40 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
-from tcpipe.formats.bucket_directories import CARDS, FoundCard, find_newest, find_unlisted_files
-from tcpipe.formats.commit_log import COMMIT, LOG, SNAPSHOT, make_snapshot_name, read_snapshot, refresh
-from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
+from tcpipe.formats.documents import (
+    BLOBS,
+    INDEX,
+    KINDS,
+    RECORDS,
+    Kind,
+    State,
+    find_strange_files,
+    parse_name,
+    read_record,
+)
+from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
-from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.parquet import read_row_count, read_table
-from tcpipe.formats.place import Place, find_wrong_files, open_place
-from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
-from tcpipe.formats.run_documents import (
-    COPY_MARK,
-    MARK,
-    Manifest,
-    MapDocument,
-    RunJson,
-    find_highest_numbers,
-    name_document,
-    read_as_at,
-    read_sealed_at,
-    split_number,
-)
-from tcpipe.pipeline.dataset.redaction import find_leaks
-from tcpipe.store import Store, find_store_above, is_store
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.parquet import read_column_names, read_row_count
+from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.published_outputs import CARDS, FoundCard, find_newest, find_unlisted_files
+from tcpipe.formats.runs import Run, RunFacts
+from tcpipe.pipeline.calls import list_open_calls
+from tcpipe.pipeline.named_runs import find_named_runs
+from tcpipe.pipeline.problems import find_incomplete_runs
+from tcpipe.pipeline.prune import BLOB, is_note, is_payload, list_payload, name_payload, read_beaten
+from tcpipe.store import Store, is_store
 from tcpipe.tables.facts import LEFT_OUT
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import COORDINATES, DATA_MODEL_VERSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +48,6 @@ class Repair:
 CheckResult = tuple[str, int] | str | Repair
 
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
-_STREAMS = "streams"
-_DIGEST = re.compile(r"[0-9a-f]{16}")
-_INDEX = "index"
 _KNOWN = "dataset, run, store, map (.zarr), model or cost map"
 
 _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
@@ -60,8 +56,14 @@ _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
 _HOW_MADE = {"dataset": "build", "model": "train", "cost map": "make"}
 
 _KILLED = "was left by a killed command; 'tcpipe prune' removes it"
-_BESIDE = ".aux.xml"
-"""Ending of the statistics that GDAL and QGIS put beside a raster that they look at."""
+_INGEST = "run {}: copy the store again, or ingest the log again with --force"
+_REPAIRS: Mapping[Kind, str] = {
+    "calls": "remove it", "runs": "remove it and ingest its log again", "failed": "remove it and ingest its log again",
+    "tags": "remove it and ingest its log again with --tag", "seen": "remove it",
+    "acknowledged": "remove it and acknowledge the problem again", "maps": "remove it and add the map again",
+    "outputs": "remove it and build the dataset again",
+}  # fmt: skip
+"""By kind of document: how to repair one that is damaged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +76,7 @@ class Verified:
     read: Mapping[str, int]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    """How to repair the problems; limits of a redacted dataset."""
+    """How to repair the problems."""
 
     def __str__(self) -> str:
         """Return a line of what was read, and one for each problem."""
@@ -84,14 +86,12 @@ class Verified:
         return clean_lines((f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes))
 
 
-def verify(path: Path | str) -> Verified:
-    """Re-read a dataset, a run, a store, a map, a model or a cost map; all but a map also at a URL.
+def verify(path: Path | str, *, store: Path | str = "tcpipe-store") -> Verified:
+    """Re-read a dataset, a store, a map, a model or a cost map, all but a map also at a URL; or a run of a ``store`` by its name.
 
     Raises `UsageError`: the path is none of these.
     """
-    if not is_url(path) and not Path(path).exists():
-        raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
-    kind, findings, notes = _find_kind(path)
+    kind, findings = _find_kind(path, store)
     read: dict[str, int] = {}
     problems, repairs = list[str](), list[str]()
     try:
@@ -107,29 +107,23 @@ def verify(path: Path | str) -> Verified:
     if kind not in ("store", "run") and not is_url(path):
         again = "the next command that writes it removes it"
         problems += [f"{left}: was left by a killed command; {again}" for left in find_leftovers(Path(path))]
-    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), (*dict.fromkeys(repairs), *notes))
+    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), tuple(dict.fromkeys(repairs)))
 
 
-def _find_kind(path: Path | str) -> tuple[str, Iterator[CheckResult], tuple[str, ...]]:
-    """Return what a path is, its findings, which are made as they are asked for, and notes."""
-    if inside := find_store_above(path):
-        return "run", _verify_run(*inside), ()
-    above, _, last = str(path).rstrip("/").rpartition("/")
-    for root in (path, *([above] if above and last in (LOG, "maps") else [])):  # which lie in a store
-        if is_store(root):
-            return "store", _verify_store(Store(root if is_url(root) else Path(root))), ()
+def _find_kind(path: Path | str, store: Path | str) -> tuple[str, Iterator[CheckResult]]:
+    """Return what a path is, and its findings, which are made as they are asked for."""
+    if not is_url(path) and not Path(path).exists():
+        place = Store(store).place
+        return "run", _verify_runs(place, [(run.facts, run.document) for run in find_named_runs(path, store)])
+    if is_store(path):
+        return "store", _verify_store(Store(path))
     place = open_place(path)
     if place.path and place.path.resolve().suffix == ".zarr" and not (place.path.resolve().parent / CARD).is_file():
-        return "map", _verify_map(place.path), ()
+        return "map", _verify_map(place.path)
     found = find_newest(str(path), CARDS)
     if found is None:
         raise UsageError(f"{path}: is no {_KNOWN}; give one of these directories")
-    card: DatasetCard | None = None
-    with suppress(TcpipeError):  # a problem that is found again
-        card = parse_card(found.data, found.place.where(CARD), proved=False) if found.name == CARD else None
-    redaction = None if card is None else card.redaction
-    notes = () if redaction is None else ("It is redacted.", *redaction.lines())
-    return _KINDS[found.name], _verify_directory(found, str(path)), notes
+    return _KINDS[found.name], _verify_directory(found, str(path))
 
 
 def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
@@ -147,67 +141,23 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     wrong = list(find_wrong_files(place, checksums))
     yield from _repair_by(Repair(f"{repair} with --force"), wrong)
     yield "files", len(checksums)
-    yield from (
-        f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not name.endswith(_BESIDE)
-    )
-    if is_bucket(path):
-        yield from (line for line in _verify_log(open_place(path)) if isinstance(line, str))
+    yield from (f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not is_note(name))
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
-        yield from _verify_counts(place.proved(SAMPLES, checksums[SAMPLES]), card, where)
+        yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 
 
 def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[CheckResult]:
-    """Compare how many samples there are; of a redacted dataset also that it reveals nothing."""
+    """Compare how many samples there are, and with a card without coordinates the columns."""
     rows = read_row_count(samples)
     yield "samples", rows
     counts = {"splits": sum(card.splits.values()), "runs": sum(run.samples for run in card.runs)}
     for name, count in {"samples": card.samples, **counts}.items():
         if count != rows:
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
-    if card.redaction is not None:
-        table = read_table(samples)
-        yield from (f"{where}: it is marked as redacted, but {leak}" for leak in find_leaks(card, table))
-
-
-def _verify_store(store: Store) -> Iterator[CheckResult]:
-    """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
-    place = store.place
-    yield from _verify_seals(place, [MARK], Repair(f"{place.where(MARK)}: {COPY_MARK}"))
-    for name in place.files():
-        if name == REPORT:
-            yield from _verify_seals(place, [name], Repair(f"{place.where(name)}: 'tcpipe report' writes it again"))
-        elif name != MARK:
-            yield _describe_stranger(place, name)
-    for name in place.folders():
-        if name not in (LOG, "maps", "runs", _INDEX) and place.entries(name):
-            yield _describe_stranger(place, name)
-    yield from _verify_log(place)
-    yield from _verify_maps(store)
-    yield from _verify_runs(store)
-    yield from _find_left_behind(place.path) if place.path else ()
-
-
-def _verify_log(place: Place) -> Iterator[CheckResult]:
-    """Yield how many commits a place has, and what is wrong with them and with snapshots."""
-    log, state = place.below(LOG), refresh(place, State())
-    yield "commits", state.number - len(state.problems)
-    wrong = {"commit-missing": "is missing", "commit-damaged": "has changed, or does not follow the commit before"}
-    yield from (f"{problem.log[0]}: {wrong[problem.finding.code]}" for problem in state.problems)
-    lost, snapshots = len(state.problems), [name for name in log.files() if name.startswith(SNAPSHOT)]
-    for name in snapshots:
-        if name > make_snapshot_name(state.number):  # the last commits are missing
-            yield f"{log.where(name.removeprefix(SNAPSHOT).removesuffix('.zst'))}: is missing"
-            lost += 1
-    if lost:
-        yield Repair(
-            f"{log.where()}: copy the store again, or ingest all logs again and acknowledge the commits; what a later snapshot has is kept"
-        )
-    for name in log.files():
-        if name in snapshots:
-            repair = Repair(f"{log.where(name)}: remove it; the commits say the same")
-            yield from _isolate_errors(_verify_snapshot(log, name), repair)
-        elif not COMMIT.fullmatch(name):
-            yield _describe_stranger(log, name)
+    coordinates = [name for name in read_column_names(samples) if name in COORDINATES]
+    if card.without_coordinates and coordinates:
+        columns = ", ".join(coordinates)
+        yield f"{where}: states that it has no coordinates, but {SAMPLES} has the columns {columns}; build it again"
 
 
 def _repair_by(repair: Repair, findings: Iterable[CheckResult]) -> Iterator[CheckResult]:
@@ -216,103 +166,10 @@ def _repair_by(repair: Repair, findings: Iterable[CheckResult]) -> Iterator[Chec
         yield from (finding, repair) if isinstance(finding, str) else (finding,)
 
 
-def _verify_snapshot(log: Place, name: str) -> Iterator[CheckResult]:
-    read_snapshot(log, name)
-    yield "files", 1
-
-
-def _verify_runs(store: Store) -> Iterator[CheckResult]:
-    """Yield the same of all runs, of those that the log names and of which files are gone, and of ingestions that no commit names."""
-    wrong, found = set[str](), store.ingestions()
-    pruned = found.superseded.keys() - {run_id for run_id, _ in found.rows}
-    for run_id in store.run_ids():
-        if run_id in pruned:
-            yield f"{store.runs_place.where(run_id)}: {_KILLED}"
-            continue
-        for finding in _verify_run(store, run_id):
-            wrong |= {run_id} if isinstance(finding, str) else set()
-            yield finding
-        for under in store.read_rows(run_id):
-            if (run_id, under) not in found.rows:
-                how = _KILLED if (run_id, under) in found.state.pruned else "no commit names it; ingest its log again"
-                yield f"{store.runs_place.below(run_id).where(under)}: {how}"
-    yield from (line for (run_id, _), line in found.damaged.items() if run_id not in wrong)
-
-
-def _verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[CheckResult]:
-    """Yield the same of one run: its log's description, its streams, and what became of it under every recipe, or one."""
-    place = store.runs_place.below(run_id)
-    names = [entry.name for entry in place.entries()]
-    there, last, folders = _list_documents(place), find_highest_numbers(names), place.folders()
-    repair = _describe_ingesting(place)
-    yield from _verify_seals(place, sorted(there), repair)
-    if "run" not in last:
-        yield from (f"{place.where(name_document('run', 1))}: is missing", repair)
-    known = None
-    for number in range(1, last.get("run", 0) + 1):
-        with suppress(StoreError):
-            known = read_as_at(place, name_document("run", number), RunJson)
-            there |= set(known.streams)
-    yield from _verify_files(place, known.streams if known else {}, repair)
-    recipes = [name for name in folders if name != _STREAMS and find_highest_numbers(place.files(name)).get("manifest")]
-    for name in recipes if recipe is None else [recipe]:
-        yield from _isolate_errors(_verify_ingestion(store.runs_place, run_id, name), repair)
-    if not recipes:
-        yield f"{place.where()}: contains no finished run; ingest its log again"
-    for name in names:
-        if name not in there and name.partition("/")[0] not in recipes:
-            yield _describe_stranger(place, name)
-
-
-def _describe_ingesting(place: Place) -> Repair:
-    return Repair(f"{place.where()}: remove .json files that have changed, then ingest its log again with --force")
-
-
-def _list_documents(place: Place) -> set[str]:
-    return {name for name in place.files() if split_number(name) or name == REPORT}
-
-
-def _verify_seals(place: Place, names: Iterable[str], repair: Repair) -> Iterator[CheckResult]:
-    lines = (find_broken_seal(place.read(name), place.where(name)) or ("files", 1) for name in names)
-    yield from _repair_by(repair, lines)
-
-
-def _verify_maps(store: Store) -> Iterator[CheckResult]:
-    place = store.place.below("maps")
-    known = _list_documents(place)
-    repair = Repair(f"{place.where()}: remove .json files that have changed, then add the map again with --force")
-    yield from _verify_seals(place, sorted(known), repair)
-    for name, last in find_highest_numbers(known).items():
-        yield "maps", 1
-        for number in range(1, last + 1):
-            with suppress(StoreError):
-                checksums = read_as_at(place, name_document(name, number), MapDocument).checksums
-                known |= set(checksums)
-                yield from _verify_files(place, checksums, repair) if number == last else ()
-    yield from _find_strangers(place, known)
-
-
 def _verify_files(place: Place, checksums: Mapping[str, Checksum], repair: Repair) -> Iterator[CheckResult]:
-    """Read files again and compare them with what a sealed document has of them."""
+    """Read files again and compare them with what a document has of them."""
     yield from _repair_by(repair, find_wrong_files(place, checksums))
     yield "files", len(checksums)
-
-
-def _find_strangers(place: Place, known: Collection[str]) -> Iterator[str]:
-    yield from (_describe_stranger(place, entry.name) for entry in place.entries() if entry.name not in known)
-
-
-def _describe_stranger(place: Place, name: str) -> str:
-    """Return a line about what no document knows."""
-    if any(_DIGEST.fullmatch(part) for part in name.split("/")):
-        return f"{place.where(name)}: {_KILLED}"
-    return f"{place.where(name)}: is no file of this store"
-
-
-def _find_left_behind(root: Path) -> Iterator[str]:
-    for path in sorted(root.glob(f"{TEMPORARY_PREFIX}*")):
-        if is_abandoned(path):
-            yield f"{path}: was left by a killed command; the next tcpipe ingest or add-map removes it"
 
 
 def _verify_map(path: Path) -> Iterator[CheckResult]:
@@ -320,7 +177,8 @@ def _verify_map(path: Path) -> Iterator[CheckResult]:
     yield "maps", 1
     place, checksums = Place(path), read_checksums(path)
     yield from _verify_files(place, checksums, Repair(f"{path}: copy it again, or add the map again with --force"))
-    yield from _find_strangers(place, {*checksums, CHECKSUMS})
+    strange = [entry.name for entry in place.entries() if entry.name not in {*checksums, CHECKSUMS}]
+    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_note(name))
 
 
 def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator[CheckResult]:
@@ -331,34 +189,108 @@ def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator
         yield from _repair_by(repair, error.problems)
 
 
-def _verify_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[CheckResult]:
-    """Compare what a run became under one recipe with its manifest."""
-    yield "runs", 1
-    place = runs.below(f"{run_id}/{recipe_name}")
-    last = name_document("manifest", find_highest_numbers(place.files())["manifest"])
-    document, where = read_sealed_at(place, last), place.where(last)
-    if document["data_model_version"] != DATA_MODEL_VERSION:
-        yield (
-            f"{where}: of data model {document['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
-            "ingest the log again, then remove this directory"
-        )
-        return
-    manifest, recipe = parse_typed(document, Manifest, where), document["recipe"]
-    keys = (ingest_key(recipe), make_recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
-    if keys != (manifest.ingest_key, recipe_name):
-        yield f"{where}: its recipe is not the one that the directory is named after"
-    documents, repair = _list_documents(place), _describe_ingesting(runs.below(run_id))
-    yield from _verify_seals(place, sorted(documents), repair)
-    known = {*documents, *manifest.checksums}
-    for name in documents - {REPORT}:
-        with suppress(StoreError):
-            known |= set(read_as_at(place, name, Manifest).checksums)
-    yield from _find_strangers(place, known)
-    wrong = list(find_wrong_files(place, manifest.checksums))
-    yield from _repair_by(repair, wrong)
-    yield "files", len(manifest.checksums)
-    for name, checksum in manifest.checksums.items() if not wrong else ():
-        table, rows = PurePosixPath(name).stem, read_row_count(place.local(name, checksum))
+def _verify_store(store: Store) -> Iterator[CheckResult]:
+    """Yield what was read of all documents and payload, and a line for everything that is not as it was written."""
+    place, state = store.place, store.scan()
+    yield from _verify_documents(place)
+    yield from _verify_page(place)
+    rows = [(row, state.names["runs", key]) for key, row in state.runs.items() if row.blob and state.has_payload(row)]
+    yield from _verify_runs(place, sorted(rows, key=lambda row: (row[0].run_id, row[0].recipe_id)))
+    for problem in find_incomplete_runs(state):
+        missing = place.where(problem.finding.names["file"])
+        yield from (f"{missing}: is missing (run {problem.run_id})", Repair(_INGEST.format(problem.run_id)))
+    for each in state.maps.values():
+        yield "maps", 1
+        repair = Repair(f"map {each.name}: copy the store again, or add the map again with --force")
+        yield from _verify_files(place.below(f"{BLOBS}/{each.blob}"), each.files, repair)
+    yield from _verify_names(store, state)
+
+
+def _verify_documents(place: Place) -> Iterator[CheckResult]:
+    """Read every document and compare it with its name."""
+    for kind in KINDS:
+        names = [str(name) for file in place.list(kind) if (name := parse_name(kind, file)) is not None]
+        yield "documents", len(names)
+        for line in filter(None, place.map(lambda name, kind=kind: _check_document(place, kind, name), names)):  # type: ignore[misc]
+            yield from (line, Repair(f"{line.partition(': ')[0]}: copy it again, or {_REPAIRS[kind]}"))
+
+
+def _check_document(place: Place, kind: Kind, name: str) -> str | None:
+    try:
+        read_record(place, name, RECORDS[kind])
+    except StoreError as error:
+        return error.problems[0].partition(";")[0]
+    return None
+
+
+def _verify_page(place: Place) -> Iterator[CheckResult]:
+    page, where = place.read(REPORT), place.where(REPORT)
+    if page is not None:
+        repair = Repair(f"{where}: 'tcpipe report' writes it again")
+        yield from _repair_by(repair, [find_broken_seal(page, where) or ("files", 1)])
+
+
+def _verify_runs(place: Place, runs: Iterable[tuple[RunFacts, str]]) -> Iterator[CheckResult]:
+    """Compare the payload of runs, and the page of each, with their manifests; streams of several runs once."""
+    known = set[str]()
+    for row, document in runs:
+        yield "runs", 1
+        repair, folder = Repair(_INGEST.format(f"{row.run_id}/{row.recipe_id}")), place.below(f"{BLOBS}/{row.blob}")
+        if row.streams_blob not in known:
+            known.add(row.streams_blob)
+            yield from _verify_files(place.below(f"{BLOBS}/{row.streams_blob}"), row.streams, repair)
+        wrong = list(find_wrong_files(folder, row.tables))
+        yield from _repair_by(repair, wrong)
+        yield "files", len(row.tables)
+        yield from _verify_page(folder)
+        if row.data_model_version != DATA_MODEL_VERSION:
+            yield (
+                f"run {row.run_id}/{row.recipe_id}: is of data model {row.data_model_version}, this version reads "
+                f"{DATA_MODEL_VERSION}; ingest its log again"
+            )
+        elif not wrong:
+            yield from _isolate_errors(_verify_rows(place, row, document), repair)
+
+
+def _verify_rows(place: Place, row: RunFacts, document: str) -> Iterator[CheckResult]:
+    """Compare the number of rows of each table with the manifest."""
+    counts = read_record(place, document, Run).counts
+    for name, checksum in row.tables.items():
+        table = PurePosixPath(name).stem
+        rows = read_row_count(place.below(f"{BLOBS}/{row.blob}").fetch(name, checksum, proved=False))
         yield "rows", rows
-        if (count := getattr(manifest.counts, _COUNTS[table])) not in (None, rows):
-            yield f"{where}: {_COUNTS[table]} is {count}, but {table}.parquet has {rows} rows"
+        if (count := getattr(counts, _COUNTS[table])) not in (None, rows):
+            yield f"{place.where(document)}: {_COUNTS[table]} is {count}, but {table}.parquet has {rows} rows"
+
+
+def _verify_names(store: Store, state: State) -> Iterator[CheckResult]:
+    """Yield payload that no document names, and files that tcpipe did not write."""
+    place, beaten = store.place, read_beaten(store, state.beaten)[0]
+    listed = {(row.blob, name) for row in state.runs.values() for name in row.tables}
+    listed |= {(row.streams_blob, name) for row in state.runs.values() for name in row.streams}
+    listed |= {(each.blob, name) for each in state.maps.values() for name in each.files}
+    named = name_payload([*state.runs.values(), *state.maps.values(), *beaten])
+    replaced = {record.blob for record in beaten}
+    is_quiet = all(call.state == "killed" for call in list_open_calls(state))
+    strange = [name for name in place.list() if name not in (*KINDS, BLOBS, INDEX, REPORT)]
+    strange += [
+        *find_strange_files(place),
+        *(f"{BLOBS}/{name}" for name in place.list(BLOBS) if not BLOB.fullmatch(name)),
+    ]
+    for blob, entries in list_payload(store).items():
+        if blob not in named:
+            yield from [f"{place.where(f'{BLOBS}/{blob}')}: {_KILLED}"] if is_quiet else []
+            continue
+        for entry in entries:
+            if (blob, entry.name) in listed or entry.name == REPORT or blob in replaced:
+                continue
+            if is_payload(entry.name) and is_quiet:
+                yield f"{place.where(f'{BLOBS}/{blob}/{entry.name}')}: {_KILLED}"
+            elif not is_payload(entry.name):
+                strange.append(f"{BLOBS}/{blob}/{entry.name}")
+    for name in strange:
+        line = f"{place.where(name)}: is no file of this store"
+        yield Repair(line) if is_note(name) else line
+    for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
+        if is_abandoned(path):
+            yield f"{path}: {_KILLED}"

@@ -29,16 +29,17 @@ from numpy.typing import NDArray
 from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
-from tcpipe.formats.bucket_directories import fetch_directory, has_card
+from tcpipe.formats.bucket_directories import fetch_directory
+from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, make_raster_style, write_nav2_map
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import Place, find_wrong_files
+from tcpipe.formats.place import Place
+from tcpipe.formats.published_outputs import find_newest, write_output
 from tcpipe.learning.models import Model
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
     BARRED,
@@ -177,7 +178,7 @@ def make_cost_map(
     ----------
     model, source : who predicts, and the map.
     out : its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where it
-        becomes the newest generation, and an interrupted call begins anew.
+        becomes the newest build, and an interrupted call begins anew.
     cell_size_m : side of a cell in the map's plane [m].
     origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
         without.
@@ -190,10 +191,10 @@ def make_cost_map(
     key = make_cost_map_key(model, source, cell_size_m)
     if is_url(out):
         url = str(out)
-        known = read_cost_map_card(fetch_directory(url)) if has_card(url) else None
+        known = read_cost_map_card(fetch_directory(url)) if find_newest(url, [CARD]) else None
         if known is not None and (known.key, known.origin_deg) == (key, origin_deg):
             return CostMapResult(url, "unchanged", known)
-        with write_generation(url, CARD) as place:
+        with write_output(url, CARD) as place:
             made = make_cost_map(model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step)
         return replace(made, path=url)
     out = Path(out)

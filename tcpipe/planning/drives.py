@@ -17,20 +17,19 @@ from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear
-from tcpipe.formats.bucket_directories import require_card
 from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.object_storage import is_url, make_absolute
+from tcpipe.formats.published_outputs import require_card, write_output
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.learning.models import Model
 from tcpipe.pipeline.dataset.map_checks import register_runs
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import Reason, check_model, predict_segments
 from tcpipe.planning.path_cost import find_added_turning
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles
 from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
@@ -94,23 +93,19 @@ class DriveCost:
         return self.samples_in_training == 0
 
 
-def find_drive(store: Store, log: str) -> RunDirectory:
-    """Return the ingested run of a log, by its path or its run's name; `UsageError` if it is missing, or has several recipes."""
-    found = []
-    for run in store.runs():
-        known = store.run_json(run.run_id)
-        paths = known.source.paths if known else ()
-        if log == run.run_id or str(Path(log).absolute()) in {str(Path(path).absolute()) for path in paths}:
-            found.append(run)
+def find_drive(store: Store, log: str) -> StoredRun:
+    """Return the run of a log, by the path or URL of the log, RUN or RUN/RECIPE; `UsageError` if there is none, or several recipes."""
+    state = store.scan()
+    found = store.find_runs(log, state) or [
+        run for run in store.runs(state) if make_absolute(log) in run.facts.log.paths
+    ]
     if not found:
         raise UsageError(
-            f"{log}: no run of this log in {store.root}; expected its path or its run's name: run 'tcpipe ingest {log}' first"
+            f"{log}: {store.root} has no run of this log or name; expected the path of an ingested log, a run or RUN/RECIPE"
         )
     if len(found) > 1:
-        recipes = ", ".join(run.recipe_id for run in found)
-        raise UsageError(
-            f"{log}: {store.root} contains it under several recipes ({recipes}); expected one: give a store with it alone"
-        )
+        names = ", ".join(run.name for run in found)
+        raise UsageError(f"{log}: was ingested under several recipes; expected one of {names}")
     return found[0]
 
 
@@ -135,7 +130,7 @@ class DrivenMetres:
 def predict_run(
     model: Model,
     source: MapReader,
-    run: RunDirectory,
+    run: StoredRun,
     *,
     gnss_crs: str | None = None,
     sample: SampleConfig | None = None,
@@ -208,7 +203,7 @@ def collect_runs(
 
 
 def find_shifts(
-    store: Store, source: MapFile, recipe: Recipe, runs: Sequence[RunDirectory], data: Dataset | None = None
+    store: Store, source: MapFile, recipe: Recipe, runs: Sequence[StoredRun], data: Dataset | None = None
 ) -> tuple[Shifts, list[Finding]]:
     """Return where runs lie on a map, with those of a dataset that are in the store, and findings; nothing without ``sample.align``."""
     if not recipe.sample.align:
@@ -223,15 +218,15 @@ def find_shifts(
 
 
 def compute_drive_cost(
-    model: Model, source: MapReader, run: RunDirectory, data: Dataset, *, log: str, shifts: Shifts | None = None
+    model: Model, source: MapReader, run: StoredRun, data: Dataset, *, log: str, shifts: Shifts | None = None
 ) -> DriveCost:
     """Return what a drive took beside what a model says of it.
 
     ``data`` is the dataset that the model was trained on: what of the drive it has seen; ``log`` what the user calls the drive;
     ``shifts`` are of runs on the map. `ModelError`, `UsageError`: it is of another robot, or has no segments.
     """
-    if run.manifest.robot != model.card.robot:
-        raise ModelError(f"{log}: is of robot {run.manifest.robot}, model {model.name} of {model.card.robot}")
+    if run.facts.robot != model.card.robot:
+        raise ModelError(f"{log}: is of robot {run.facts.robot}, model {model.name} of {model.card.robot}")
     segments = run.segments()
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
@@ -239,8 +234,8 @@ def compute_drive_cost(
     found = predict_run(model, source, run, gnss_crs=recipe.read.gnss_crs, sample=recipe.sample, shift=shift)
     errors, trained, length_m = model.errors, data["train"], found.run.metres["energy"].length_m
     near = are_near(
-        compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
-        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.card.chord_m,
+        compute_middles([to_floats(segments, name) for name in PLACES]),
+        compute_middles([trained.column(name) for name in PLACES]), within_m=CLOSE * model.card.chord_m, in_degrees=True,
     )  # fmt: skip
     good = {name: metres.take(found.is_good) for name, metres in found.run.metres.items()}
     sums = {
@@ -251,7 +246,7 @@ def compute_drive_cost(
         for name, metres in good.items()
     }  # fmt: skip
     return DriveCost(
-        run_id=run.run_id, log=log, map=source.name, driven_m=float(sum(run.manifest.distance_by_reason_m.values())),
+        run_id=run.run_id, log=log, map=source.name, driven_m=run.facts.driven_m,
         segments_m=float(length_m.sum()), compared_m=float(length_m[found.is_good].sum()),
         rest_m={name: float(length_m[[name in why for why in found.reasons]].sum()) for name in found.names},
         samples_in_training=int((trained.column("run_id").astype(np.str_) == run.run_id).sum()),
@@ -334,7 +329,7 @@ def evaluate_drives(
     Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
     """
     if is_url(out):
-        with write_generation(str(out), JSON) as made:
+        with write_output(str(out), JSON) as made:
             result = evaluate_drives(model, data, source, logs, store=store, out=made)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place, opened = Path(out), open_store(store)

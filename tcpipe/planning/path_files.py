@@ -43,14 +43,15 @@ from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
 def choose_map(store: str | Path, name: str | None) -> MapFile:
     """Return the named map of a store, or its only one; `UsageError` if there are several and none is named."""
     opened = open_store(store)
-    maps = opened.maps()
+    state = opened.scan()
+    maps = state.maps
     if not maps:
         raise MapError(f"{opened.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
     if name is None and len(maps) > 1:
         raise UsageError(f"{opened.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map")
     if name is not None and name not in maps:
         raise MapError(f"{opened.root}: no map {name!r} in the store; there are {', '.join(maps)}")
-    return open_map(*opened.map_files(name or maps[0]))
+    return open_map(*opened.map_at(opened.find_map(name or next(iter(maps)), state)))
 
 
 _PATH_VERSION = "1.2"

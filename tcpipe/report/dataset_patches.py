@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import PatchFiles, find_places_in_files, open_patches, read_samples
 from tcpipe.formats.json_files import Json
+from tcpipe.formats.published_outputs import REPORT_PATCHES
 from tcpipe.report.pictures import ACROSS, colour_classes, colour_heights, encode_picture, make_picture_uri, make_sheet
 from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.layers import COLOURS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,12 +14,12 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial import cKDTree
 
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings, judge_dataset
-from tcpipe.formats.dataset_files import read_intact_card, read_samples
+from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_columns
+from tcpipe.formats.documents import BLOBS
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.run_documents import MARK
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
 from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
 from tcpipe.report.label_sections import (
@@ -44,6 +45,7 @@ from tcpipe.report.page import (
 )
 from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
+from tcpipe.store import Store, is_store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
 _PAGE = "report.html"
@@ -52,17 +54,18 @@ MOST_SAMPLES = 100_000
 
 SAMPLE_COLUMNS = (
     *("sample_id", "split", "run_id", "start_ns", "start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg"),
+    *("start_x_m", "start_y_m", "end_x_m", "end_y_m"),
     *("terrain_class", "terrain_name", "slope_rad", "yaw_change_rad", "quality"),
     *(column for *columns, _ in LABELS.values() for column in columns),
 )
-"""Columns of samples.parquet that the page needs."""
+"""Columns of samples.parquet that the page needs, those that the dataset has."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class SamplesShown:
-    """The samples of the page, and their middles in the first map's plane, (N, 2)."""
+    """The samples of the page, and their middles in the first map's plane, or from the dataset's own origin, (N, 2)."""
 
     xy_m: Floats
     json: Json
@@ -79,9 +82,11 @@ def render_dataset_report(
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
     card = read_intact_card(directory)
-    samples = read_samples(directory, SAMPLE_COLUMNS) if samples is None else samples
+    if samples is None:
+        there = sample_columns(directory)
+        samples = read_samples(directory, [name for name in SAMPLE_COLUMNS if name in there])
     shown = select_samples(card, samples)
-    plots, lost = draw_dataset_map(directory, card, len(shown.xy_m))
+    plots, lost = draw_dataset_map(directory, card, shown.xy_m)
     quality = samples.column("quality").to_numpy()
     try:
         patches = make_patches_data(directory, card, samples, len(shown.xy_m))
@@ -190,13 +195,13 @@ def _make_data(
 
 def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
     """Return the relative address of each run's page, for runs of a store in ``beside``."""
-    stores = sorted(mark.parent for mark in beside.glob(f"*/{MARK}"))
-    return {
-        run.run_id: f"../{place.relative_to(beside).as_posix()}/{_PAGE}"
-        for run in card.runs
-        for store in stores
-        if (place := store / "runs" / run.run_id / run.recipe_id).is_dir()
-    }
+    wanted, found = {(run.run_id, run.recipe_id) for run in card.runs}, dict[str, str]()
+    for path in sorted(runs.parent for runs in beside.glob("*/runs")):
+        with suppress(StoreError, UsageError):  # no store that can be read
+            rows = Store(path).scan().runs.values() if is_store(path) else ()
+            names = {row.run_id: row.blob for row in rows if row.blob and (row.run_id, row.recipe_id) in wanted}
+            found |= {run_id: f"../{path.name}/{BLOBS}/{blob}/{_PAGE}" for run_id, blob in names.items()}
+    return found
 
 
 def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
@@ -293,7 +298,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
             )
             for grid in card.maps
         ),
-        *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs),
+        *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs if run.sha256),
         *(("excluded", str(exclusion)) for exclusion in card.exclusions),
         ("licence", card.licence or "none given"),
         ("creator", card.creator or "none given"),
@@ -317,9 +322,7 @@ def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floa
 
 def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
     """Return the samples of the page."""
-    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
-    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
-    xy_m = np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
+    xy_m = _read_middles_m(card, table)
     apart_m, nearest = find_nearest_train_m(xy_m, _find_indices(table, "split", SPLITS))
     starts_ns = np.array(find_first_starts_ns(card, table), np.int64)
     table = table.slice(0, MOST_SAMPLES)
@@ -344,6 +347,15 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
         "nearest": ("u32", np.where(near, nearest, np.arange(len(near)))[:count]),
     }
     return SamplesShown(xy_m[:count], {"packed": pack_columns(columns), "ids": _find_odd_ids(table)})
+
+
+def _read_middles_m(card: DatasetCard, table: pa.Table) -> Floats:
+    if card.without_coordinates:
+        ends = [np.column_stack([to_floats(table, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")]
+        return 0.5 * (ends[0] + ends[1])
+    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
+    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
+    return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
 
 
 def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray[np.int32]:

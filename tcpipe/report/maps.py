@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,9 @@ from pyproj import Transformer
 from tcpipe.errors import TcpipeError, clean_line
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
-from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.report.colours import CURSOR, FAINT, SPLIT_COLOURS
 from tcpipe.report.pictures import (
     Bounds,
@@ -32,19 +32,22 @@ from tcpipe.store import Store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
 Floats = NDArray[np.float64]
-Pictures = MutableMapping[str, str]
+Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
 
 _LEAST_SHARE = 0.5
 """Smallest share of the track on a map that becomes its background."""
 
 
-def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> tuple[list[Plot], list[str]]:
-    """Return the map of the samples and the plot beside it, and which parts of the map are lost."""
-    bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
+def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[list[Plot], list[str]]:
+    """Return the map of the samples at ``xy_m``, (N, 2), and the plot beside it, and which parts of the map are lost."""
+    if card.maps:
+        bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
+    else:
+        bounds = (0.0, 0.0, *xy_m.max(axis=0, initial=1.0).tolist())
     tools = "box_select,lasso_select"
     plot = make_map_plot(
-        alt=f"Map of {sample_count} points, coloured by the quantity chosen above; the tables below list the counts.",
+        alt=f"Map of {len(xy_m)} points, coloured by the quantity chosen above; the tables below list the counts.",
         axes=("easting [m]", "northing [m]"),
         height_px=110 + 330 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
         tools=f"pan,wheel_zoom,{tools},reset,save",
@@ -54,7 +57,7 @@ def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> t
     ends = {end: np.empty(0) for end in ("x0", "y0", "x1", "y1")}
     leaks = figure.segment(source=ends, color=CURSOR, line_width=1.5, name="leaks", visible=False)
     leaks.level = "overlay"  # above the points that they join
-    rings = _project_rings(card.split.region, Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True))
+    rings = _project_rings(card)
     xs, ys = ([ring[:, axis] for ring in rings] for axis in (0, 1))
     figure.multi_line(xs, ys, color="#b3202a", line_width=2, line_dash="dashed")
     corners = {
@@ -127,7 +130,7 @@ def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds
     files = {"orthophoto" if has_ortho else "hillshade": OVERVIEW, "hillshade ": RELIEF, "classes": CLASSES}
     lost = []
     for number, (name, file) in enumerate(files.items()):
-        if file != OVERVIEW and file not in card.checksums:
+        if file not in card.checksums:
             continue
         pixels = read_picture(directory / file)
         if pixels is None:
@@ -137,10 +140,12 @@ def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds
     return lost
 
 
-def _project_rings(region: Mapping[str, PolygonGeometry] | None, to_map: Transformer) -> list[Floats]:
+def _project_rings(card: DatasetCard) -> list[Floats]:
     """Return every ring of every polygon of the region in the map's plane [m], each of shape (M, 2)."""
-    rings = []
-    for geometry in (region or {}).values():
+    if card.split.region is None:
+        return []
+    to_map, rings = Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True), []
+    for geometry in card.split.region.values():
         polygons = (geometry.coordinates,) if geometry.type == "Polygon" else geometry.coordinates
         rings += [np.array(ring, dtype=float)[:, :2] for polygon in polygons for ring in polygon]
     return [np.column_stack(to_map.transform(ring[:, 0], ring[:, 1])) for ring in rings]
@@ -159,60 +164,66 @@ class RunMap:
     """Names of the pictures below the track."""
     missing: tuple[str, ...]
     """Reasons why pictures are missing."""
+    is_complete: bool
+    """Whether no map of the store is damaged."""
 
 
-def draw_run_map(
-    store: Store,
-    run: RunDirectory,
-    track: pa.Table,
-    segments: pa.Table,
-    *,
-    has_datum: bool,
-    pictures_by_map: MutableMapping[str, Pictures],
-) -> RunMap:
-    """Return the map; ``has_datum`` is whether the track has a place on Earth, ``pictures_by_map`` keeps pictures for further runs."""
+@dataclass(frozen=True, slots=True)
+class StoredMaps:
+    """The maps of a store, as backgrounds of the pages of its runs."""
+
+    store: Store
+    records: Mapping[str, StoredMap]
+    """By name."""
+    pictures: dict[str, Pictures] = field(default_factory=dict)
+    """Of the maps that were drawn, for further runs."""
+
+
+def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: StoredMaps, *, has_datum: bool) -> RunMap:
+    """Return the map; ``has_datum`` is whether the track has a place on Earth."""
     lonlat = np.column_stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")])
-    ground, missing = _find_ground(store, run, lonlat, pictures_by_map) if has_datum else (None, [])
+    ground, missing = _find_ground(run, lonlat, maps) if has_datum else (None, [])
+    is_complete = not missing
     if ground is None:
         start, end = (
             np.column_stack([to_floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
         )
         xy_m = np.column_stack([to_floats(track, "x_m"), to_floats(track, "y_m")])
         plot = _draw_track(("east [m]", "north [m]"), xy_m)
-        missing = missing or [_explain_no_map(store, has_datum=has_datum)]
-        return RunMap(plot, xy_m, (start, end), (), tuple(missing))
+        missing = missing or [_explain_no_map(maps, has_datum=has_datum)]
+        return RunMap(plot, xy_m, (start, end), (), tuple(missing), is_complete)
     to_map, bounds_m, pictures = ground
     xy_m = to_map(lonlat)
     plot = _draw_track(("easting [m]", "northing [m]"), xy_m)
     for number, (name, uri) in enumerate(pictures.items()):
         lay_picture(plot, name, uri, bounds_m, visible=number == 0)
     ends_xy_m = to_map(read_lonlat_deg(segments, "start")), to_map(read_lonlat_deg(segments, "end"))
-    return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing))
+    return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing), is_complete)
 
 
-def _explain_no_map(store: Store, *, has_datum: bool) -> str:
+def _explain_no_map(maps: StoredMaps, *, has_datum: bool) -> str:
     if not has_datum:
         return "No GNSS fix: the track has only local coordinates and cannot be placed on a map."
-    return "No map of the store covers the track." if store.maps() else "The store has no map ('tcpipe add-map')."
+    return "No map of the store covers the track." if maps.records else "The store has no map ('tcpipe add-map')."
 
 
 def _find_ground(
-    store: Store, run: RunDirectory, lonlat: Floats, pictures_by_map: MutableMapping[str, Pictures]
+    run: StoredRun, lonlat: Floats, maps: StoredMaps
 ) -> tuple[tuple[Callable[[Floats], Floats], Bounds, Pictures] | None, list[str]]:
     """Return projection, bounds and pictures of the first map that contains most of the track, and the maps that cannot be read."""
     lost: list[str] = []
-    for name in store.maps():
+    for name, record in maps.records.items():
         try:
-            source = open_map(*store.map_files(name))
+            source = open_map(*maps.store.map_at(record))
             transformer = Transformer.from_crs(run.manifest.recipe.read.gnss_crs, source.grid.crs, always_xy=True)
 
             def to_map(places_deg: Floats, transformer: Transformer = transformer) -> Floats:
                 return np.column_stack(transformer.transform(*places_deg.T)).reshape(-1, 2)
 
             if source.grid.contains(to_map(lonlat)).mean() > _LEAST_SHARE:
-                if name not in pictures_by_map:
-                    pictures_by_map[name] = _draw_pictures(source)
-                return (to_map, source.grid.bounds_m, pictures_by_map[name]), lost
+                if name not in maps.pictures:
+                    maps.pictures[name] = _draw_pictures(source)
+                return (to_map, source.grid.bounds_m, maps.pictures[name]), lost
         except (TcpipeError, OSError) as error:
             lost.append(f"Map {name} cannot be shown: {clean_line(str(error))}.")
     return None, lost

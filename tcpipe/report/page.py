@@ -194,6 +194,7 @@ def render_page(
     script: str = "",
     data: Json = None,
     reads_pictures: bool = False,
+    made_from: str = "",
 ) -> str:
     """Return the page's HTML; every text is escaped, everything is inline.
 
@@ -204,6 +205,7 @@ def render_page(
     links : pages that belong to it.
     script, data : file beside this one that runs when all figures are drawn, and its data.
     reads_pictures : whether the page may load pictures beside it; it never loads anything else.
+    made_from : digest of the inputs, by which `is_made_from` finds that the page need not be rendered again; "" if it has to be.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = _format_cell
@@ -217,6 +219,7 @@ def render_page(
         verdict=verdict,
         links=links,
         pictures="'self' file: " if reads_pictures else "",
+        made_from=_MADE_FROM.format(made_from) if made_from else "",
         sections=sections,
         ids={plot.figure.name: id_ for plot, id_ in zip(drawn, ids, strict=True)},
         read_file=_read_file,
@@ -229,6 +232,15 @@ def render_page(
     code = [plots.read_bokeh_script()] if ids else []
     code += [_read_file("page.js"), *([_read_file(script)] if script else [])]
     return visible.replace(_SCRIPTS, "\n".join(blocks + [f"<script>\n{part}\n</script>" for part in code]), 1)
+
+
+_MADE_FROM = '<meta name="tcpipe-made-from" content="{}">'
+_HEAD_BYTES = 4096
+
+
+def is_made_from(page: bytes, made_from: str) -> bool:
+    """Return whether a page was made from inputs with this digest."""
+    return _MADE_FROM.format(made_from).encode() in page[:_HEAD_BYTES]
 
 
 def _read_file(name: str) -> str:

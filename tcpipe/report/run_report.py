@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -15,8 +15,8 @@ from tcpipe.errors import StoreError, TableError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.run_documents import Counts, Manifest, RunJson
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.runs import Run
+from tcpipe.formats.stored_runs import StoredRun, find_stream_files
 from tcpipe.report.colours import DOUBTED, KEPT, LINE_COLOURS, SEVERITY_COLOURS, UNUSED
 from tcpipe.report.label_sections import (
     LABELS,
@@ -27,7 +27,7 @@ from tcpipe.report.label_sections import (
     make_physics_sections,
     make_quality_section,
 )
-from tcpipe.report.maps import Pictures, RunMap, draw_run_map
+from tcpipe.report.maps import RunMap, StoredMaps, draw_run_map
 from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
 from tcpipe.report.plots import Plot, draw_label_histograms, make_plot, show_text
 from tcpipe.report.run_plots import (
@@ -46,7 +46,6 @@ from tcpipe.report.run_plots import (
     make_track_series,
     time_plots,
 )
-from tcpipe.store import Store
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import NoiseFacts, PhysicsFacts, StageFacts
@@ -69,26 +68,16 @@ _STEP_M = 0.05
 """Positions of the track that are nearer become one on the map."""
 
 
-def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[str, Pictures] | None = None) -> str:
-    """Return the HTML page of a run of the store; a map of the store that lies under the run is its background.
+def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
+    """Return the HTML page of a run; a map of the store that contains the run is its background.
 
-    ``pictures_by_map`` keeps pictures of maps for the pages of further runs.
+    The page has ``made_from``, a digest of its inputs, in its head, unless some of these are damaged.
     """
     track, segments, manifest, rejections = run.track().table, run.segments(), run.manifest, run.rejections()
     label = manifest.info.report.facts.label
-    run_json = store.run_json(run.run_id)
-    ledger, total = manifest.distance_by_reason_m, sum(manifest.distance_by_reason_m.values())
-    drive, data = _draw_run(
-        store,
-        run,
-        track,
-        segments,
-        rejections=rejections,
-        pictures_by_map={} if pictures_by_map is None else pictures_by_map,
-    )
-    source = "source unknown"
-    if run_json is not None:
-        source = f"from {', '.join(run_json.source.paths)} ({run_json.source.size_bytes / 1e6:.1f} MB)"
+    ledger, total = manifest.distance_by_reason_m, manifest.driven_m
+    drive = _draw_run(run, track, segments, rejections=rejections, maps=maps)
+    source = f"from {', '.join(manifest.log.paths)} ({manifest.log.size_bytes / 1e6:.1f} MB)"
     return render_page(
         title=f"Run {run.run_id}",
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {source}",
@@ -100,17 +89,28 @@ def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[
             Number(_mean(segments, "power_watt", "W"), "mean power w"),
             Number(_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
         ],
-        links=[Link("All runs of the store", f"../../../{_PAGE}")] if store.place.size(_PAGE) is not None else [],
+        links=[Link("All runs of the store", f"../../{_PAGE}")] if run.place.size(_PAGE) is not None else [],
         sections=[
-            *drive,
+            *drive.sections,
             *make_losses_sections([ledger], "Kept and excluded distances add up to the odometer.", names_runs=False),
             *_make_label_sections(run, segments, label.physics if label else None),
-            _make_sensor_section(run_json, manifest, rejections),
-            _make_provenance_section(run, manifest, run_json),
+            _make_sensor_section(manifest, rejections),
+            _make_provenance_section(manifest),
         ],
-        script="run.js" if data is not None else "",
-        data=data,
+        script="run.js" if drive.data is not None else "",
+        data=drive.data,
+        made_from=made_from if drive.is_complete else "",
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """Map and plots over time, and the data of their script; None of a run without a track."""
+
+    sections: list[Section]
+    data: Json
+    is_complete: bool
+    """Whether all maps and streams could be read."""
 
 
 def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
@@ -118,23 +118,15 @@ def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
     return f"{values.mean():.{digits}f} {unit}" if len(values) else "none"
 
 
-def _draw_run(
-    store: Store,
-    run: RunDirectory,
-    track: pa.Table,
-    segments: pa.Table,
-    *,
-    rejections: pa.Table,
-    pictures_by_map: MutableMapping[str, Pictures],
-) -> tuple[list[Section], Json]:
-    """Return map and plots over time, and the data of their script; None of a run without a track."""
+def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections: pa.Table, maps: StoredMaps) -> _Drive:
     if not track.num_rows:
-        return [Section("The drive", "No track: the log has no measurements that can be fused.")], None
+        text = "No track: the log has no measurements that can be fused."
+        return _Drive([Section("The drive", text)], None, is_complete=True)
     info = run.manifest.info
     timeline = make_timeline(track)
     has_datum = info.datum is not None
-    run_map = draw_run_map(store, run, track, segments, has_datum=has_datum, pictures_by_map=pictures_by_map)
-    sensor_series, lost = _read_series(store, run, timeline)
+    run_map = draw_run_map(run, track, segments, maps, has_datum=has_datum)
+    sensor_series, lost = _read_series(run, timeline)
     series = [make_track_series(track, timeline, run_map.track_xy_m), *sensor_series]
     lines, spans = make_lines(series), find_mask_spans(track, timeline, info.rate_hz)
     findings = find_finding_spans(info.report.findings, track, timeline)
@@ -178,25 +170,19 @@ def _draw_run(
     drive = Section(
         "The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot, first], stacked=True
     )
-    return [drive, Section("Over time", over, controls="run_time.html", plots=others, stacked=True)], data
+    over_time_section = Section("Over time", over, controls="run_time.html", plots=others, stacked=True)
+    return _Drive([drive, over_time_section], data, is_complete=run_map.is_complete and not lost)
 
 
-def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[list[Series], list[str]]:
+def _read_series(run: StoredRun, timeline: Timeline) -> tuple[list[Series], list[str]]:
     """Return power and speeds of the run's streams, and in words which of them are lost."""
+    shown = ("power", *SPEED_ROLES)
+    streams = {name: each for name, each in run.facts.streams.items() if PurePosixPath(name).stem in shown}
     try:
-        run_json = store.run_json(run.run_id)
-        tables = {}
-        if run_json is not None:
-            streams = run_json.streams if run_json.streams_key == run.streams_key else {}
-            streams = {
-                name: digest for name, digest in streams.items() if PurePosixPath(name).stem in ("power", *SPEED_ROLES)
-            }
-            files = store.stream_files(run.run_id, replace(run_json, streams=streams))
-            tables = {role: read_table(path) for role, path in files.items()}
+        files = find_stream_files(run.place, replace(run.facts, streams=streams))
+        tables = {role: read_table(path) for role, path in files.items()}
     except (StoreError, TableError) as error:
         return [], [f"The measurements cannot be drawn: {error.problems[0]}."]
-    if not tables and run.manifest.counts.messages.get("gnss"):
-        return [], ["The measurements are missing or were read again: the plots show only columns of the track."]
     series = list(make_rail_series(tables.pop("power"), timeline)) if "power" in tables else []
     if "gnss_velocity" in tables:
         tables.pop("gnss", None)
@@ -269,11 +255,11 @@ def _find_severities(
     return worst
 
 
-def _make_label_sections(run: RunDirectory, segments: pa.Table, physics: PhysicsFacts | None) -> list[Section]:
+def _make_label_sections(run: StoredRun, segments: pa.Table, physics: PhysicsFacts | None) -> list[Section]:
     """Return the section on labels, with physics, flags and uncertainty below it; none of a run without segments."""
     if not segments.num_rows:
         return []
-    fits = {run.manifest.robot: physics.fit} if physics is not None and physics.fit is not None else {}
+    fits = {run.facts.robot: physics.fit} if physics is not None and physics.fit is not None else {}
     parts = [
         *make_physics_sections(fits),
         make_quality_section(to_integers(segments, "quality"), "segments"),
@@ -282,12 +268,12 @@ def _make_label_sections(run: RunDirectory, segments: pa.Table, physics: Physics
     return [Section("Labels", "One value per segment.", plots=draw_label_histograms(segments), parts=parts)]
 
 
-def _make_sensor_section(run_json: RunJson | None, manifest: Manifest, rejections: pa.Table) -> Section:
-    """Return the section on topics, rejections, noise and clocks; ``run_json`` is None where it is lost."""
+def _make_sensor_section(manifest: Run, rejections: pa.Table) -> Section:
+    """Return the section on topics, rejections, noise and clocks."""
     facts = manifest.info.report.facts
     plots = list(_draw_noises(facts))
     parts = [
-        *([] if run_json is None else [_make_topics_section(run_json, manifest.counts)]),
+        _make_topics_section(manifest),
         *_make_trust_sections(facts, rejections),
         *_make_clock_sections(facts),
     ]
@@ -298,13 +284,13 @@ def _name(role: str) -> str:
     return role.replace("_", " ")
 
 
-def _make_topics_section(run_json: RunJson, counts: Counts) -> Section:
+def _make_topics_section(manifest: Run) -> Section:
     rows = [
         (
-            *(_name(role), sensor.topic, sensor.type_name, counts.messages.get(role, 0)),
+            *(_name(role), sensor.topic, sensor.type_name, manifest.counts.messages.get(role, 0)),
             *(sensor.time_source, sensor.placed_by, sensor.why),
         )
-        for role, sensor in sorted(run_json.sensors.items())
+        for role, sensor in sorted(manifest.sensors.items())
     ]
     header = ("role", "topic", "type", "messages", "stamp", "placed by", "why this topic")
     return Section("Topics and roles", header=header, rows=rows)
@@ -407,14 +393,14 @@ def _make_clock_sections(facts: StageFacts) -> list[Section]:
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
 
 
-def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:
+def _make_provenance_section(manifest: Run) -> Section:
     """Return the inputs from which the run can be made again, and what is damaged of them."""
     rows = [
         ("made by", f"tcpipe {manifest.tcpipe_version}, data model {manifest.data_model_version}"),
-        ("recipe", run.recipe_id),
+        ("recipe", manifest.recipe_id),
         ("estimator", manifest.info.estimator),
         ("tags", ", ".join(f"{key}={value}" for key, value in manifest.tags.items()) or "none"),
-        *((("log", f"sha256 {run_json.source.sha256}"),) if run_json is not None else ()),
+        ("log", f"sha256 {manifest.log.sha256}"),
         *(("damage of the log", describe_finding(finding)) for finding in manifest.damage),
     ]
     text = "The same log and recipe give the same run."

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.formats.finding_lines import FindingGroup, describe_finding
-from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.stored_runs import Ingestions
+from tcpipe.formats.runs import RunFacts
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.label_sections import make_losses_sections
 from tcpipe.report.page import Link, Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.tables.findings import Finding, Verdict, select_problems
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
-_PAGE = "report.html"
+RunKey: TypeAlias = tuple[str, str]
+"""Run and recipe."""
+_INCOMPLETE, _OTHER_RECIPE = "tables missing", "of another recipe"
 MOST_ROWS = 200
 """Runs that can be read without scripts: with them, all."""
 _MOST_LISTED = 500
@@ -36,10 +38,10 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class StoredDataset:
-    """A dataset that was built of the store: where, of which ingestions, whether it is still that one, and its page from the store's."""
+    """A dataset that was built from the store: where, of which runs, whether it is still that one, and its page from the store's."""
 
     out: str
-    runs: tuple[tuple[str, str], ...]
+    runs: tuple[RunKey, ...]
     there: bool
     page: str | None = None
 
@@ -58,11 +60,18 @@ class StoreFacts:
     """The content of a store's page."""
 
     where: str
-    found: Ingestions
+    rows: tuple[RunFacts, ...]
+    """All runs that were not pruned, one for each recipe."""
+    ruling: str
+    """Key of the current recipe."""
+    incomplete: frozenset[RunKey]
+    """Runs whose tables are missing."""
+    damaged: tuple[str, ...]
+    """Documents that are not as they were written."""
     acknowledged: frozenset[str]
     """Runs whose problems a person has acknowledged."""
-    pages: frozenset[tuple[str, str]]
-    """Ingestions, by run and recipe, that have a page."""
+    pages: Mapping[RunKey, str]
+    """Names of the pages of runs in the store."""
     datasets: tuple[StoredDataset, ...]
     verdict: Verdict
     """On the current runs together."""
@@ -74,47 +83,38 @@ class StoreFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class StoredRun:
-    """A row of the page: an ingestion with its state, page, datasets and codes of findings."""
+class RunRow:
+    """A row of the page: a run under one recipe with its state, page, datasets and codes of findings."""
 
-    run_id: str
-    recipe_id: str
     state: str
-    facts: RunFacts | None
+    facts: RunFacts
     href: str
     datasets: tuple[int, ...]
     codes: tuple[int, ...]
     """Places in `StoreFacts.groups`."""
     is_current: bool = False
-    """Whether it counts: it is of the ruling recipe, and nothing has taken its place."""
-
-    @property
-    def begin_ns(self) -> int:
-        """Return when its first segment begins [ns since 1970]; 0 where that is not known."""
-        return (self.facts and self.facts.start_ns) or 0
+    """Whether it counts: it is of the current recipe, complete, and not superseded."""
 
     @property
     def used_share(self) -> float | None:
         """Return the share of the metres driven that are in segments."""
-        return self.facts.kept_m / self.facts.driven_m if self.facts and self.facts.driven_m > 0 else None
+        return self.facts.kept_m / self.facts.driven_m if self.facts.driven_m > 0 else None
 
     @property
     def floor(self) -> float | None:
         """Return the noise floor of E, a share."""
-        return self.facts.energy_budget.total if self.facts and self.facts.energy_budget else None
+        return self.facts.energy_budget.total if self.facts.energy_budget else None
 
     def row(self, terms: Sequence[str]) -> list[Json]:
         """Return the values of `_FIELDS` for the page's script."""
         facts = self.facts
-        if facts is None:
-            return [self.run_id, self.href, None, "", self.state, "", "", *[None] * 4, "", None, [], [], None, []]
         return [
-            self.run_id,
+            facts.run_id,
             self.href,
             None if facts.start_ns is None else facts.start_ns // 10**6,
             facts.robot,
             self.state,
-            facts.superseded_by,
+            facts.superseded_by or "",
             ", ".join(f"{key}={value}" for key, value in facts.tags.items()),
             facts.segments,
             round(facts.driven_m, 1),
@@ -135,50 +135,41 @@ _FIELDS = (
 )
 
 
-def sort_runs(store: StoreFacts) -> list[StoredRun]:
-    """Return every ingestion, the latest first; then those without a segment, and those that cannot be read."""
-    found, ruling = store.found, find_recipe_key(store.found)
-    members, codes = dict[tuple[str, str], list[int]](), dict[str, list[int]]()
+def sort_runs(store: StoreFacts) -> list[RunRow]:
+    """Return a row for each run and recipe, the latest first; then those without a segment."""
+    members, codes = dict[RunKey, list[int]](), dict[str, list[int]]()
     for number, dataset in enumerate(store.datasets):
         for part in dataset.runs if dataset.there else ():
             members.setdefault(part, []).append(number)
     for number, group in enumerate(store.groups):
         for run_id in group.of:
             codes.setdefault(run_id, []).append(number)
-    rows = [
-        StoredRun(
-            run_id,
-            recipe_id,
-            _state(facts, ruling, acknowledged=run_id in store.acknowledged),
-            facts,
-            f"runs/{run_id}/{recipe_id}/{_PAGE}" if (run_id, recipe_id) in store.pages else "",
-            tuple(members.get((run_id, recipe_id), ())),
-            tuple(codes.get(run_id, ())) if facts.ingest_key == ruling else (),
-            is_current=facts.ingest_key == ruling and not facts.superseded_by,
-        )
-        for (run_id, recipe_id), facts in found.rows.items()
-    ]
-    rows.sort(key=lambda run: (-run.begin_ns, run.run_id, not run.is_current, run.recipe_id))
-    rows += [StoredRun(*part, "files changed or missing", None, "", (), ()) for part in found.damaged]
-    return rows + [
-        StoredRun(name, "", f"of data model {head.data_model_version}", None, "", (), ())
-        for name, head in found.outdated.items()
-    ]
+    rows = list[RunRow]()
+    for facts in store.rows:
+        key, why_not = (facts.run_id, facts.recipe_id), _find_why_not_current(facts, store)
+        state = why_not or _describe_defect(facts, store) or "current"
+        its_codes = () if why_not else tuple(codes.get(facts.run_id, ()))
+        rows.append(RunRow(state, facts, store.pages.get(key, ""), tuple(members.get(key, ())), its_codes, not why_not))
+    return sorted(rows, key=_rank)
 
 
-def find_recipe_key(found: Ingestions) -> str | None:
-    """Return the key of the recipe that most runs are of; of two that the latest run is of."""
-    keys = Counter(run.facts.ingest_key for run in found.finished)
-    latest = {run.facts.ingest_key: max(0, run.facts.start_ns or 0) for run in found.finished}
-    return max(keys, key=lambda key: (keys[key], latest[key], key), default=None)
+def _rank(row: RunRow) -> tuple[int, str, bool, str]:
+    return -(row.facts.start_ns or 0), row.facts.run_id, not row.is_current, row.facts.recipe_id
 
 
-def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
+def _find_why_not_current(facts: RunFacts, store: StoreFacts) -> str:
+    """Return why a run is not part of the sums; "" of one that is."""
+    if facts.data_model_version != DATA_MODEL_VERSION:
+        return f"of data model {facts.data_model_version}"
+    if (facts.run_id, facts.recipe_id) in store.incomplete:
+        return _INCOMPLETE
     if facts.superseded_by:
         return "superseded"
-    if facts.ingest_key != ruling:
-        return "of another recipe"
-    return f"{facts.defect}{', acknowledged' * acknowledged}" if facts.defect else "current"
+    return _OTHER_RECIPE if facts.ingest_key != store.ruling else ""
+
+
+def _describe_defect(facts: RunFacts, store: StoreFacts) -> str:
+    return facts.defect and f"{facts.defect}{', acknowledged' * (facts.run_id in store.acknowledged)}"
 
 
 def _compute_percent(share: float | None) -> float | None:
@@ -191,9 +182,9 @@ def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
     return [name if short.count(name) == 1 else dataset.out for name, dataset in zip(short, datasets, strict=True)]
 
 
-def format_day(facts: RunFacts | None) -> str:
-    """Return when the first segment of a run begins, to the minute, UTC; "" where that is not known."""
-    if facts is None or facts.start_ns is None:
+def format_day(facts: RunFacts) -> str:
+    """Return when the first segment of a run begins, to the minute, UTC; "" without segments."""
+    if facts.start_ns is None:
         return ""
     return f"{datetime.fromtimestamp(facts.start_ns // 10**9, UTC):%Y-%m-%d %H:%M}"
 
@@ -203,15 +194,15 @@ def store_report(store: StoreFacts) -> str:
     runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
     groups = [(group, len(current), "runs") for group in store.groups]
-    ledgers = [run.facts.distance_by_reason_m for run in current if run.facts]
-    losses = make_losses_sections(
-        ledgers, "The largest losses of distance and their remedies; 'tcpipe status' lists the same.", names_runs=True
-    )
+    ledgers = [run.facts.distance_by_reason_m for run in current]
+    losses = make_losses_sections(ledgers, "The largest losses of distance and their remedies.", names_runs=True)
     drift, table = _make_drift_sections(runs), _make_table_section(store, runs)
     problem = "The store has no usable runs. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."
+    if any(run.state == _OTHER_RECIPE for run in runs):
+        problem = "The store has no runs of the current recipe. 'tcpipe report --recipe FILE' shows those of another."
     return render_page(
         title=f"Store {store.where}",
-        lead="All runs. Sums, trends and losses use the most frequent recipe and exclude superseded runs.",
+        lead="All runs. Sums, trends and losses use the runs of the current recipe and exclude superseded runs.",
         verdict=show_verdict(store.verdict, store.changes, groups) if current else None,
         numbers=_make_numbers(store, current),
         warnings=[] if current else [problem],
@@ -227,8 +218,8 @@ def store_report(store: StoreFacts) -> str:
     )
 
 
-def _make_numbers(store: StoreFacts, current: Sequence[StoredRun]) -> list[Number]:
-    facts = [run.facts for run in current if run.facts]
+def _make_numbers(store: StoreFacts, current: Sequence[RunRow]) -> list[Number]:
+    facts = [run.facts for run in current]
     driven_m, kept_m = (
         math.fsum(run_facts.driven_m for run_facts in facts),
         math.fsum(run_facts.kept_m for run_facts in facts),
@@ -245,16 +236,16 @@ def _make_numbers(store: StoreFacts, current: Sequence[StoredRun]) -> list[Numbe
     ]
 
 
-def _make_table_section(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
+def _make_table_section(store: StoreFacts, runs: Sequence[RunRow]) -> list[Section]:
     if not runs:
         return []
     names = name_datasets(store.datasets)
     rows = [
         (
-            Link(run.run_id, run.href) if run.href else run.run_id,
+            Link(run.facts.run_id, run.href) if run.href else run.facts.run_id,
             format_day(run.facts),
-            run.facts.robot if run.facts else "",
-            f"superseded by {run.facts.superseded_by}" if run.facts and run.facts.superseded_by else run.state,
+            run.facts.robot,
+            f"superseded by {run.facts.superseded_by}" if run.facts.superseded_by else run.state,
             ", ".join(names[number] for number in run.datasets),
             *("" if cell is None else cell for cell in run.row([])[6:13]),
         )
@@ -266,14 +257,14 @@ def _make_table_section(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Se
     return [Section("All runs", text, header=_COLUMNS, rows=rows, controls="store.html")]
 
 
-def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
+def _make_drift_sections(runs: Sequence[RunRow]) -> list[Section]:
     """Return the plots over time; the page's script fills them."""
-    dated = [run for run in runs if run.facts and run.facts.start_ns is not None]
+    dated = [run for run in runs if run.facts.start_ns is not None]
     is_known = {
         "metres used [%]": ("used", any(run.used_share is not None for run in dated)),
         "noise floor of E [%]": ("floor", any(run.floor is not None for run in dated)),
-        "idle power [W]": ("idle", any(run.facts and run.facts.idle_watt is not None for run in dated)),
-        "term of physics": ("term", any(run.facts and run.facts.physics for run in dated)),
+        "idle power [W]": ("idle", any(run.facts.idle_watt is not None for run in dated)),
+        "term of physics": ("term", any(run.facts.physics for run in dated)),
     }
     names = {name: label for label, (name, known) in is_known.items() if known}
     if not names:
@@ -311,14 +302,14 @@ def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
     return [Section("Trends over time", text, plots=plots, controls="store-drift.html" if "term" in names else "")]
 
 
-def _list_robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
+def _list_robots(runs: Sequence[RunRow]) -> list[tuple[str, str]]:
     """Return the robots with their colours, those of most runs first."""
-    counts = Counter(run.facts.robot for run in runs if run.facts)
+    counts = Counter(run.facts.robot for run in runs)
     return [(robot, CLASS_COLOURS[n % len(CLASS_COLOURS)]) for n, (robot, _) in enumerate(counts.most_common())]
 
 
-def _make_datasets_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
-    current_runs = {(run.run_id, run.recipe_id) for run in runs if run.is_current}
+def _make_datasets_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[Section]:
+    current_runs = {(run.facts.run_id, run.facts.recipe_id) for run in runs if run.is_current}
     rows = [
         (
             Link(dataset.out, dataset.page) if dataset.page else dataset.out,
@@ -332,15 +323,17 @@ def _make_datasets_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> lis
     return [Section("Datasets", "Datasets that were built from this store.", header=header, rows=rows)] if rows else []
 
 
-def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
-    """Return the logs without a run, and the runs that are damaged or cannot be read."""
+def _make_problem_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[Section]:
+    """Return the logs without a run, the runs that are damaged or cannot be read, and damaged documents."""
     rows = [(log.log, log.state, log.why) for log in store.failed]
+    rows += [(document, "damaged", "its bytes have changed since it was written") for document in store.damaged]
     for run in runs:
-        if run.facts is None or (run.is_current and run.facts.defect):
-            line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
-            if run.facts:
-                line = describe_finding((*run.facts.damage, *select_problems(run.facts.findings))[0])
-            rows.append((run.run_id, run.state, line))
+        facts = run.facts
+        if run.is_current and facts.defect:
+            line = describe_finding((*facts.damage, *select_problems(facts.findings))[0])
+            rows.append((facts.run_id, run.state, line))
+        elif run.state == _INCOMPLETE or facts.data_model_version != DATA_MODEL_VERSION:
+            rows.append((facts.run_id, run.state, "ingest its log again"))
     if not rows:
         return []
     text = "Use 'tcpipe acknowledge' for problems that cannot be repaired."
@@ -350,8 +343,8 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
     return [Section("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)]
 
 
-def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
-    terms = sorted({term for run in runs if run.facts for term in run.facts.physics if not term.startswith("idle")})
+def _make_data(store: StoreFacts, runs: Sequence[RunRow]) -> Json:
+    terms = sorted({term for run in runs for term in run.facts.physics if not term.startswith("idle")})
     return {
         "fields": list(_FIELDS),
         "rows": [run.row(terms) for run in runs],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import shapely
@@ -29,6 +29,9 @@ CLOSE = 1.05
 
 PLACES = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 """Columns of a chord's ends."""
+
+LOCAL_PLACES = ("start_x_m", "start_y_m", "end_x_m", "end_y_m")
+"""The same in a dataset without coordinates, where all runs have one frame."""
 
 _M_A_DEG = 111_195.0  # of a great circle: to half a per cent
 
@@ -107,21 +110,26 @@ def _audit_split(name: str, held: Ints, run: Ints, train: Ground, crossing: int)
     )
 
 
-def compute_middles_deg(ends: Mapping[str, NDArray[np.generic]]) -> Floats:
-    """Return lon, lat [deg] of the middles of chords, shape (N, 2), by the columns `PLACES`."""
-    x0, y0, x1, y1 = (ends[name].astype(np.float64) for name in PLACES)
+def compute_middles(ends: Sequence[NDArray[np.generic]]) -> Floats:
+    """Return the middles of chords, shape (N, 2), by the columns `PLACES` [deg] or `LOCAL_PLACES` [m]."""
+    x0, y0, x1, y1 = (end.astype(np.float64) for end in ends)
     return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])
 
 
-def are_near(queries_deg: Floats, references_deg: Floats, *, within_m: float) -> NDArray[np.bool_]:
-    """Return which of ``queries``, lon, lat [deg], shape (N, 2), are at most so far from one of ``references``; NaN is near nothing."""
-    scale = _M_A_DEG * np.array([np.cos(np.radians(np.nanmean(queries_deg[:, 1]))) if len(queries_deg) else 1.0, 1.0])
-    known, others = np.isfinite(queries_deg).all(axis=1), references_deg[np.isfinite(references_deg).all(axis=1)]
-    found = np.zeros(len(queries_deg), np.bool_)
+def are_near(queries: Floats, references: Floats, *, within_m: float, in_degrees: bool) -> NDArray[np.bool_]:
+    """Return which of ``queries``, shape (N, 2), are at most so far from one of ``references``; NaN is near nothing.
+
+    Both are lon, lat [deg] if ``in_degrees``, else x, y [m].
+    """
+    scale = np.ones(2)
+    if in_degrees and len(queries):
+        scale = _M_A_DEG * np.array([np.cos(np.radians(np.nanmean(queries[:, 1]))), 1.0])
+    known, others = np.isfinite(queries).all(axis=1), references[np.isfinite(references).all(axis=1)]
+    found = np.zeros(len(queries), np.bool_)
     if known.any() and len(others):
         origin = others[0]
         tree = cKDTree((others - origin) * scale)
-        apart_m, _ = tree.query((queries_deg[known] - origin) * scale, distance_upper_bound=within_m)
+        apart_m, _ = tree.query((queries[known] - origin) * scale, distance_upper_bound=within_m)
         found[known] = np.isfinite(apart_m)
     return found
 

@@ -1,4 +1,4 @@
-"""Facts that each stage records: run.json has those of reading, manifest.json all, under the same names.
+"""Facts that each stage records; the manifest of a run has all of them, under the same names.
 
 Counts and metres are by role, by reason or by entry of the distance breakdown. A number that is None is unknown.
 """

@@ -51,7 +51,7 @@ class Entry:
     thresholds : numbers that decide whether the finding is made; the suffix is the unit.
     flag : the quality bit that marks segments for the same reason; "" for none.
     is_problem : whether it makes ``tcpipe ingest`` exit with 3 until it is acknowledged.
-    public : numbers and names that a redacted dataset keeps.
+    public : numbers and names that a dataset without coordinates keeps.
     words : other words under which readers search.
     """
 

@@ -37,6 +37,9 @@ def describe_other_data_model(where: str, version: str) -> str:
 GEOMETRY = "geometry"
 """Column with the place of a row for other tools (GeoParquet)."""
 
+COORDINATES = (*(f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")), GEOMETRY)
+"""Columns of segments and samples that state where on Earth they are."""
+
 _METADATA_KEY = b"tcpipe"
 
 _F64 = pa.float64()

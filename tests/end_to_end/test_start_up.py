@@ -1,10 +1,13 @@
-"""What an ingest loads: nothing heavy that it does not use, and nothing twice."""
+"""What an ingest, and a build with nothing to do, load: nothing heavy that they do not use, and nothing twice."""
 
 import subprocess
 import sys
 
+import numpy as np
 from simulated_streams import log_of
+from synthetic_store import add_run, lanes, open_world, segments
 
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.simulation import make_tiny
 
 UNUSED = {
@@ -39,3 +42,21 @@ def test_where_workers_do_the_work_their_parent_loads_no_kernel(tmp_path):
     for log in logs:
         log.write_bytes(log.name.encode())
     assert not loaded(tmp_path, 2, *logs) & (UNUSED | {"numba", "scipy"})
+
+
+BUILD = """
+import sys
+import tcpipe.cli
+from tcpipe.pipeline.dataset.build import build_dataset
+assert build_dataset(sys.argv[1], store=sys.argv[2]).status == "unchanged"
+print(*sorted(sys.modules))
+"""
+
+
+def test_a_build_with_nothing_to_do_loads_nothing_that_writes_a_dataset(tmp_path):
+    store, out = open_world(tmp_path), tmp_path / "dataset"
+    add_run(store, "a", segments("a", *lanes(np.array([-3.0, 3.0]), -8.0, 8.0)))
+    build_dataset(out, store=store.root)
+    command = [sys.executable, "-c", BUILD, out, store.root]
+    modules = set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout.split())
+    assert not modules & (UNUSED - {"shapely"} | {"numba", "scipy", "bokeh", "PIL"})

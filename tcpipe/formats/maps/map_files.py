@@ -36,10 +36,10 @@ from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
 from tcpipe.formats.bucket_directories import FetchedShards
+from tcpipe.formats.file_checks import prove_files
 from tcpipe.formats.integrity import read_checksums
 from tcpipe.formats.json_files import convert_record, parse_typed, read_json, to_plain
 from tcpipe.formats.maps.map_facts import Description, MapFacts, MapSummary, describe_layer, make_cf_flags, read_layers
-from tcpipe.formats.place import prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
 from tcpipe.tables.facts import LEFT_OUT

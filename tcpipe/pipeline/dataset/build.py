@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Collection, Container, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, UsageError, clean_lines, list_first
+from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
+from tcpipe.execution import refuse_import_of_script
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
-from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
-from tcpipe.formats.commits import CallRecord, Dataset, Entries
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -23,27 +22,20 @@ from tcpipe.formats.dataset_files import (
     read_card,
     read_intact_card,
 )
+from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
-from tcpipe.formats.place import open_place
+from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
+from tcpipe.formats.store_records import Output
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.calls import (
-    BUILD,
-    Estimate,
-    LogWriter,
-    commit_call,
-    estimate,
-    open_log,
-    start_stopwatch,
-)
-from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options
+from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
+from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
-from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.store import open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
 from tcpipe.tables.options import as_function
 
@@ -101,64 +93,159 @@ class BuildResult:
         return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
-        if self.card is None or self.card.redaction is None:
+        if self.card is None or not self.card.without_coordinates:
             return []
-        publish = f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        return [*self.card.redaction.lines(), publish]
+        return [f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
     Findings on damaged runs (which are excluded), runs to be ingested again, runs that only the replaced dataset has, and empty splits make
-    the exit code 3. The bytes do not depend on ``jobs``.
+    the exit code 3, unless the call before has reported them. The bytes do not depend on ``jobs``.
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
-    measure, ruling = start_stopwatch(), merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
-    out, store, dry_run = options.out, options.store, options.dry_run
+    refuse_import_of_script(options.jobs)
+    out = options.out
     place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
-    opened = open_store(store)
-    log = open_log(opened)
-    if isinstance(place, Path) and not dry_run:
-        clear_beside(place)
+    opened = open_store(options.store)
+    if options.dry_run:
+        return _plan(opened.scan(), opened, options, place)
+    where = make_absolute(place)
+    with record_call(opened, BUILD, [where], jobs=options.jobs) as call:
+        before = call.state.outputs.get(where) or Output(where=where)
+        now = replace(before, options=_describe_options(options), at=call.call.begin)
+        try:
+            result, inputs = _build(call, options, place, reported=before.reported)
+        except TcpipeError as error:
+            message = "\n".join(error.problems)
+            _record_output(call, replace(now, exit_code=error.exit_code, message=message), before)
+            raise
+        runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
+        reported = tuple(sorted(map(_name_finding, select_problems(result.findings))))
+        made = replace(
+            now, inputs=inputs.digest, parts=inputs.made_from.parts, runs=runs, exit_code=result.exit_code, message="",
+            reported=reported,
+        )  # fmt: skip
+        _record_output(call, made, before)
+    return result
+
+
+def _plan(state: State, store: Store, options: BuildDatasetOptions, place: Path | str) -> BuildResult:
+    """Return what a call would do."""
+    job = _read_job(state, store, options, place)
+    if job.is_made and job.known is not None:
+        return _make_result(place, "unchanged", job.known, job.left_out, ())
+    most = sum(run.facts.segments - int(job.inputs.again[run.run_id].sum()) for run in job.inputs.runs)
+    expected = estimate(list_ended_calls(state), BUILD, most, jobs=options.jobs)
+    code = 3 if select_problems(job.inputs.findings) else 0
+    return BuildResult(str(place), "planned", job.inputs.findings, exit_code=code, estimate=expected)
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What a call has to do."""
+
+    marks: BuildOptions
+    inputs: Inputs
+    left_out: tuple[Finding, ...]
+    """On excluded runs."""
+    known: DatasetCard | None
+    """The card of the dataset that lies there."""
+    is_made: bool
+    """Whether that is what would be made now."""
+
+
+def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: Path | str) -> _Job:
     known, is_intact = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
-    marks = read_build_options(options, ruling, place)
-    inputs = choose_inputs(opened, marks, log.state)
+    marks = read_build_options(options, merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed), place)
+    inputs = choose_inputs(store, marks, state)
     left_out = _find_left_out(inputs, known, marks, options.min_runs)
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
-    if is_intact and known is not None and known.inputs == inputs.digest:
-        result = _make_result(place, "unchanged", known, left_out)
-        _commit_references(log, _describe_dataset(result, inputs))
-        return result
+    is_made = is_intact and known is not None and known.inputs == inputs.digest
     others = [] if known is None or known.inputs == inputs.digest else find_other_options(known, marks, inputs)
     if others and not options.force:
         what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
         raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
-    if dry_run:
-        if isinstance(place, str):
-            read_generations(open_place(place), CARD)
-        most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
-        expected = estimate(log.state.calls, BUILD, most, jobs=options.jobs)
-        code = 3 if select_problems(inputs.findings) else 0
-        return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
+    return _Job(marks, inputs, left_out, known, is_made)
+
+
+def _build(
+    call: RunningCall, options: BuildDatasetOptions, place: Path | str, *, reported: Collection[str]
+) -> tuple[BuildResult, Inputs]:
+    """Write the dataset, unless it is there; return the result and its inputs. ``reported`` are findings that are known."""
+    if isinstance(place, Path):
+        clear_beside(place)
+    job = _read_job(call.state, call.store, options, place)
+    if job.is_made and job.known is not None:
+        result = _make_result(place, "unchanged", job.known, job.left_out, reported)
+        call.result |= {"exit_code": result.exit_code, "counts": {"unchanged": 1}}
+        return result, job.inputs
+    prove_maps(call.store, job.inputs.map_records)
     from tcpipe.pipeline.dataset.writing import write_dataset  # noqa: PLC0415  slow to import, and often nothing is to be built
 
-    output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
+    output = write_output(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
-    with commit_call(log, BUILD, [make_absolute(place)]) as call:
-        with output as directory:
-            card = write_dataset(directory, inputs, marks, options.jobs)
-            _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
-        result = _make_result(place, "done", card, left_out)
-        counts = {"runs": len(inputs.runs), "samples": card.samples}
-        written = sum(checksum.size_bytes for checksum in card.checksums.values())
-        took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
-        dataset = _describe_dataset(result, inputs)
-        replaced = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
-        call.kind = "built"
-        call.end = Entries(datasets=(dataset,), forgotten=replaced, calls=(measure(took),))
-    return result
+    with output as directory:
+        card = write_dataset(directory, job.inputs, job.marks, options.jobs)
+        _refuse_others_since(place, {job.known.inputs if job.known else None, job.inputs.digest})
+    result = _make_result(place, "done", card, job.left_out, reported)
+    call.result |= {
+        "exit_code": result.exit_code,
+        "counts": {"runs": len(job.inputs.runs), "samples": card.samples},
+        "written_bytes": sum(checksum.size_bytes for checksum in card.checksums.values()),
+    }
+    return result, job.inputs
+
+
+def _describe_options(options: BuildDatasetOptions) -> dict[str, object]:
+    """Return the options of a call as JSON values, files as absolute paths, so that it can be planned again."""
+    found = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name not in _NOT_RECORDED}
+    for name in ("split", "keep_split", "recipe"):
+        value = found[name]
+        found[name] = make_absolute(value) if isinstance(value, str | Path) else None if value is None else _IN_PYTHON
+    for name in ("covariates", "exclude"):
+        given = [found[name]] if isinstance(found[name], str | Path) else found[name]
+        found[name] = [make_absolute(path) for path in given]
+    return {name: value for name, value in found.items() if value not in (None, (), [], {}, False)}
+
+
+_NOT_RECORDED = ("out", "store", "jobs", "dry_run", "force")
+"""Options of a call that do not decide what the dataset is made of."""
+_IN_PYTHON = "a recipe in Python"
+
+
+def find_changed_parts(store: Store, state: State, output: Output) -> str:
+    """Return which parts of a dataset would be others if it were built now, or why it cannot be planned; "" if nothing would change.
+
+    A dataset whose recipe was given in Python is taken for unchanged.
+    """
+    if not output.inputs or output.options.get("recipe") == _IN_PYTHON:
+        return ""
+    options = BuildDatasetOptions(output.where, store=store.root, **output.options)  # type: ignore[arg-type]  # as recorded
+    try:
+        recipe = merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
+        parts = plan_inputs(store, read_build_options(options, recipe, output.where), state).parts
+    except TcpipeError as error:
+        return error.problems[0]
+    except OSError as error:
+        return f"{error.filename}: {error.strerror}"
+    return ", ".join(name.replace("_", " ") for name, part in parts.items() if output.parts.get(name) != part)
+
+
+def _record_output(call: RunningCall, output: Output, before: Output) -> None:
+    """Write what an output is made of and how the last call for it ended; nothing if that is known."""
+    if replace(output, at="") == replace(before, at=""):
+        return
+    try:
+        call.store.put(call.state, "outputs", make_key(output.where), output)
+    except StoreError as error:
+        logger.warning("%s; so 'tcpipe status' and 'tcpipe prune' do not know this dataset", error.problems[0])
+
+
+def _name_finding(finding: Finding) -> str:
+    return f"{finding.code} {finding.subject.kind} {finding.subject.name}"
 
 
 build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
@@ -178,25 +265,12 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         )
 
 
-def _describe_dataset(result: BuildResult, inputs: Inputs) -> Dataset:
-    return Dataset(make_absolute(result.path), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
-
-
-def _commit_references(log: LogWriter, dataset: Dataset) -> None:
-    """Commit the runs of an earlier dataset unless the log has them: ``tcpipe prune`` keeps what a dataset refers to."""
-    if log.state.datasets.get((dataset.out, dataset.inputs)) != dataset:
-        try:
-            log.commit("built", Entries(datasets=(dataset,)))
-        except StoreError as error:
-            logger.warning("%s; so 'tcpipe prune' does not know the runs of this dataset", error.problems[0])
-
-
 def _find_left_out(
     inputs: Inputs, known: DatasetCard | None, options: BuildOptions, min_runs: int | None
 ) -> tuple[Finding, ...]:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
-    before = () if known is None or known.redaction else known.runs
+    before = () if known is None or known.without_coordinates else known.runs
     fewer = (*chosen.missing, *find_gone_runs(before, chosen, robot=options.robot, tags=options.tags))
     if min_runs is None:
         return (*chosen.damaged, *fewer)
@@ -209,7 +283,7 @@ def _find_left_out(
 
 def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     """Return the card of the dataset at a URL, if there is one, and whether it is intact."""
-    open_place(url).check()
+    check_kind(url, CARD)
     if (found := find_newest(url, [CARD])) is None:
         return None, False
     with _name_remedy(url):
@@ -218,10 +292,13 @@ def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     return card, fetched is not None and fetched.is_complete()
 
 
-def _make_result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
-    """Return the result, with today's findings on excluded runs in place of the card's."""
+def _make_result(
+    place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding], reported: Collection[str]
+) -> BuildResult:
+    """Return the result, with today's findings on excluded runs in place of the card's; those ``reported`` before are no news."""
     findings = (*left_out, *(finding for finding in card.findings if finding.code not in CHOICE_CODES))
-    return BuildResult(str(place), status, findings, card, 3 if select_problems(findings) else 0)
+    is_news = any(_name_finding(finding) not in reported for finding in select_problems(findings))
+    return BuildResult(str(place), status, findings, card, 3 if is_news else 0)
 
 
 def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:

@@ -49,7 +49,7 @@ from tcpipe.formats.parquet import (
 )
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.inputs import Inputs
@@ -73,7 +73,7 @@ logger = logging.getLogger("tcpipe")
 
 
 def _pool_segments(
-    runs: Sequence[RunDirectory], directory: Path, *, again: Mapping[str, NDArray[np.bool_]]
+    runs: Sequence[StoredRun], directory: Path, *, again: Mapping[str, NDArray[np.bool_]]
 ) -> tuple[pa.Table, dict[str, float], list[Finding]]:
     """Return the segments that can become samples, mapped from a file in ``directory``, and metres by reason, which sum to the odometers.
 
@@ -109,7 +109,7 @@ def _pool_segments(
 
 
 def _iterate_usable(
-    runs: Sequence[RunDirectory],
+    runs: Sequence[StoredRun],
     again: Mapping[str, NDArray[np.bool_]],
     lacks: dict[str, list[str]],
     lost: Mapping[Loss, list[float]],
@@ -161,13 +161,15 @@ class SampleTable:
     """Quality bits of each patch of ``sampled`` beyond those of its segment."""
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
-    redact: Callable[[pa.Table], pa.Table] | None = None
-    """Gives rows public names and places; None where theirs are."""
+    convert: Callable[[pa.Table], pa.Table] | None = None
+    """Makes rows with coordinates those of a dataset without; None where the dataset has them."""
 
     @property
     def schema(self) -> pa.Schema:
-        """The samples' columns, with the extent of their places."""
+        """The samples' columns, with the extent of their coordinates."""
         bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
+        if self.convert is not None:
+            return self.convert(bare).schema
         pieces = (
             self._centres_deg(self.patch[first : first + ROWS_PER_GROUP])
             for first in range(0, len(self), ROWS_PER_GROUP)
@@ -186,7 +188,12 @@ class SampleTable:
         return len(self.patch)
 
     def take(self, rows: NDArray[np.int64]) -> pa.Table:
-        """Return rows of the samples table (schema SAMPLES, and the added columns behind it)."""
+        """Return rows of the samples table as the dataset has them."""
+        table = self._make_rows(rows)
+        return table if self.convert is None else self.convert(table)
+
+    def _make_rows(self, rows: NDArray[np.int64]) -> pa.Table:
+        """Return rows of the samples table with coordinates (schema SAMPLES, and the added columns behind it)."""
         at = self.patch[rows]
         assigned = self.assigned.select(at)
         rows_of_segments = self.sampled.kept[at]
@@ -213,7 +220,7 @@ class SampleTable:
         added = take_rows(self.added, rows_of_segments)
         for field in added.schema:
             table = table.append_column(field, added.column(field.name))
-        return add_geo_metadata(table if self.redact is None else self.redact(table), "Point", centres)
+        return add_geo_metadata(table, "Point", centres)
 
     def pieces(self) -> Iterator[pa.Table]:
         """Yield the table in pieces of `ROWS_PER_GROUP`; at least one, which may be empty."""

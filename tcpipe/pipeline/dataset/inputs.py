@@ -10,7 +10,8 @@ import json
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -20,26 +21,32 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.bucket_directories import FetchedShards
-from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import DatasetCard, RunSource
+from tcpipe.formats.dataset_inputs import (
+    Change,
+    DatasetInputs,
+    ExclusionInputs,
+    RunInputs,
+    compare_records,
+    format_value,
+)
+from tcpipe.formats.documents import BLOBS, State
 from tcpipe.formats.geojson import regions_to_json
-from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
-from tcpipe.formats.json_files import convert_record, digest, to_plain
+from tcpipe.formats.integrity import compute_checksums
+from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.run_documents import LogOrigin, MapDocument
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.runs import RunFacts
+from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.store import Store
 from tcpipe.tables.arrays import encode_rows, number_column
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
-from tcpipe.tables.levels import TABLES_VERSION
+from tcpipe.tables.levels import RESULTS_VERSION, TABLES_VERSION
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.dataset.sampling import MapPlaces
@@ -47,21 +54,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Runs, their entries of the card, the maps, the hash over all inputs, and findings."""
+    """Runs, their entries of the card, the maps, the record of all inputs, and findings."""
 
-    runs: tuple[RunDirectory, ...]
+    runs: tuple[StoredRun, ...]
     sources: tuple[RunSource, ...]
-    map_names: tuple[str, ...]
-    """In order of priority where maps overlap."""
+    map_records: tuple[StoredMap, ...]
     maps: MapPlaces
-    map_sha256: tuple[str, ...]
-    """Over the checksums of each map's files."""
+    made_from: DatasetInputs
+    digest: str
+    """Of ``made_from``."""
     again: Mapping[str, NDArray[np.bool_]]
     """By run: segments that another run has too."""
-    digest: str
     chosen: SelectedRuns
     findings: tuple[Finding, ...]
     """On the choice of runs."""
+
+    @property
+    def map_names(self) -> tuple[str, ...]:
+        """In order of priority where maps overlap."""
+        return self.made_from.map_names
 
 
 def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
@@ -73,39 +84,52 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
     except DatasetError as error:
         problems += error.problems
     try:
-        names = choose_maps(store, options.map_names)
+        records = choose_maps(store, state, options.map_names)
     except DatasetError as error:
         problems += error.problems
     if problems:
         raise DatasetError(*problems)
-    once = remove_duplicates(store, chosen.runs, chosen.logs)
-    runs = once.runs
-    documents = tuple(store.map_document(name) for name in names)
-    maps = partial(_map_files, store, documents)
-    map_sha256 = tuple(
-        _map_digest(name, path) if fetched is None else _digest_of(document.checksums, document.zarr)
-        for name, document, (path, fetched) in zip(names, documents, maps(), strict=True)
-    )
-    sources = tuple(_make_source(run, chosen.logs[run.run_id]) for run in runs)
-    fingerprint = digest(
-        {
-            "versions": [__version__, TABLES_VERSION],
-            "recipe": options.recipe,
-            "runs": [{key: value for key, value in to_plain(run).items() if key != "samples"} for run in sources],
-            "maps": list(zip(names, map_sha256, strict=True)),
-            "region": options.region,
-            "format": options.file_format,
-            "covariates": [(table.name, table.checksum) for table in options.covariates],
-            "excluded": [(ids.name, ids.checksum, ids.reason) for ids in options.exclusions],
-            "kept_split": None if options.earlier is None else _hash_table(options.earlier),
-        }
-    )
-    fingerprint = digest(("redacted", fingerprint)) if options.redact else fingerprint
+    made_from = _describe_inputs(options, chosen.runs, records)
+    once = remove_duplicates(chosen.runs)
+    maps = partial(_find_maps, store, records)
     findings = (*chosen.findings, *once.findings)
-    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings)
+    sources = tuple(map(_make_source, once.runs))
+    return Inputs(once.runs, sources, records, maps, made_from, made_from.digest, once.again, chosen, findings)
 
 
-def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
+def plan_inputs(store: Store, options: BuildOptions, state: State) -> DatasetInputs:
+    """Return what a dataset would be made of, by the documents alone; `DatasetError` as `choose_inputs`."""
+    chosen = choose_runs(store, options.recipe, state=state, robot=options.robot, tags=options.tags, prove=False)
+    return _describe_inputs(options, chosen.runs, choose_maps(store, state, options.map_names))
+
+
+def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Sequence[StoredMap]) -> DatasetInputs:
+    regions = {} if options.regions is None else regions_to_json(options.regions)
+    return DatasetInputs(
+        versions={"results": str(RESULTS_VERSION), "tables": TABLES_VERSION},
+        recipe=options.recipe,
+        runs={run.run_id: _describe_run(run) for run in runs},
+        robots=tuple(sorted({run.facts.robot for run in runs})),
+        tags=dict(sorted(options.tags.items())),
+        maps={record.name: _hash_files(record) for record in maps},
+        map_names=tuple(record.name for record in maps),
+        region=None if options.regions is None else {kind: digest(polygon) for kind, polygon in regions.items()},
+        covariates={table.name: table.checksum.sha256 for table in options.covariates},
+        exclusions={ids.name: ExclusionInputs(ids.checksum.sha256, ids.reason) for ids in options.exclusions},
+        kept_split=None if options.earlier is None else _hash_table(options.earlier),
+        file_format=options.file_format,
+        without_coordinates=options.without_coordinates,
+    )
+
+
+def _describe_run(run: StoredRun) -> RunInputs:
+    log, tables = run.facts.log, run.facts.tables
+    names = tuple(Path(path).name for path in log.paths)
+    named = {"logs": names, "sha256": log.sha256, "segments_sha256": tables["segments.parquet"].sha256}
+    return convert_record(run.facts, RunInputs, **named)
+
+
+def _refuse_without_segments(runs: Sequence[StoredRun]) -> None:
     if any(run.facts.segments for run in runs):
         return
     lost_m = Counter[str]()
@@ -120,42 +144,35 @@ def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
     )
 
 
-def _map_files(store: Store, maps: Sequence[MapDocument]) -> tuple[tuple[Path, FetchedShards | None], ...]:
+def _find_maps(store: Store, maps: Sequence[StoredMap]) -> tuple[tuple[Path, FetchedShards | None], ...]:
     return tuple(map(store.map_at, maps))
 
 
-def _map_digest(name: str, path: Path) -> str:
-    """Return one hash over a map's files; `MapError` if one was changed or lost, which would read as no data."""
-    found, wrong = compute_checksums(path), list[str]()
-    try:
-        recorded = read_checksums(path)
-        names = {*found, *recorded} - {CHECKSUMS}
-        wrong = [str(path / name) for name in sorted(names) if found.get(name) != recorded.get(name)]
-    except StoreError as error:
-        wrong = list(error.problems)
-    if wrong:
-        raise MapError(
-            f"map {name}: changed since it was written: {list_first(wrong)} ('tcpipe verify {path}' lists everything); "
-            "add the map again with --force"
-        )
-    return _digest_of(found)
+def prove_maps(store: Store, maps: Sequence[StoredMap]) -> None:
+    """Compare the files of maps on disk with their documents; `MapError` if one was changed or lost, which would read as no data."""
+    root = store.place.path
+    if root is None:  # what is read from a bucket is verified when it is fetched
+        return
+    for record in maps:
+        folder = root / BLOBS / record.blob
+        found = compute_checksums(folder)
+        if wrong := sorted(name for name in {*found, *record.files} if found.get(name) != record.files.get(name)):
+            raise MapError(
+                f"map {record.name}: changed since it was written: {list_first([str(folder / name) for name in wrong])} "
+                f"('tcpipe verify {store.root}' lists everything); add the map again with --force"
+            )
 
 
-def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
-    """Return one hash over the checksums of files, or of those below a directory."""
-    start = f"{below}/" if below else ""
-    return digest(
-        {
-            name.removeprefix(start): (checksum.size_bytes, checksum.sha256)
-            for name, checksum in files.items()
-            if name.startswith(start)
-        }
-    )
+def _hash_files(record: StoredMap) -> str:
+    """Return one hash over the checksums of the files of a map."""
+    start = f"{record.name}.zarr/"
+    files = {name.removeprefix(start): each for name, each in record.files.items() if name.startswith(start)}
+    return digest({name: (checksum.size_bytes, checksum.sha256) for name, checksum in files.items()})
 
 
-def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
+def choose_maps(store: Store, state: State, names: Sequence[str]) -> tuple[StoredMap, ...]:
     """Return the maps to sample: the named ones in their order, or the only one."""
-    maps = store.maps()
+    maps = state.maps
     if not maps:
         raise DatasetError(f"{store.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
     unknown = [name for name in names if name not in maps]
@@ -166,12 +183,13 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
             f"{store.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map, or several; the first has "
             "priority where they overlap"
         )
-    return tuple(dict.fromkeys(names)) or (maps[0],)
+    return tuple(maps[name] for name in dict.fromkeys(names)) or tuple(maps.values())
 
 
-def _make_source(run: RunDirectory, log: LogOrigin) -> RunSource:
+def _make_source(run: StoredRun) -> RunSource:
     """Return the card's entry of a run."""
-    named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
+    log = run.facts.log
+    named = {"sha256": log.sha256, "segments_sha256": run.facts.tables["segments.parquet"].sha256}
     return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
 
 
@@ -183,59 +201,59 @@ def _hash_table(table: pa.Table) -> str:
     return found.hexdigest()
 
 
-_LONGEST_VALUE = 80
+_OPTIONS = {
+    "robots": "--robot",
+    "tags": "--tag",
+    "map_names": "--map",
+    "region": "--split",
+    "covariates": "--covariates",
+    "exclusions": "--exclude",
+    "kept_split": "--keep-split",
+    "file_format": "--format",
+    "without_coordinates": "--without-coordinates",
+}
+"""Options of a build, by the field of `DatasetInputs` that each rules."""
 
 
 def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> list[str]:
     """Return a line with both values for each option of a build that differs from those of the dataset it would replace."""
-    if card.redaction is not None or options.redact:
-        if bool(card.redaction) != options.redact:
-            return [_format_difference("--redact", bool(card.redaction), options.redact)]
-        return ["--redact: a redacted dataset omits its maps, region, tags and recipe, so that they cannot be compared"]
-    return [
-        _format_difference(name, was, now) for name, was, now in _iterate_options(card, options, inputs) if was != now
-    ]
-
-
-def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> Iterator[tuple[str, object, object]]:
-    """Yield each option with its value in the card and its value now."""
-    was, now = flatten_recipe(card.recipe), flatten_recipe(options.recipe)
-    keys = sorted({*was, *now} - {"robot"})  # the robot of the runs counts, whoever named it
-    yield from ((f"recipe {key}", was.get(key), now.get(key)) for key in keys)
-    yield "--robot", card.robots, tuple(sorted({run.robot for run in inputs.sources})) if card.robots else ()
-    yield "--tag", dict(card.run_tags or {}), dict(options.tags)
-    yield "--map", tuple(entry.name for entry in card.maps), inputs.map_names
-    regions = None if options.regions is None else regions_to_json(options.regions)
-    yield "--split", _format_region(card.split.region), _format_region(regions)
-    yield (
-        "--covariates",
-        tuple(table.name for table in card.covariates),
-        tuple(table.name for table in options.covariates),
+    was, now = card.made_from, inputs.made_from
+    if was.without_coordinates and now.without_coordinates:
+        return ["--without-coordinates: maps, region, tags and recipe are not stored and cannot be compared"]
+    is_other = was.without_coordinates != now.without_coordinates
+    names = ("without_coordinates",) if is_other else ("recipe", *_OPTIONS)
+    lines = (
+        _format_option(change, was, now)
+        for change in compare_records(was, now)
+        if change.path[0] in names and _is_option(change, options)
     )
-    yield "--exclude", tuple(table.name for table in card.exclusions), tuple(table.name for table in options.exclusions)
-    yield "--format", card.format, options.file_format
-    if not options.keeps_own_split:
-        yield "--keep-split", card.split.kept is not None, options.earlier is not None
+    return list(dict.fromkeys(lines))
 
 
-def _format_region(region: Mapping[str, object] | None) -> str | None:
-    """Return the kinds of a region's polygons and a digest of them."""
-    return None if region is None else f"{' and '.join(region)} ({digest(to_plain(region))[:8]})"
+def _is_option(change: Change, options: BuildOptions) -> bool:
+    """Return whether a change is of an option: a file may have other content, and the robot of the runs counts, whoever named it."""
+    if change.path[0] in ("covariates", "exclusions", "kept_split"):
+        is_own = change.path[0] == "kept_split" and options.keeps_own_split
+        return not is_own and None in (change.was, change.now)
+    return change.path != ("recipe", "robot")
 
 
-def _format_difference(name: str, was: object, now: object) -> str:
-    return f"{name}: {_format_value(was)} in the dataset, {_format_value(now)} now"
+def _format_option(change: Change, was: DatasetInputs, now: DatasetInputs) -> str:
+    field = change.path[0]
+    if field == "recipe":
+        return f"recipe {change.name}: {format_value(change.was)} in the dataset, {format_value(change.now)} now"
+    values = (_format_field(field, each) for each in (was, now))
+    return f"{_OPTIONS[field]}: {{}} in the dataset, {{}} now".format(*values)
 
 
-def _format_value(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, Mapping):
-        value = [f"{key}={item}" for key, item in value.items()]
-    if isinstance(value, list | tuple):
-        value = ", ".join(map(str, value))
-    text = "none" if value in (None, "") else str(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}… ({digest(text)[:8]})"
+def _format_field(field: str, record: DatasetInputs) -> str:
+    """Return the value of an option without the content of files: their names, whether there is one, the kinds of a region's polygons."""
+    value = getattr(record, field)
+    if field == "region" and value is not None:
+        value = f"{' and '.join(value)} ({digest(value)[:8]})"
+    elif field in ("covariates", "exclusions"):
+        value = tuple(value)
+    return format_value(value is not None if field == "kept_split" else value)
 
 
 _SAME_TIME_NS = 1_000_000_000
@@ -254,7 +272,7 @@ Mask = NDArray[np.bool_]
 class UniqueRuns:
     """Runs of which each drive is there once: ``again`` marks, by run, the segments that an earlier one in ``runs`` has too."""
 
-    runs: tuple[RunDirectory, ...]
+    runs: tuple[StoredRun, ...]
     again: Mapping[str, Mask]
     findings: tuple[Finding, ...]
 
@@ -268,14 +286,14 @@ class _SegmentPositions:
     lonlat_deg: NDArray[np.float64]
 
 
-def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[str, LogOrigin]) -> UniqueRuns:
+def remove_duplicates(runs: Sequence[StoredRun]) -> UniqueRuns:
     """Return the runs, by id, without second logs of a drive, and findings; of two, the first by id stays.
 
-    ``runs`` are all of one recipe; ``logs`` are by run.
+    ``runs`` are all of one recipe.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
     start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T
-    robot, kept = np.array([run.facts.robot for run in runs]), dict[int, RunDirectory]()
+    robot, kept = np.array([run.facts.robot for run in runs]), dict[int, StoredRun]()
 
     @lru_cache(maxsize=_WAYS)
     def way(index: int) -> _SegmentPositions:
@@ -285,7 +303,7 @@ def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[
     findings: list[Finding] = []
     by_sha256: dict[str, str] = {}
     for index, run in enumerate(runs):
-        twin = by_sha256.setdefault(logs[run.run_id].sha256, run.run_id)
+        twin = by_sha256.setdefault(run.facts.log.sha256, run.run_id)
         if twin != run.run_id:
             findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
@@ -294,12 +312,12 @@ def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[
         for earlier in np.flatnonzero((apart_ns <= _SAME_TIME_NS) & (robot[:index] == run.facts.robot)).tolist():
             if earlier in kept:
                 shared = _find_shared(way(index), way(earlier))
-                is_one = _is_one_drive(store, (run, kept[earlier])) if shared.any() else False
+                is_one = _is_one_drive((run, kept[earlier])) if shared.any() else False
                 if is_one:
                     twice |= shared
                     others.append(kept[earlier].run_id)
                 elif is_one is None:
-                    findings.append(_find_overlap(run, kept[earlier], int(shared.sum()), logs))
+                    findings.append(_find_overlap(run, kept[earlier], int(shared.sum())))
         if twice.any():
             findings.append(_find_twice(run, int(twice.sum()), others))
         if twice.all() and len(twice):
@@ -309,7 +327,7 @@ def remove_duplicates(store: Store, runs: Sequence[RunDirectory], logs: Mapping[
     return UniqueRuns(tuple(kept.values()), again, tuple(findings))
 
 
-def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Finding:
+def _find_twice(run: StoredRun, duplicates: int, others: Sequence[str]) -> Finding:
     return make_finding(
         "drive-recorded-twice",
         Subject("run", run.run_id),
@@ -319,9 +337,9 @@ def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Fi
     )
 
 
-def _find_overlap(run: RunDirectory, other: RunDirectory, shared: int, logs: Mapping[str, LogOrigin]) -> Finding:
+def _find_overlap(run: StoredRun, other: StoredRun, shared: int) -> Finding:
     """Return the question whether two runs are of one drive, with a command for each answer."""
-    own, others = (shlex.join(map(str, logs[each.run_id].paths)) for each in (run, other))
+    own, others = (shlex.join(each.facts.log.paths) for each in (run, other))
     remedies = (
         Remedy("two_robots", command=f"tcpipe ingest {own} --tag robot={run.run_id}"),
         Remedy("one_drive", command=f"tcpipe ingest {others} {own} --tag robot={other.run_id}"),
@@ -335,13 +353,13 @@ _COMPARED_ROLES = ("gnss", "pose", "wheel_odometry", "visual_odometry", "imu")
 _MIN_EQUAL_FRACTION, _MIN_VALUES = 0.5, 3
 
 
-def _is_one_drive(store: Store, pair: tuple[RunDirectory, RunDirectory]) -> bool | None:
+def _is_one_drive(pair: tuple[StoredRun, StoredRun]) -> bool | None:
     """Return whether two runs at one time and place are of one drive, None if that is unknown.
 
     One sensor with equal values proves one drive, other values of topics of one name prove two; else the tag ``robot`` decides.
     """
-    files = [store.find_stream_files(run.run_id) for run in pair]
-    sensors = [run.facts.log.sensors if run.facts.log else {} for run in pair]
+    files = [_find_streams(run) for run in pair]
+    sensors = [run.facts.sensors for run in pair]
     for role in (role for role in _COMPARED_ROLES if all(role in found for found in files)):
         fraction = _compute_equal_fraction([read_table(found[role]) for found in files])
         if fraction >= _MIN_EQUAL_FRACTION:
@@ -351,6 +369,13 @@ def _is_one_drive(store: Store, pair: tuple[RunDirectory, RunDirectory]) -> bool
             return False
     tags = [run.facts.tags.get("robot") for run in pair]
     return tags[0] == tags[1] if any(tags) else None
+
+
+def _find_streams(run: StoredRun) -> dict[str, Path]:
+    """Return the files of the streams of a run; none where one is not as it was written."""
+    with suppress(StoreError):
+        return run.stream_files()
+    return {}
 
 
 def _compute_equal_fraction(streams: Sequence[pa.Table]) -> float:
@@ -377,7 +402,7 @@ def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
     return facts.start_ns, facts.end_ns
 
 
-def _read_positions(run: RunDirectory) -> _SegmentPositions:
+def _read_positions(run: StoredRun) -> _SegmentPositions:
     names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
     table = run.table("segments", names)
     middle = [

@@ -16,7 +16,7 @@ from tcpipe.errors import MapError
 from tcpipe.formats.dataset_card import MapRegistration, Removal
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.motion.distance_breakdown import (
     Group,
     compute_interval_length_m,
@@ -69,7 +69,7 @@ _Spans = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]
 
 
 def register_runs(
-    runs: Sequence[RunDirectory], source: MapFile, recipe: Recipe
+    runs: Sequence[StoredRun], source: MapFile, recipe: Recipe
 ) -> tuple[tuple[MapRegistration, ...], list[Finding]]:
     """Return the map's registration against each run that crosses enough of it, and findings on misfits.
 
@@ -159,7 +159,7 @@ def _share_shift(tracks: Sequence[_Track], source: MapFile, *, is_wanted: bool) 
     return {track.run_id: given for (track, _), given in zip(fitting, shared, strict=True)}
 
 
-def _register(run: RunDirectory, source: MapFile, projection: Projection, config: SampleConfig) -> _Track:
+def _register(run: StoredRun, source: MapFile, projection: Projection, config: SampleConfig) -> _Track:
     table = run.table("track", _COLUMNS)
     lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(table, name) for name in _COLUMNS)
     std_m = np.hypot(x_std_m, y_std_m)
@@ -269,7 +269,7 @@ _Rows = NDArray[np.float64]
 
 
 def find_contradictions(
-    runs: Sequence[RunDirectory], segments: pa.Table, sampled: Sampled, map_names: Sequence[str], config: SampleConfig
+    runs: Sequence[StoredRun], segments: pa.Table, sampled: Sampled, map_names: Sequence[str], config: SampleConfig
 ) -> tuple[NDArray[np.uint32], list[Finding]]:
     """Return `Quality.MAP_CONTRADICTS_TRACK` or 0 of each patch, shape (N,), and findings on the largest clusters of such patches.
 
@@ -329,7 +329,7 @@ def _find_clusters(rows: NDArray[np.int64], excess: _Rows, sampled: Sampled, map
 
 
 def find_removed_by_ground(
-    runs: Sequence[RunDirectory],
+    runs: Sequence[StoredRun],
     segments: pa.Table,
     used: NDArray[np.int64],
     sources: Sequence[MapFile],
@@ -394,7 +394,7 @@ def _list_spans(segments: pa.Table, used: NDArray[np.int64]) -> dict[str, _Spans
 
 
 def _read_intervals(
-    run: RunDirectory, spans: _Spans, grounds: Sequence[_Ground]
+    run: StoredRun, spans: _Spans, grounds: Sequence[_Ground]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return length [m], reason, slope and class (ids as `find_classes_at`) of every interval of a run's track."""
     track = run.table("track", _TRACK_COLUMNS)

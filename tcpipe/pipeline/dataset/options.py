@@ -66,7 +66,7 @@ class BuildOptions:
     covariates: tuple[CovariateTable, ...]
     exclusions: tuple[ExcludedIds, ...]
     file_format: FileFormat
-    redact: bool
+    without_coordinates: bool
     earlier: pa.Table | None
     """Samples of an earlier dataset, which keep their split."""
     keeps_own_split: bool
@@ -87,7 +87,7 @@ def read_build_options(options: BuildDatasetOptions, recipe: Recipe, place: Path
         covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
         exclusions=read_exclusions(options.exclude, options.reason),
         file_format=options.file_format,
-        redact=options.redact,
+        without_coordinates=options.without_coordinates,
         earlier=None if keep_split is None else read_earlier_splits(keep_split),
         keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
     )
@@ -127,8 +127,8 @@ def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple
 def read_earlier_splits(dataset: str | Path) -> pa.Table:
     """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` for another path."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
-    if read_card(directory).redaction is not None:
+    if read_card(directory).without_coordinates:
         raise DatasetError(
-            f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"
+            f"{directory}: is without coordinates, its samples have other names; give the dataset with them (--keep-split)"
         )
     return read_samples(directory, ["sample_id", "split", "fold"])

@@ -21,7 +21,6 @@ from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file, take_rows
-from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled, Shifts, check_same_layers, sample_on_maps
@@ -65,7 +64,7 @@ class Spool:
 
     """
 
-    place: Place
+    directory: Path
     layers: Mapping[str, Layer]
     patch_px: int
     counts: tuple[int, ...] = ()
@@ -75,7 +74,7 @@ class Spool:
         """Write the patches of a batch in an order of its rows, (n,); return the results without pixels."""
         pixels = sampled.patches.pixels
         waiting = [np.ascontiguousarray(pixels[layer][order]).data for layer in self.layers]
-        self.place.put(f"{batch}", b"".join(waiting), lasting=False)
+        (self.directory / f"{batch}").write_bytes(b"".join(waiting))
         return replace(sampled, patches=replace(sampled.patches, pixels={}))
 
     def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
@@ -89,7 +88,9 @@ class Spool:
         for span in np.split(np.arange(len(slots)), np.flatnonzero(np.diff(batches)) + 1) if len(slots) else []:
             batch, first, last = int(batches[span[0]]), int(rows[span[0]]), int(rows[span[-1]])
             start = self.counts[batch] * before + first * each
-            data = self.place.read_range(f"{batch}", start, (last - first + 1) * each)
+            with (self.directory / f"{batch}").open("rb") as stream:
+                stream.seek(start)
+                data = stream.read((last - first + 1) * each)
             patches[order[span]] = np.frombuffer(data, dtype).reshape(-1, *shape)[rows[span] - first]
         return patches
 
@@ -140,7 +141,8 @@ def sample_all_segments(
     check_same_layers(sources, config)
     found = [list_layers(source, config.patch_m, config.patch_px) for source in sources]
     layers = sort_layers(join_layers(found))
-    spool = Spool(Place(directory / "pixels"), layers, config.patch_px)
+    (directory / "pixels").mkdir()
+    spool = Spool(directory / "pixels", layers, config.patch_px)
     each = spool.sample_bytes
     if len(layers) > len(sources[0].layers):
         shapes = (

@@ -39,7 +39,7 @@ from tcpipe.pipeline.dataset.card import (
 from tcpipe.pipeline.dataset.content import SampleTable, gather_content, write_patches
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.options import BuildOptions
-from tcpipe.pipeline.dataset.redaction import make_redaction, redact_card, redact_content, redact_inputs
+from tcpipe.pipeline.dataset.without_coordinates import make_publication
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 
@@ -51,24 +51,25 @@ def write_dataset(directory: Path, inputs: Inputs, options: BuildOptions, jobs: 
     waiting, recipe = directory / "spool", options.recipe
     waiting.mkdir()
     content = gather_content(waiting, inputs, options, jobs)
-    redaction = make_redaction(content, inputs, recipe) if options.redact else None
-    if redaction is not None:
-        content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
+    public = make_publication(content, inputs, patch_m=recipe.sample.patch_m) if options.without_coordinates else None
+    if public is not None:
+        content, inputs = public.convert_content(content), public.convert_inputs(inputs)
     logger.info("writing %d samples", len(content.samples))
     figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
     ids, compression = figures.column("sample_id"), recipe.dataset.compression
     shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
-    _write_overviews(directory, content.sources)
+    if public is None:
+        _write_overviews(directory, content.sources)
     repeatability = measure_repeatability(
         figures,
         content.samples.centres_xy_m(),
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
     )
-    if content.excluded.num_rows and redaction is None:
+    if content.excluded.num_rows and public is None:
         write_csv(content.excluded, directory / EXCLUDED)
     card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
-    card = card if redaction is None else redact_card(card, redaction)
+    card = card if public is None else public.make_card(card)
     shutil.rmtree(waiting)
     write_text(directory / HUB_CARD, format_hub_card(card))
     files = compute_checksums(directory)
@@ -81,7 +82,8 @@ def write_dataset(directory: Path, inputs: Inputs, options: BuildOptions, jobs: 
 
 def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     """Write the samples; return the columns that card and page are made from, mapped from another file."""
-    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS)))
+    asked = dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS))
+    names = [name for name in asked if name in samples.schema.names]
 
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces():

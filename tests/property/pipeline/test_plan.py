@@ -11,12 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic_store import add_run, lanes, segments
-
-from tcpipe.errors import UsageError
 from tcpipe.formats.commit_log import read_state_here
 from tcpipe.formats.index_files import KnownLog, RunFacts
-from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import LogOrigin
+
+from tcpipe.errors import UsageError
+from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested

@@ -20,7 +20,6 @@ from tcpipe.formats.documents import (
     Name,
     State,
     find_strange_files,
-    make_blob_name,
     make_key,
     parse_name,
     put_document,
@@ -29,6 +28,7 @@ from tcpipe.formats.documents import (
 )
 from tcpipe.formats.place import Place
 from tcpipe.formats.store_records import Call, Failure, Output, Tags
+from tcpipe.pipeline.calls import make_blob_name
 
 
 @pytest.fixture(params=["directory", "bucket"])

@@ -81,7 +81,7 @@ def test_findings_of_several_runs_are_one_line_a_code():
     assert format_groups(groups, 3, more="tcpipe report STORE")[-1] == "and 1 note: tcpipe report STORE"
 
 
-def test_a_finding_of_another_version_or_redacted_is_a_line_all_the_same():
+def test_a_finding_of_another_version_or_without_its_fields_is_a_line_all_the_same():
     assert describe_finding(replace(NOTE, code="no-such-code")) == "command: no such code"
     assert "?" in describe_finding(replace(EMPTY, names={}))
     old = replace(slow(0.7), remedies=(Remedy("gone", recipe={"no_such_table": {"key": 1}}),))

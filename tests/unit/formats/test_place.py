@@ -1,10 +1,14 @@
 """A directory and a bucket behind the same verbs: each test is made of both, and of a real gateway where there is one."""
 
 import hashlib
+import os
 import pickle
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from object_gateway import open_bucket
@@ -41,21 +45,80 @@ def test_what_is_put_is_there(place: Place) -> None:
     assert _names(place.entries()) == sorted(NAMES)
     assert _names(place.entries("runs/x")) == [NAMES[3]]
     assert [entry.size_bytes for entry in place.entries("runs/100%")] == [len(NAMES[2])]
-    assert place.folders() == ["drives of May", "runs"]
-    assert place.files() == ["a.json"]
-    assert place.files("runs/x") == ["[1] & 'two'+~.bin"]
-    assert place.folders("runs") == ["100%", "x"]
-    assert place.folders("nowhere") == place.files("nowhere") == place.entries("nowhere") == []
+    assert place.list() == ["a.json", "drives of May", "runs"]
+    assert place.list("runs") == ["100%", "x"]
+    assert place.list("runs/x") == ["[1] & 'two'+~.bin"]
+    assert place.list("nowhere") == place.list("a.json") == place.entries("nowhere") == []
     there = pickle.loads(pickle.dumps(place))  # noqa: S301  as a worker gets it
     assert there.below("runs").read("100%/track.parquet") == NAMES[2].encode()
 
 
-def test_of_many_writers_the_first_wins(place: Place) -> None:
+def test_of_many_writers_one_stays_and_no_reader_sees_a_half(place: Place) -> None:
+    written = {bytes([number]) * 100_000 for number in range(12)}
     with ThreadPoolExecutor(12) as pool:
-        won = list(pool.map(lambda number: place.put_new("document.json", b"%d" % number), range(12)))
-    assert sum(won) == 1
-    assert place.read("document.json") == b"%d" % won.index(True)
-    assert not place.put_new("document.json", b"late")
+        writing = [pool.submit(place.put, "document.json", data) for data in written]
+        while not all(done.done() for done in writing):
+            assert place.read("document.json") in {None, *written}
+        assert [done.result() for done in writing] == [None] * 12
+    assert place.read("document.json") in written
+    assert place.list() == ["document.json"]
+
+
+def test_a_folder_is_deleted_with_all_in_it_and_nothing_beside_it(place: Place) -> None:
+    for name in ("blobs/a/1", "blobs/a/c/0", "blobs/a b/1", "blobs/ab"):
+        place.put(name, b"")
+    for _ in range(2):
+        place.delete("blobs/a")
+        assert _names(place.entries()) == ["blobs/a b/1", "blobs/ab"]
+    place.delete("blobs/ab/below a file")
+    place.delete("blobs/ab")
+    assert place.list("blobs") == ["a b"]
+    assert place.read("blobs/a b/1") == b""
+
+
+def test_a_deleted_folder_is_whole_or_a_temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place, seen = Place(tmp_path), list[list[str]]()
+    for name in ("blobs/a/1", "blobs/a/2"):
+        place.put(name, b"")
+    unlink = os.unlink
+
+    def look(*how: Any, **more: Any) -> None:
+        seen.append(place.list("blobs"))
+        unlink(*how, **more)
+
+    monkeypatch.setattr(os, "unlink", look)
+    place.delete("blobs/a")
+    assert seen == [[], []]
+    assert place.list() == ["blobs"], "only what is named goes"
+
+
+def test_what_a_killed_deletion_or_writer_left_is_not_listed_and_goes_when_cleared(tmp_path: Path) -> None:
+    place = Place(tmp_path / "store")
+    for name in ("blobs/a/1", "runs/x.json"):
+        place.put(name, b"")
+    program = (
+        "import os, shutil, sys; from pathlib import Path; from tcpipe.formats.place import Place\n"
+        "place = Place(Path(sys.argv[1]))\n"
+        "os.fsync = shutil.rmtree = lambda *_, **__: os._exit(9)\n"
+        "place.delete('blobs/a') if sys.argv[2] == 'delete' else place.below('runs').put('y.json', b'')\n"
+    )
+    for number, act in enumerate(("put", "delete")):
+        killed = subprocess.run([sys.executable, "-c", program, place.where(), act], check=False)
+        assert killed.returncode == 9
+        assert sum(path.name.startswith(".tmp-") for path in (tmp_path / "store").iterdir()) == 1, number
+        assert _names(place.entries()) == (["blobs/a/1", "runs/x.json"] if act == "put" else ["runs/x.json"])
+        assert place.list() == ["blobs", "runs"]
+        place.clear()
+        assert sorted(path.name for path in (tmp_path / "store").iterdir()) == ["blobs", "runs"]
+
+
+def test_a_folder_costs_a_request_however_many_files_lie_deeper(served: Fetched) -> None:
+    place = open_place("s3://tests/x")
+    for number in range(20):
+        place.put(f"blobs/{number:02}/a/b", b"")
+    before = served.requests
+    assert len(place.list("blobs")) == 20
+    assert served.requests - before == 1
 
 
 def test_nothing_is_a_file_too_and_what_is_gone_is_told(place: Place) -> None:
@@ -72,21 +135,34 @@ def test_nothing_is_a_file_too_and_what_is_gone_is_told(place: Place) -> None:
 
 def test_files_are_put_together_and_had_here(place: Place) -> None:
     data = {"track.parquet": b"1" * 1000, "c/0/1": b""}
-    for _ in range(2):
-        with place.workshop() as directory:
-            for name, content in data.items():
-                (directory / name).parent.mkdir(parents=True, exist_ok=True)
-                (directory / name).write_bytes(content)
-            assert place.entries() == [] or _names(place.entries()) == ["runs/x/c/0/1", "runs/x/track.parquet"]
-            place.put_files("runs/x", directory)
-        assert not directory.exists()
+    with place.workshop() as directory:
+        for name, content in data.items():
+            (directory / name).parent.mkdir(parents=True, exist_ok=True)
+            (directory / name).write_bytes(content)
+        assert place.entries() == place.list() == []
+        place.put_files("runs/x", directory)
+    assert not directory.exists()
     assert [(entry.name, entry.size_bytes) for entry in place.entries()] == [
         ("runs/x/c/0/1", 0),
         ("runs/x/track.parquet", 1000),
     ]
     checksum = Checksum(1000, hashlib.sha256(data["track.parquet"]).hexdigest())
     for _ in range(2):
-        assert place.local("runs/x/track.parquet", checksum).read_bytes() == data["track.parquet"]
+        assert place.fetch("runs/x/track.parquet", checksum).read_bytes() == data["track.parquet"]
+
+
+def test_a_file_is_proved_when_it_is_fetched_and_an_altered_copy_is_fetched_again(place: Place) -> None:
+    place.put("a", b"content")
+    checksum = Checksum(7, hashlib.sha256(b"content").hexdigest())
+    held = place.fetch("a", checksum)
+    held.chmod(0o600)
+    held.write_bytes(b"altered")
+    assert place.fetch("a", checksum, proved=False).read_bytes() == b"altered"
+    if place.path is None:
+        assert place.fetch("a", checksum).read_bytes() == b"content"
+    else:
+        with pytest.raises(StoreError, match=r"its sha256 is .*; 'tcpipe verify .*place' lists all changed files"):
+            place.fetch("a", checksum)
 
 
 @pytest.mark.parametrize("name", ["../outside", "/etc/passwd"])
@@ -120,7 +196,7 @@ def test_a_bucket_that_cannot_be_used_is_one_line(tmp_path: Path, monkeypatch: p
             open_place("s3://tests/x").check()
     open_place(f"s3://{READ_ONLY}").check()
     with pytest.raises(StoreError, match=r"read-only/x/a: it cannot be written \(the credentials do not allow it\)"):
-        open_place(f"s3://{READ_ONLY}/x").put_new("a", b"")
+        open_place(f"s3://{READ_ONLY}/x").put("a", b"")
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     began = time.monotonic()
     with pytest.raises(StoreError, match="cannot be read"):
@@ -130,10 +206,9 @@ def test_a_bucket_that_cannot_be_used_is_one_line(tmp_path: Path, monkeypatch: p
 
 def test_what_is_written_counts_also_where_the_answer_is_lost(served: Fetched) -> None:
     place = open_place("s3://tests")
-    for name, put in (("a", place.put), ("b", place.put_new)):
-        served.lost = 2
-        put(name, b"data")
-        assert (place.read(name), served.lost) == (b"data", 0)
+    served.lost = 2
+    place.put("a", b"data")
+    assert (place.read("a"), served.lost) == (b"data", 0)
 
 
 @pytest.mark.usefixtures("served")
@@ -142,7 +217,7 @@ def test_a_copy_that_is_not_what_it_should_be_is_no_copy() -> None:
     place.put("a", b"damaged")
     for _ in range(2):
         with pytest.raises(StoreError, match="s3://tests/a: its sha256 is"):
-            place.local("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))
+            place.fetch("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))
 
 
 @pytest.mark.usefixtures("served")
@@ -153,7 +228,7 @@ def test_the_cache_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     for number in range(5):
         data = bytes([number]) * 1000
         place.put("a", data)
-        place.local("a", Checksum(1000, hashlib.sha256(data).hexdigest()))
+        place.fetch("a", Checksum(1000, hashlib.sha256(data).hexdigest()))
     assert sum(path.is_file() for path in (tmp_path / "cache").rglob("*")) == 2
 
 
@@ -163,4 +238,4 @@ def test_a_cache_that_cannot_be_is_named_with_what_names_another(tmp_path: Path)
     place.put("a", b"content")
     (tmp_path / "cache").touch()
     with pytest.raises(StoreError, match=r"cache/../.*: cannot be written \(.*\); TCPIPE_CACHE names another place"):
-        place.local("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))
+        place.fetch("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))

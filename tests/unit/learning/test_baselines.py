@@ -114,10 +114,13 @@ def test_blocks_are_of_ground_whatever_the_runs_frames():
     east_m = np.array([1.0, 31.0, 31.5, 61.0]) / (111_320.0 * np.cos(np.radians(47.0)))
     known = {f"{end}_lat_deg": np.full(4, 47.0) for end in ("start", "end")} | {"start_lon_deg": 15.0 + east_m}
     columns = known | {"run_id": np.array(["a", "a", "b", "b"])}
-    kind, groups = _group_samples(SimpleNamespace(column=columns.__getitem__), 10.0)
-    assert kind == "blocks"
-    assert groups[1] == groups[2]
-    assert len(set(groups.tolist())) == 3
+    local = {"start_x_m": np.array([1.0, 31.0, 31.5, 61.0]), "start_y_m": np.zeros(4), "run_id": columns["run_id"]}
+    for each, has_coordinates in ((columns, True), (local, False)):
+        split = SimpleNamespace(column=each.__getitem__, has_coordinates=has_coordinates)
+        kind, groups = _group_samples(split, 10.0)
+        assert kind == "blocks"
+        assert groups[1] == groups[2]
+        assert len(set(groups.tolist())) == 3
 
 
 @pytest.mark.parametrize("is_of_energy", [False, True])

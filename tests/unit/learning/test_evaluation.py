@@ -299,20 +299,21 @@ def test_a_dataset_that_is_replaced_meanwhile_is_told(evaluated, model, dataset,
 
 
 @pytest.mark.usefixtures("served")
-def test_it_goes_to_a_bucket_and_another_one_is_the_next_generation(evaluated, model, dataset, tmp_path, monkeypatch):
+def test_it_goes_to_a_bucket_and_another_one_is_the_next_build(evaluated, model, dataset, tmp_path, monkeypatch):
     place, values = evaluated
     table, url = read_table(place / "predictions.parquet"), "s3://tests/by me"
     monkeypatch.setattr(
         "tcpipe.learning.evaluation_files.evaluate", lambda *_, key, **__: (replace(values, key=key), table)
     )
     told = run_evaluation(model, dataset, url, config=CONFIG)
-    (there,) = (tmp_path / "served" / "tests" / "by me" / "generations").iterdir()
-    assert str(told).endswith(f"open {url}/generations/{there.name}/evaluation.html")
+    (there,) = (tmp_path / "served" / "tests" / "by me" / "builds").iterdir()
+    assert str(told).endswith(f"open {url}/builds/{there.name}/evaluation.html")
     for name in ("evaluation.json", "evaluation.html", "predictions.parquet"):
         assert (there / name).read_bytes() == (place / name).read_bytes()
     assert run_evaluation(model, dataset, url, config=CONFIG).values == told.values
     other = run_evaluation(model, dataset, url, config=replace(CONFIG, seed=1))
-    assert "/generations/0000000002-" in other.path
+    assert other.path not in (told.path, url)
+    assert len(list(there.parent.iterdir())) == 2
 
 
 def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):

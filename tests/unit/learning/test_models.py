@@ -14,8 +14,8 @@ from stored_files import flip
 
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.formats.integrity import write_sealed
+from tcpipe.formats.published_outputs import write_output
 from tcpipe.learning.models import WEIGHTS, load_model
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.verify import verify
 
 pytest.importorskip("torch")
@@ -137,7 +137,7 @@ def test_what_does_not_belong_to_a_model_is_named(tmp_path, place):
 
 @pytest.mark.usefixtures("served")
 def test_a_model_in_a_bucket_is_the_one_on_disk(place):
-    with write_generation("s3://tests/a b", "model.json") as directory:
+    with write_output("s3://tests/a b", "model.json") as directory:
         shutil.copytree(place, directory, dirs_exist_ok=True)
     there = load_model("s3://tests/a b")
     assert (there.checksum, there.name) == (load_model(place).checksum, "s3://tests/a b")

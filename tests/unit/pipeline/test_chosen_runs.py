@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from synthetic_store import add_run, commit_run, lanes, open_world, segments
+from tcpipe.formats.commits import Entries
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.formats.commits import Entries
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect

@@ -9,11 +9,11 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 from synthetic_store import add_run, commit_run, lanes, segments, supersede
+from tcpipe.formats.commits import Entries, LogSnapshot
 
 import tcpipe.store as stores
 from tcpipe.errors import StoreError
 from tcpipe.formats import stored_runs
-from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.runs import choose_runs
 from tcpipe.recipe import Recipe

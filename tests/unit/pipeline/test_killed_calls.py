@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import pytest
 from click.testing import CliRunner
 from object_gateway import open_bucket
+from tcpipe.formats.commits import Begun, Entries
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.commits import Begun, Entries
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import status as status_module

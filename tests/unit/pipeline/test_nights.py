@@ -5,12 +5,12 @@ import os
 import shutil
 
 import pytest
+from tcpipe.formats.run_documents import LogOrigin, RunJson
 from wheel_drives import START_NS, ask_status, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
 from tcpipe.formats.logs.writing import MessageStream, write_bag, write_rosbag2
-from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.calls import LogWriter

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from synthetic_store import add_run, commit_run, lanes, segments, supersede
+from tcpipe.formats.commits import Dataset, Entries
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.commits import Dataset, Entries
 from tcpipe.formats.integrity import seal_page
 from tcpipe.pipeline import prune as prune_module
 from tcpipe.pipeline.calls import open_log

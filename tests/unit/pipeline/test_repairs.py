@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 from synthetic_store import WORLD
+from tcpipe.formats.commits import Entries, LogSnapshot
 from wheel_drives import drive_at
 
 from tcpipe.errors import StoreError
 from tcpipe.formats import commit_log
-from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 from stored_files import flip, manifest, run_document, table
 from synthetic_store import add_run, box, commit_run, lanes, open_world, region_file, segments, supersede
+from tcpipe.formats.commits import Entries
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.formats.commits import Entries
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect

@@ -155,7 +155,7 @@ def test_maps_are_held_open_only_while_samples_are_taken(store, tmp_path, monkey
 
 
 def test_the_option_may_be_repeated(store, tmp_path, monkeypatch):
-    monkeypatch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", render_dataset_report)
+    monkeypatch.setattr("tcpipe.pipeline.dataset.writing.render_dataset_report", render_dataset_report)
     arguments = ["build-dataset", str(tmp_path / "out"), "--store", str(store.root), "--map", "west", "--map", "east"]
     result = CliRunner().invoke(cli, [*arguments, "--quiet", "--json"], catch_exceptions=False)
     assert result.exit_code == 0

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
+from tcpipe.formats.commits import CallRecord, Entries
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
-from tcpipe.formats.commits import CallRecord, Entries
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.calls import open_log

@@ -13,15 +13,15 @@ import pytest
 from made_tracks import with_columns
 from stored_files import flip, manifest, run_document, table
 from synthetic_store import add_run, box, commit_run, lanes, region_file, segments, small_store
+from tcpipe.formats.commits import Entries, LogSnapshot
+from tcpipe.formats.run_documents import MapDocument, read_as_at
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_page, write_sealed
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import Place
-from tcpipe.formats.run_documents import MapDocument, read_as_at
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import _match_by_time, diff
@@ -129,7 +129,7 @@ def test_a_card_that_counts_otherwise_is_found(copy, key, value):
     assert verify(directory).problems == (told,)
 
 
-@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "distance_by_reason_m", "layers", "format"])
+@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "distance_by_reason_m", "layers", "made_from"])
 def test_a_card_that_lacks_something_is_one_problem_and_no_traceback(copy, key):
     directory = copy("parquet")
     card = json.loads((directory / "dataset.json").read_text())

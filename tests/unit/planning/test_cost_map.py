@@ -256,7 +256,7 @@ def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew
         make_cost_map(MODEL, source, out, cell_size_m=2.0, origin_deg=lonlat[::-1])
 
 
-def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_generation(made, tmp_path, served):
+def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_build(made, tmp_path, served):
     source, result = made
     source = replace(source, reads=Counter())
     (tmp_path / "served" / "maps").mkdir(parents=True)

@@ -1,21 +1,25 @@
 """The page of a store says of each run what its documents say, names what failed, and tells a change over the nights from scatter."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from page_reading import data_of
-from synthetic_store import add_run, lanes, open_world, segments, supersede
+from stored_files import flip, manifest
+from synthetic_store import add_run, lanes, open_world, segments, supersede, tag_run
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.commits import CallRecord, Entries, Failure
+from tcpipe.formats.documents import make_key
 from tcpipe.formats.place import open_place
-from tcpipe.pipeline import calls
-from tcpipe.pipeline.calls import open_log
+from tcpipe.formats.recipe_toml import ingest_key
+from tcpipe.formats.store_records import Call, Failure
+from tcpipe.pipeline import report as report_module
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
-from tcpipe.pipeline.status import find_changes, find_shift
+from tcpipe.pipeline.store_facts import find_changes, find_shift
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
@@ -47,20 +51,28 @@ def store(tmp_path_factory):
     supersede(store, "d", "a")
     build_dataset(here / "dataset", store=store.root)
     add(store, "c", 3, distance_by_reason_m={"kept": 20.0, "gap": 60.0, "stationary": 5.0})
-    junk = Failure("1", "1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0")
-    cut = Failure("2", "a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0")
+    put_failure(store, Failure("1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0"))
+    put_failure(store, Failure("a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0"))
     failed = {"/logs/passing.mcap": "No space left on device", "/logs/b.mcap": "No space left on device"}
-    call = calls.start_stopwatch()(CallRecord("ingest", "0", 3, {"failed": 1}, failed=failed))
-    open_log(store).commit("ended", Entries(failed=(junk, cut), calls=(call,)))
+    call = Call(command="ingest", version="0", exit_code=3, counts={"failed": 1}, failed=failed)
+    store.put(store.scan(), "calls", "f" * 16, call)
     return store
+
+
+def put_failure(store, failure):
+    store.put(store.scan(), "failed", make_key(failure.content), failure)
 
 
 def shown(store):
     page = report(store.root, runs=False)[0]
+    return page, *read_rows(store)
+
+
+def read_rows(store):
     html = open_place(store.root).read("report.html").decode()
     told = data_of(html)
     rows = [dict(zip(told["fields"], row, strict=True)) for row in told["rows"]]
-    return page, html, told, rows
+    return html, told, rows
 
 
 def test_each_run_is_there_as_its_documents_say(store):
@@ -70,7 +82,7 @@ def test_each_run_is_there_as_its_documents_say(store):
         ("c", "current"), ("d", "superseded"), ("b", "current"), ("b", "of another recipe"), ("a", "current")
     ]  # fmt: skip
     for row, run_id in ((rows[0], "c"), (rows[-1], "a")):
-        (run,) = store.recipes_of(run_id)
+        (run,) = store.find_runs(run_id)
         made = run.manifest
         assert (row["robot"], row["segments"]) == (made.robot, made.counts.segments)
         assert row["driven"] == pytest.approx(sum(made.distance_by_reason_m.values()), abs=0.05)
@@ -97,12 +109,8 @@ def test_the_verdict_is_that_of_the_current_runs_with_findings_by_code(store):
 
 def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
     _, html, *_ = shown(store)
-    manifests = [store.recipes_of(name)[-1].manifest for name in ("a", "c")]
-    current = [
-        *manifests,
-        next(run for run in store.recipes_of("b") if run.manifest.recipe == Recipe().ingest).manifest,
-    ]
-    driven_m = sum(sum(made.distance_by_reason_m.values()) for made in current)
+    key = ingest_key(Recipe())
+    driven_m = sum(run.facts.driven_m for run in store.runs() if run.facts.ingest_key == key)
     assert f"<div><b>{driven_m:.0f} m</b><span>driven</span></div>" in html
     assert "<div><b>3</b><span>runs</span></div>" in html
     losses = html.split("<h2>Distance breakdown</h2>")[1].split("</section>")[0]
@@ -130,7 +138,7 @@ def test_names_are_text_and_pages_are_led_to_where_they_are(store):
     assert not any(row["href"] for row in rows)
     assert 'href="../dataset/report.html"' in html
     pages = report(store.root)
-    assert [page.path for page in pages[1:]] == [f"{run.where}/report.html" for run in store.runs()]
+    assert [page.path for page in pages[1:]] == [run.folder.where("report.html") for run in store.runs()]
     for row in shown(store)[3]:
         assert (row["href"] != "") == (row["run"] != "d")
         assert not row["href"] or (store.root / row["href"]).is_file()
@@ -140,13 +148,14 @@ def test_names_are_text_and_pages_are_led_to_where_they_are(store):
 def test_an_empty_store_and_one_of_failed_logs_alone_have_a_page(tmp_path):
     store = open_store(tmp_path / "store", create=True)
     assert "The store has no usable runs." in shown(store)[1]
-    junk = Failure("1", "1" * 64, ("/logs/junk",), ("/logs/junk: is no log",), "0")
-    open_log(store).commit("failed", Entries(failed=(junk,)))
+    put_failure(store, Failure("1" * 64, ("/logs/junk",), ("/logs/junk: is no log",), "0"))
     _, html, *_ = shown(store)
     assert "The store has no usable runs." in html
     assert "junk: is no log" in html
-    with pytest.raises(UsageError, match="is no dataset, run or store"):
+    with pytest.raises(UsageError, match="is no dataset or store"):
         report(tmp_path)
+    with pytest.raises(UsageError, match="no such file or directory, and no such run in"):
+        report("gone", store=store.root)
 
 
 def test_a_run_that_cannot_be_read_is_named_and_costs_no_other_page(tmp_path):
@@ -154,14 +163,61 @@ def test_a_run_that_cannot_be_read_is_named_and_costs_no_other_page(tmp_path):
     for number, run_id in enumerate("abc"):
         add(store, run_id, number)
     runs = {run.run_id: run for run in store.runs()}
-    track = runs["b"].file("track.parquet")
-    track.write_bytes(track.read_bytes()[::-1])
-    (store.root / "runs/c" / runs["c"].recipe_id / "manifest-1.json").write_text("{")
+    flip(runs["b"].file("track.parquet"))
+    flip(manifest(runs["c"]))
     with pytest.raises(StoreError, match=r"track\.parquet"):
         report(store.root)
-    rows = {row["run"]: row for row in shown(store)[3]}
-    assert (rows["a"]["href"] != "", rows["b"]["href"], rows["c"]["href"]) == (True, "", "")
-    assert rows["c"]["state"] == "files changed or missing"
+    _, html, _, rows = shown(store)
+    assert {row["run"]: row["href"] != "" for row in rows} == {"a": True, "b": False}
+    assert runs["c"].document in html.replace("<wbr>", "")  # named as damaged
+    shutil.rmtree(runs["b"].folder.where())
+    assert {row["run"]: row["state"] for row in shown(store)[3]} == {"a": "current", "b": "tables missing"}
+
+
+def test_the_current_runs_are_those_of_the_ruling_recipe_however_few(tmp_path):
+    store = open_store(tmp_path / "store", create=True)
+    for number, run_id in enumerate("abc"):
+        add(store, run_id, number, recipe=OLD)
+    add(store, "a", 0)
+    assert {(row["run"], row["state"]) for row in shown(store)[3]} == {
+        ("a", "current"), *((run_id, "of another recipe") for run_id in "abc")
+    }  # fmt: skip
+    report(store.root, runs=False, recipe=OLD)
+    rows = read_rows(store)[2]
+    assert sorted(row["state"] for row in rows) == ["current"] * 3 + ["of another recipe"]
+    report(store.root, runs=False, recipe=replace(Recipe(), read=ReadConfig(ignore_topics=["/other"])))
+    assert "The store has no runs of the current recipe." in read_rows(store)[0]
+
+
+def test_a_page_is_rendered_again_only_where_its_inputs_have_changed(tmp_path, monkeypatch):
+    store = open_world(tmp_path)
+    for number, run_id in enumerate("ab"):
+        add(store, run_id, number)
+    rendered = []
+    render = report_module.run_report
+    monkeypatch.setattr(
+        report_module, "run_report", lambda run, *a, **k: rendered.append(run.run_id) or render(run, *a, **k)
+    )
+
+    def list_rendered():
+        rendered.clear()
+        changed = [Path(page.path).parent.name for page in report(store.root)[1:] if page.changed]
+        assert changed == [runs[run_id].facts.blob for run_id in rendered]
+        return rendered
+
+    runs = {run.run_id: run for run in store.runs()}
+    assert list_rendered() == ["a", "b"]
+    assert list_rendered() == []
+    tag_run(store, "b", {"site": "quarry"})
+    assert list_rendered() == ["b"]
+    flip(Path(runs["a"].folder.where("report.html")))
+    assert list_rendered() == ["a"]
+    with store.new_map(store.scan(), "other") as path:
+        path.mkdir()
+    assert list_rendered() == ["a", "b"]
+    assert list_rendered() == []
+    monkeypatch.setattr(report_module, "__version__", "another")
+    assert list_rendered() == ["a", "b"]
 
 
 def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monkeypatch):

@@ -67,7 +67,7 @@ def build(store, tmp_path, *, page=False, **keywords):
     """Build into ``out``; only datasets of an odd kind get their page."""
     with pytest.MonkeyPatch.context() as patch:
         if page:
-            patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", render_dataset_report)
+            patch.setattr("tcpipe.pipeline.dataset.writing.render_dataset_report", render_dataset_report)
         return build_dataset(tmp_path / "out", store=store.root, **{"recipe": Recipe(), **keywords})
 
 

@@ -1,9 +1,7 @@
-"""Datasets in a bucket: generations that appear whole, never a mixture; read by range through a cache that is proved."""
+"""Datasets in a bucket: builds that appear whole, never a mixture; read by range through a cache that is proved."""
 
-import getpass
 import json
 import shutil
-import socket
 
 import numpy as np
 import pytest
@@ -15,9 +13,8 @@ from synthetic_store import add_run, lanes, segments, small_store
 
 import tcpipe
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.bucket_directories import GENERATIONS
 from tcpipe.formats.place import open_place
-from tcpipe.pipeline.dataset import build as building
+from tcpipe.pipeline.dataset import writing
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
@@ -57,8 +54,8 @@ def put(made, bucket, kind="zarr"):
 def test_a_dataset_that_is_built_into_a_bucket_is_the_same_as_on_disk(made, bucket):
     built = build_dataset(URL, store=made / "store", recipe=Recipe())
     assert (built.status, built.path) == ("done", URL)
-    (generation,) = folders(bucket)
-    assert files(generation) == files(made / "zarr")
+    (build,) = folders(bucket)
+    assert files(build) == files(made / "zarr")
     before = files(bucket[0])
     again = build_dataset(f"{URL}/", store=made / "store", recipe=Recipe())
     assert again.status == "unchanged"
@@ -83,8 +80,9 @@ def test_what_lies_there_and_is_no_dataset_is_left_alone(made, bucket):
 
 
 def folders(bucket, name="by name/ds"):
-    """The folders of the generations at a URL, by number."""
-    return sorted(folder for folder in (bucket[0] / name / GENERATIONS).iterdir() if files(folder))
+    """The folders of the builds at a URL, by number."""
+    numbered = {int(path.name.split(".")[1]): path for path in (bucket[0] / name).glob("current.*.json")}
+    return [bucket[0] / name / json.loads(numbered[number].read_text())["folder"] for number in sorted(numbered)]
 
 
 def test_a_second_night_builds_there_and_readers_see_it_while_an_earlier_one_finishes(made, tmp_path, bucket):
@@ -100,12 +98,10 @@ def test_a_second_night_builds_there_and_readers_see_it_while_an_earlier_one_fin
     assert tcpipe.open_dataset(URL).card == tcpipe.open_dataset(tmp_path / "ds").card != earlier.card
     assert len(earlier["train"].patches) == len(earlier["train"]), "read after the second was there"
     assert verify(URL).problems == ()
-    assert len(diff(f"{URL}/{GENERATIONS}/{first.name}", URL).causes) > 0, (
-        "the folder of a generation is a dataset itself"
-    )
+    assert len(diff(f"{URL}/builds/{first.name}", URL).causes) > 0, "the folder of a build is a dataset itself"
 
 
-def test_what_0_8_or_a_copy_put_there_is_read_and_the_next_build_is_beside_it(made, bucket):
+def test_what_a_copy_put_there_is_read_and_the_next_build_is_beside_it(made, bucket):
     put(made, bucket)
     before = files(bucket[0] / "by name" / "ds")
     assert build_dataset(URL, store=made / "store", recipe=Recipe()).status == "unchanged"
@@ -113,48 +109,45 @@ def test_what_0_8_or_a_copy_put_there_is_read_and_the_next_build_is_beside_it(ma
     build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, force=True)
     now = files(bucket[0] / "by name" / "ds")
     assert {name: now[name] for name in before} == before
-    (generation,) = folders(bucket)
-    assert tcpipe.open_dataset(URL).card.inputs == json.loads((generation / "dataset.json").read_text())["inputs"]
+    (build,) = folders(bucket)
+    assert tcpipe.open_dataset(URL).card.inputs == json.loads((build / "dataset.json").read_text())["inputs"]
     assert verify(URL).problems == ()
 
 
 def test_a_build_of_another_call_meanwhile_stays(made, bucket, monkeypatch):
-    draw = building.write_patches
+    draw = writing.write_patches
 
     def while_the_first_draws(*how, **more):
-        monkeypatch.setattr(building, "write_patches", draw)
+        monkeypatch.setattr(writing, "write_patches", draw)
         build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7)
         return draw(*how, **more)
 
-    monkeypatch.setattr(building, "write_patches", while_the_first_draws)
+    monkeypatch.setattr(writing, "write_patches", while_the_first_draws)
     with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(URL, store=made / "store", recipe=Recipe())
     assert len(folders(bucket)) == 1
 
 
-def test_a_redacted_dataset_names_no_machine_in_its_log(made, bucket):
-    build_dataset(URL, store=made / "store", recipe=Recipe(), redact=True)
-    text = b"".join(path.read_bytes() for path in (bucket[0] / "by name" / "ds" / "log").iterdir()).decode()
-    assert "generations/0000000001-" in text
-    assert not [name for name in (socket.gethostname(), str(made), getpass.getuser()) if name in text]
+def test_the_pointer_names_no_machine(made, bucket):
+    build_dataset(URL, store=made / "store", recipe=Recipe())
+    (pointer,) = (bucket[0] / "by name" / "ds").glob("current.*.json")
+    assert json.loads(pointer.read_text()).keys() == {"folder", "card"}
 
 
-def test_verify_names_what_is_of_no_generation_and_what_is_wrong_with_the_log(made, bucket):
+def test_verify_names_what_is_of_no_build_and_a_damaged_pointer(made, bucket):
     build_dataset(URL, store=made / "store", recipe=Recipe())
     build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, force=True)
-    there = bucket[0] / "by name" / "ds"
-    for name in ("0000000001-00000000000000ff", "0000000003-00000000000000ff"):
-        (there / GENERATIONS / name).mkdir()
-        (there / GENERATIONS / name / "data").touch()
-    left = f"{URL}/{GENERATIONS}/0000000001-00000000000000ff/data: is no file of this dataset"
-    assert verify(URL).problems == (left,), "the folder of the next number may be of a build that goes on"
-    commit = there / "log" / "0000000001.json"
-    commit.write_bytes(commit.read_bytes()[:-9])
-    (problem,) = verify(URL).problems
-    assert "log/0000000001.json" in problem
-    assert len(tcpipe.open_dataset(URL)["train"]), "readers need the last commit alone"
-    build_dataset(URL, store=made / "store", recipe=Recipe(), seed=8, force=True)
-    assert len(folders(bucket)) == 5, "what a damaged commit may name stays"
+    there, (first, newest) = bucket[0] / "by name" / "ds", folders(bucket)
+    for name in ("current.json", f"builds/{newest.name}/data", "builds/data", f"builds/{'f' * 16}/data"):
+        (there / name).parent.mkdir(exist_ok=True)
+        (there / name).touch()
+    strange = {f"{URL}/{name}: is no file of this dataset" for name in ("current.json", "builds/data")}
+    strange.add(f"{URL}/builds/{newest.name}/data: is no file of this dataset")
+    assert set(verify(URL).problems) == strange, "the last one may be of a build that goes on"
+    (pointer,) = there.glob("current.2.*.json")
+    pointer.write_bytes(pointer.read_bytes()[:-9])
+    assert f"{URL}/{pointer.name}: is no file of this dataset" in verify(URL).problems
+    assert tcpipe.open_dataset(URL).card.inputs == json.loads((first / "dataset.json").read_text())["inputs"]
 
 
 @pytest.mark.parametrize("kind", ["zarr", "parquet"])

@@ -182,11 +182,12 @@ def test_a_segment_that_is_no_sample_is_said_to_be_none(store, plain, tmp_path):
     assert [row["outcome"] for row in outcomes(tmp_path)] == ["no sample", "excluded"]
 
 
-def test_a_redacted_dataset_tells_the_count_alone(store, plain, tmp_path):
+def test_without_coordinates_the_metres_alone_are_published(store, plain, tmp_path):
     ids = choose(plain)
-    card = build(store, tmp_path, ids=ids, redact=True).card
+    card = build(store, tmp_path, ids=ids, without_coordinates=True).card
     assert not (tmp_path / "out/excluded.csv").exists()
-    assert [(of.name, of.reason, of.samples) for of in card.exclusions] == [("excluded1", "", 3)]
+    assert card.exclusions == ()
+    assert card.distance_by_reason_m["excluded"] == pytest.approx(3.0)
     text = (tmp_path / "out/dataset.json").read_text() + (tmp_path / "out/report.html").read_text()
     assert not any(secret in text for secret in (WHY, "ids.csv", *ids))
     assert verify(tmp_path / "out").problems == ()

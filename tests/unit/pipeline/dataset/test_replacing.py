@@ -15,8 +15,9 @@ from synthetic_store import add_run, add_world, box, commit_run, lanes, region_f
 from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.pipeline.dataset import build as building
+from tcpipe.pipeline.dataset import writing
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
 from tcpipe.store import open_store
 
@@ -69,7 +70,7 @@ OTHER = {
     "file_format": ("parquet", "--format: zarr in the dataset, parquet now"),
     "seed": (5, "recipe split.seed: 0 in the dataset, 5 now"),
     "holdout": ("sample", "recipe split.holdout: block in the dataset, sample now"),
-    "redact": (True, "--redact: no in the dataset, yes now"),
+    "without_coordinates": (True, "--without-coordinates: no in the dataset, yes now"),
     "recipe": (
         Recipe(sample=SampleConfig(patch_px=20), dataset=DatasetConfig(licence="CC0-1.0")),
         "recipe dataset.licence: none in the dataset, CC0-1.0 now",
@@ -100,7 +101,44 @@ def test_regions_and_tables_differ_by_what_they_are(here):
 def test_the_same_region_written_otherwise_is_the_same_option(here):
     path = here / "region.geojson"
     path.write_text(json.dumps(json.loads(path.read_text()), indent=3))
-    assert build_dataset(here / "dataset", **usual(here)).status == "done"
+    assert build_dataset(here / "dataset", **usual(here)).status == "unchanged"
+
+
+CAUSES = {
+    "covariates": ({"covariates": "soil.csv"}, {}, ("covariates: removed soil.csv",)),
+    "content of covariates": ({"covariates": "soil.csv"}, {"covariates": "wet/soil.csv"}, ("covariates: soil.csv is another table",)),
+    "chosen tags": ({"tags": {"weather": "dry"}}, {"tags": {}},
+    ("log: added wet.mcap (run wet, 20 samples)", "chosen tags: weather dry → none")),
+    "order of maps": ({"map_name": ["site", "yard"]}, {"map_name": ["yard", "site"]}, ("map: order site, yard → yard, site",)),
+    "map": ({"map_name": "site"}, {"map_name": "yard"}, ("map: added yard", "map: removed site")),
+    "region": ({"split": "region.geojson"}, {"split": "other.geojson"}, ("region: another one",)),
+    "kept split": ({}, {"keep_split": "dataset"}, ("kept split: added",)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_diff_names_every_input_that_differs(here, name):
+    """Each entry of the record of inputs, not a list of some of them."""
+    (here / "wet").mkdir()
+    (here / "wet" / "soil.csv").write_text((here / "soil.csv").read_text().replace("0.2", "0.4"))
+    *options, causes = CAUSES[name]
+    for out, how in zip("ab", options, strict=True):
+        paths = {
+            key: here / value if key in ("covariates", "split", "keep_split") else value for key, value in how.items()
+        }
+        build_dataset(here / out, **usual(here, **paths))
+    found = diff(here / "a", here / "b")
+    assert set(found.causes) == set(causes)
+    assert not found.same
+    assert diff(here / "a", here / "a").same
+
+
+def test_diff_names_other_tags_of_a_run(here):
+    store = open_store(here / "store")
+    store.tag_run("dry", {"weather": "dry", "soil": "clay"})
+    commit_run(store, "dry")
+    build_dataset(here / "b", **usual(here))
+    assert diff(here / "dataset", here / "b").causes == ("tags: run dry soil none → clay",)
 
 
 def test_other_runs_and_another_map_of_the_name_are_built_in_unasked(here):
@@ -156,14 +194,14 @@ def test_a_dataset_of_another_data_model_in_a_bucket_is_left_alone(here, monkeyp
     assert move == "s3://sets/ds: is not changed, because its inputs are unknown; move it or give another OUT"
 
 
-def test_a_redacted_dataset_does_not_tell_its_options(here):
+def test_a_dataset_without_coordinates_does_not_store_its_options(here):
     out = here / "dataset"
-    build_dataset(out, **usual(here, redact=True, force=True))
-    assert read_card(out).run_tags is None
-    assert build_dataset(out, **usual(here, redact=True)).status == "unchanged"
-    (line,) = refused(here, redact=True, map_name="yard")
-    assert line.startswith("--redact: a redacted dataset omits its")
-    assert refused(here) == ("--redact: yes in the dataset, no now",)
+    build_dataset(out, **usual(here, without_coordinates=True, force=True))
+    assert read_card(out).made_from.tags == {}
+    assert build_dataset(out, **usual(here, without_coordinates=True)).status == "unchanged"
+    (line,) = refused(here, without_coordinates=True, map_name="yard")
+    assert line == "--without-coordinates: maps, region, tags and recipe are not stored and cannot be compared"
+    assert refused(here) == ("--without-coordinates: yes in the dataset, no now",)
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -180,7 +218,7 @@ def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
         assert tree(here / "folder") == before
 
 
-def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_generation(here, monkeypatch):
+def test_in_a_bucket_the_differences_are_named_too_and_force_builds_beside_it(here, monkeypatch):
     (here / "served" / "sets").mkdir(parents=True)
     shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
     with object_store(here / "served") as (environment, _):
@@ -193,20 +231,20 @@ def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_gen
         assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
         assert build_dataset("s3://sets/ds", **usual(here, map_name="yard", force=True)).status == "done"
         build_dataset(here / "dataset", **usual(here, map_name="yard", force=True))
-        (generation,) = (here / "served" / "sets" / "ds" / "generations").iterdir()
-        assert read_card(generation) == read_card(here / "dataset")
+        (build,) = (here / "served" / "sets" / "ds" / "builds").iterdir()
+        assert read_card(build) == read_card(here / "dataset")
 
 
 def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
-    out, draw = here / "dataset", building.write_patches
+    out, draw = here / "dataset", writing.write_patches
 
     def while_the_first_draws(*how, **more):
-        monkeypatch.setattr(building, "write_patches", draw)
+        monkeypatch.setattr(writing, "write_patches", draw)
         build_dataset(out, **usual(here, map_name="yard", force=True))
         return draw(*how, **more)
 
     add_run(open_store(here / "store"), "dry", segments("dry", *lanes(1.0, -10.0, 10.0)))
-    monkeypatch.setattr(building, "write_patches", while_the_first_draws)
+    monkeypatch.setattr(writing, "write_patches", while_the_first_draws)
     with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(out, **usual(here))
     assert [entry.name for entry in read_card(out).maps] == ["yard"]

@@ -1,0 +1,133 @@
+"""Calls that are killed before any of their requests, and pairs of calls that interrupt each other: nothing is lost or half visible.
+
+TCPIPE_TEST_OPERATIONS (make test-operations): before every request, with files that ingestion makes anew; else before some.
+"""
+
+import os
+import tempfile
+from itertools import product
+
+import pytest
+from store_attacks import OLD, World, expect, write_logs
+
+DRAWS_DATASET_PAGES = True  # no dataset is built here
+
+IS_WHOLE = bool(os.environ.get("TCPIPE_TEST_OPERATIONS"))
+FEW = 3
+"""Requests before which a call is killed or interrupted in `make test`."""
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    return write_logs(tmp_path_factory.mktemp("attacks"))
+
+
+@pytest.fixture(params=["directory", "bucket"])
+def world(request, logs, tmp_path, monkeypatch):
+    monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    made = World(tmp_path / "store" if request.param == "directory" else "s3://tests/store", logs)
+    made.patch(monkeypatch, is_light=not IS_WHOLE)
+    return made
+
+
+def make_old(world):
+    """Make a store in which each command has something to do: a superseded run, an old recipe, a replaced map, what a kill left."""
+    world.run(lambda: world.ingest("long.mcap", "other.mcap", recipe=OLD))
+    world.run(lambda: world.ingest("short.mcap", "long.mcap", "junk.mcap", tags={"load": "12"}))
+    world.run(lambda: world.build("/first"))
+    world.run(lambda: world.ingest("other.mcap"))
+    world.run(lambda: world.add_map("first"))
+    world.run(lambda: world.add_map("second"))
+    world.run(lambda: world.ingest("other.mcap", force=True), kill_at=26)
+    world.run(lambda: world.ingest("other.mcap", force=True))
+
+
+CALLS = {
+    "ingest": lambda world: world.ingest("short.mcap", "junk.mcap", tags={"load": "12"}),
+    "ingest a longer log": lambda world: world.ingest("long.mcap"),
+    "ingest again": lambda world: world.ingest("long.mcap", tags={"surface": "wet"}, force=True),
+    "ingest under another recipe": lambda world: world.ingest("short.mcap", "long.mcap", recipe=OLD),
+    "fail": lambda world: world.ingest("junk.mcap"),
+    "add-map": lambda world: world.add_map("third"),
+    "build": lambda world: world.build(),
+    "prune": lambda world: world.prune(),
+    "prune a run": lambda world: world.prune(world.name_run("other")),
+    "acknowledge": lambda world: world.acknowledge(),
+}
+ON_NEW = ("ingest", "ingest a longer log", "fail", "add-map")
+"""Calls that make a store."""
+PAIRS = [
+    ("ingest", "ingest"), ("ingest", "ingest a longer log"), ("ingest under another recipe", "prune"),
+    ("ingest again", "prune"), ("add-map", "prune"), ("add-map", "add-map"), ("build", "prune"), ("prune", "prune"),
+    ("acknowledge", "ingest"), ("fail", "ingest a longer log"),
+]  # fmt: skip
+
+
+def choose(count, number):
+    """Return requests before which something happens, other ones for another ``number``."""
+    return range(count) if IS_WHOLE else sorted({(number + 1 + count * each // FEW) % count for each in range(FEW)})
+
+
+@pytest.mark.parametrize(("store", "name"), [*(("new", name) for name in ON_NEW), *(("old", name) for name in CALLS)])
+def test_a_call_that_is_killed_loses_nothing_shows_nothing_by_halves_and_completes(world, store, name):
+    def call():
+        CALLS[name](world)
+
+    if store == "old":
+        make_old(world)
+    saved, before = world.save(), world.see()
+    world.run(call)
+    count, after = world.requests, world.see()
+    assert count > 10
+    for kill_at in choose(count, list(CALLS).index(name)):
+        world.restore(saved)
+        world.run(call, kill_at=kill_at)
+        seen = world.see()
+        assert before & after <= seen <= before | after, kill_at
+        world.run(call)
+        assert world.see() == after, kill_at
+        world.check_end()
+
+
+@pytest.mark.parametrize("store", ["new", "old"])
+@pytest.mark.parametrize("names", [*PAIRS, *((b, a) for a, b in PAIRS if a != b)], ids="|".join)
+def test_two_calls_at_once_end_as_if_one_came_after_the_other(world, store, names):
+    if store == "old":
+        make_old(world)
+    calls = [lambda name=name: CALLS[name](world) for name in names]
+    saved, before, orders, counts = world.save(), world.see(), list[set](), list[int]()
+    for order in (calls, calls[::-1]):
+        world.restore(saved)
+        for call in order:
+            errors = world.interleave([call], [])
+            expect(errors)
+            counts.append(world.requests)
+        orders.append(world.see())
+    first, second = counts[0], counts[2]
+    cuts = [[(0, at)] for at in choose(first, len(names[0]))]
+    if IS_WHOLE:
+        cuts += [[(0, a), (1, b)] for a, b in product(range(0, first, 5), range(0, second, 5))]
+    for turns in cuts:
+        world.restore(saved)
+        expect(world.interleave(calls, [*turns, (1, 10**9)] if len(turns) == 1 else turns))
+        seen = world.see()
+        assert orders[0] & orders[1] <= seen <= orders[0] | orders[1] | before, turns
+        for call in calls:
+            expect(world.interleave([call], []))
+        assert orders[0] & orders[1] <= world.see(), turns
+        world.check_end()
+
+
+def test_a_failing_call_beside_a_working_one_on_a_new_store_destroys_nothing(world):
+    """In 1.0 the failing call removed the store that the working one had begun to write to."""
+    (world.logs.parent / "empty").mkdir(exist_ok=True)
+
+    def fail():
+        world.ingest("junk.mcap", "../empty")
+
+    for at in (8, 14, 20):
+        world.restore({})
+        expect(world.interleave([lambda: world.ingest("long.mcap"), fail], [(0, at), (1, 10**9)]))
+        assert {kind for kind, *_ in world.see()} == {"run", "failed"}
+        world.check_end()
