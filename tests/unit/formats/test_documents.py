@@ -193,7 +193,7 @@ def test_a_state_is_a_function_of_the_documents_in_whatever_order_they_are_writt
     for _ in range(2):
         place = Place(tmp_path_factory.mktemp("store"))
         for name, data in chance.sample([*files.items(), *files.items()], 2 * len(files)):
-            place.put(name, data, lasting=False)
+            place.put(name, data)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Place, "list", shuffle(Place.list, chance))
             states += [scan_anew(place), scan(place)]
