@@ -13,32 +13,18 @@ from types import SimpleNamespace
 import pytest
 from click.testing import CliRunner
 from object_gateway import open_bucket
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-from wheel_drives import START_NS, ask_status, drive_at
-
-from tcpipe.cli import cli
-from tcpipe.errors import StoreError, UsageError
-=======
 from synthetic_store import add_run, lanes, segments
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, TcpipeError, UsageError
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
 from tcpipe.formats.store_records import Call
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import status as status_module
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-from tcpipe.pipeline.calls import identify_process, list_open_calls, record_call
-from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.verify import verify
-=======
 from tcpipe.pipeline.calls import close_call, identify_process, list_open_calls, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.problems import acknowledge
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 
@@ -96,26 +82,13 @@ def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_i
     (finding,) = json.loads(found.stdout)["problems"]
     assert (finding["code"], finding["names"]["command"]) == ("call-killed", "ingest")
     lines = CliRunner().invoke(cli, ["status", str(tmp_path / "store")], standalone_mode=False).stderr
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-    assert f"was killed. To acknowledge it: 'tcpipe acknowledge {finding['subject']['name']}' [call-killed]" in lines
-=======
     (killed,) = ask_status(tmp_path / "store").open_calls
     assert f"was killed. To acknowledge it: 'tcpipe acknowledge {killed.name}' [call-killed]" in lines
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
     assert json.loads(found.stdout)["counts"] == {"pending": 2}
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0
     assert (ask_status(tmp_path / "store").exit_code, ask_status(tmp_path / "store").open_calls) == (0, ())
 
 
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-def test_a_call_that_runs_is_no_problem_and_one_with_nothing_to_do_writes_its_record_alone(root, logs):
-    assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
-    store = open_store(root)
-    with record_call(store, "ingest", [str(logs)]):
-        found = ask_status(root)
-        assert (found.exit_code, [call.state for call in found.open_calls]) == (0, ["running"])
-        assert "running: ingest of 20" in str(found)
-=======
 def read_calls(root):
     """Return command, exit code and the first words of the message of each call, the earliest first."""
     calls_of = [call for _, call in reversed(open_store(root).scan().calls)]
@@ -197,34 +170,18 @@ def test_a_call_that_runs_is_no_problem(root, logs):
 def test_a_call_with_nothing_to_do_writes_its_record_alone(root, logs):
     ingest([logs], store=root, recipe=Recipe())
     store = open_store(root)
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
     before = {entry.name for entry in store.place.entries()}
     again = ingest([logs], store=root, recipe=Recipe())
     assert [result.status for result in again.results] == ["unchanged"] * 2
     new = {entry.name for entry in store.place.entries()} - before
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-    assert [name.partition("/")[0] for name in new] == ["calls"] * 2
-    assert verify(root).problems == ()
-=======
     assert len(new) == 2
     assert all(name.startswith("calls/") for name in new)
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
 
 
 def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     assert ask_status(root).exit_code == 3
     ingest([logs / "one.mcap"], store=root, recipe=Recipe())
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-    ingest([logs], store=root, recipe=Recipe(), robot="husky")
-    assert len(list_open_calls(open_store(root).scan())) == 1, "other logs, another robot: none is its work"
-    ingest([logs], store=root, recipe=Recipe(), shard=(2, 2))
-    assert ask_status(root).exit_code == 3, "a task of an array does its share alone"
-    ingest([logs], store=root, recipe=Recipe())
-    assert ask_status(root).exit_code == 0
-    for shard in ((1, 2), (2, 2)):  # one of them has a log, or both
-        kill(logs, root, monkeypatch, shard=shard, force=True)
-=======
     ingest([logs], store=root, recipe=Recipe(), robot="jackal")
     assert len(list_open_calls(open_store(root).scan())) == 1, "other logs, another robot: none is its work"
     ingest([logs], store=root, recipe=Recipe(), shard=(1, 1))
@@ -232,7 +189,6 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
     ingest([logs], store=root, recipe=Recipe())
     assert ask_status(root).exit_code == 0
     kill(logs, root, monkeypatch, shard=(1, 1), force=True)
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
     assert ask_status(root).exit_code == 3
     assert ingest([logs.parent / "logs"], store=root, recipe=Recipe()).exit_code == 0
     assert ask_status(root).exit_code == 0
@@ -252,29 +208,6 @@ def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, 
     assert ask_status(root).exit_code == 3
 
 
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-def test_an_error_ends_a_call_with_its_message_and_an_interrupt_leaves_it(tmp_path):
-    store = open_store(tmp_path, create=True)
-    for error, left in ((StoreError("full"), 0), (ValueError("a bug"), 0), (KeyboardInterrupt(), 1)):
-        with suppress(StoreError, ValueError, KeyboardInterrupt), record_call(store, "ingest", ["/logs"]) as call:
-            call.begin()
-            raise error
-        assert len(list_open_calls(store.scan())) == left
-    ended = [(call.exit_code, call.message) for _, call in reversed(store.scan().calls)]
-    assert ended == [(1, "full"), (1, "ValueError: a bug"), (None, "")]
-
-
-def test_calls_of_one_time_have_keys_of_their_own_and_the_latest_is_the_first(tmp_path):
-    store = open_store(tmp_path, create=True)
-    with record_call(store, "ingest", ["/one"]) as one, record_call(store, "ingest", ["/two"]) as two:
-        one.begin()
-        two.begin()
-    with record_call(store, "ingest", ["/three"]):
-        pass
-    found = store.scan().calls
-    assert found[0][1].works_on == ("/three",)
-    assert len({key for key, _ in found}) == 3
-=======
 def test_a_call_that_was_done_by_another_says_by_which(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     ingest([logs], store=root, recipe=Recipe())
@@ -303,7 +236,6 @@ def test_an_error_ends_a_call_and_an_interrupt_leaves_it(tmp_path):
         with suppress(StoreError, KeyboardInterrupt), record_call(store, "ingest", ["/logs"]):
             raise error
         assert len(list_open_calls(store.scan())) == left
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
 
 
 HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid": os.getpid()}
@@ -331,13 +263,8 @@ def test_a_call_that_runs_is_told_from_a_killed_one_as_far_as_can_be_seen(tmp_pa
     monkeypatch.setattr(calls, "identify_process", lambda: here)
     begin = (datetime.now(UTC) - timedelta(seconds=age_s)).isoformat(timespec="milliseconds")
     store = open_store(tmp_path, create=True)
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-    begun = Call(command="ingest", version="2.0", works_on=("/logs",), process=replace(here, **other), begin=begin)
-    store.put(store.scan(), "calls", "0" * 16, begun)
-=======
     begun = Call(command="ingest", version="2", works_on=("/logs",), process=replace(here, **other), begin=begin)
     store.put(store.scan(), "calls", f"{1:016x}", begun)
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
     (call,) = list_open_calls(store.scan())
     assert call.state == state
     if state == "killed":
@@ -365,11 +292,7 @@ def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_pa
         ("log-waiting", str(logs / "new.mcap"), "pending"),
         ("log-waiting", str(logs / "future.mcap"), "growing"),
     }
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-    with record_call(open_store(store), "ingest", [str(logs)]):
-=======
     with record_call(open_store(store), "ingest", [str(logs)], CallOptions()):
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
         assert after(2).exit_code == 0, "somebody is at it"
     elsewhere = drive_at(tmp_path / "archive" / "old.mcap", seed=4)
     os.utime(elsewhere, ns=(10**18, 10**18))
@@ -396,10 +319,6 @@ def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path
     assert ask_status(tmp_path / "store").exit_code == 0
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0, "there is nothing new"
     drive_at(logs / "later.mcap", seed=7)
-<<<<<<< HEAD:tests/unit/pipeline/test_killed_calls.py
-    (result,) = [each for each in ingest([logs], store=tmp_path / "store", recipe=Recipe()).results if each.problems]
-    assert "read-only" in result.problems[0]
-=======
     monkeypatch.setattr(ingest_module, "ingest_one", lambda *_: pytest.fail("it is read before that is known"))
     with pytest.raises(StoreError, match="read-only"):
         ingest([logs], store=tmp_path / "store", recipe=Recipe())
@@ -432,4 +351,3 @@ def test_status_without_logs_asks_each_folder_as_the_call_was_that_was_given_it(
     assert (found.counts, found.problems) == ({"done": 3}, ())
     assert ask_status(store, parts).counts == {"pending": 2}
     assert ask_status(store, logs).counts == {"outdated": 2}
->>>>>>> cdde767233a42cd9048f0d900e5d57b68b60cdff:tests/unit/pipeline/test_calls.py
