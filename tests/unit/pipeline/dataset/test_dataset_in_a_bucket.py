@@ -75,7 +75,7 @@ def test_what_lies_there_and_is_no_dataset_is_left_alone(made, bucket):
         build_dataset("s3://sets", store=made / "store", recipe=Recipe())
     assert files(bucket[0]) == {"notes.txt": b"mine"}
     shutil.copytree(made / "store", bucket[0] / "st")
-    with pytest.raises(UsageError, match=r"s3://sets/st: contains index and no dataset.json; it is not changed"):
+    with pytest.raises(UsageError, match=r"s3://sets/st: contains blobs and no dataset.json; it is not changed"):
         build_dataset("s3://sets/st", store=made / "store", recipe=Recipe())
 
 
