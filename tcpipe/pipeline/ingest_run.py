@@ -13,7 +13,6 @@ import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
-from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.integrity import compute_checksums
 from tcpipe.formats.json_files import to_plain
@@ -272,7 +271,7 @@ def put_run(store: Store, state: State, run: Run, directory: Path, stored: RunFa
     """Put the files of a run into the store, then its manifest; ``stored`` has streams that are there already."""
     files = compute_checksums(directory)
     streams = {name: checksum for name, checksum in files.items() if name.startswith(f"{STREAMS}/")}
-    store.put_blob(blob := make_unique_name(), directory)
+    blob = store.put_blob(directory)
     run = replace(
         run,
         blob=blob,

@@ -12,7 +12,6 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.integrity import compute_checksum
@@ -88,7 +87,7 @@ def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
     )
     if name in state.maps and not options.force:
         return _find_unchanged(store, state, name, inputs)
-    with store.new_map(name, make_unique_name()) as (path, put):
+    with store.new_map(name) as (path, put):
         build_map(
             path,
             name=name,
