@@ -201,7 +201,7 @@ def test_payload_that_a_running_call_has_not_named_yet_is_no_problem(copy):
 
 def test_what_is_none_of_these_is_said(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(UsageError, match="give|name its store"):
+        with pytest.raises(UsageError, match=r"give|name its store"):
             verify(path)
 
 
