@@ -42,13 +42,11 @@ def list_named_files(records: Iterable[RunFacts | StoredMap]) -> set[str]:
     """Return the files of payload that belong to runs and maps, and the page of each run."""
     named = set[str]()
     for record in records:
-        parts = [(record.blob, record.tables if isinstance(record, RunFacts) else record.files)]
-        parts += (
-            [(record.streams_blob, record.streams), (record.blob, {REPORT: None})]
-            if isinstance(record, RunFacts)
-            else []
-        )
-        named |= {f"{blob}/{name}" for blob, names in parts for name in names}
+        if isinstance(record, RunFacts):
+            named |= {f"{record.streams_blob}/{name}" for name in record.streams}
+            named |= {f"{record.blob}/{name}" for name in (*record.tables, REPORT)}
+        else:
+            named |= {f"{record.blob}/{name}" for name in record.files}
     return named
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -215,16 +216,18 @@ def _verify_documents(place: Place) -> Iterator[CheckResult]:
     for kind in KINDS:
         names = [str(name) for file in place.list(kind) if (name := parse_name(kind, file)) is not None]
         yield "documents", len(names)
-        for line in filter(None, place.map(lambda name, kind=kind: _check_document(place, kind, name), names)):  # type: ignore[misc]
-            yield from (line, Repair(f"{line.partition(': ')[0]}: copy it again, or {_REPAIRS[kind]}"))
+        damaged = place.map(lambda name, kind=kind: _is_damaged(place, kind, name), names)  # type: ignore[misc]
+        for where in map(place.where, itertools.compress(names, damaged)):
+            yield f"{where}: is missing or has changed since it was written"
+            yield Repair(f"{where}: copy it again, or {_REPAIRS[kind]}")
 
 
-def _check_document(place: Place, kind: Kind, name: str) -> str | None:
+def _is_damaged(place: Place, kind: Kind, name: str) -> bool:
     try:
         read_record(place, name, RECORDS[kind])
-    except StoreError as error:
-        return error.problems[0].partition(";")[0]
-    return None
+    except StoreError:
+        return True
+    return False
 
 
 def _verify_page(place: Place) -> Iterator[CheckResult]:
