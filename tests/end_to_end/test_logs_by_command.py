@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,6 +15,7 @@ from stored_files import only_run
 from wheel_drives import drive_at
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap, write_rosbag2
+from tcpipe.store import Store
 from tcpipe.tables.findings import select_findings
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -37,11 +37,6 @@ def drive(*, simulated: bool = False) -> list[MessageStream]:
     return [MessageStream("/wheel/odom", ODOMETRY, log_ns, columns, texts)]
 
 
-def run_json(store: Path) -> dict:
-    (path,) = store.glob("runs/*/run-1.json")
-    return json.loads(path.read_text())
-
-
 @pytest.mark.parametrize(("content", "store"), [(b"nonsense", "tcpipe-store"), (b"#ROSBAG V2.0\n", "deep/down/store")])
 def test_what_cannot_be_ingested_leaves_no_store(tmp_path, content, store):
     (tmp_path / "a.bag").write_bytes(content)
@@ -59,10 +54,10 @@ def test_what_cannot_be_ingested_leaves_no_store(tmp_path, content, store):
 def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     write_rosbag2(tmp_path / "run", drive(simulated=True), storage="sqlite3")
     assert tcpipe("ingest", "run", cwd=tmp_path).returncode == 0
-    found = run_json(tmp_path / "tcpipe-store")
-    assert found["damage"] == []
-    assert [of["code"] for of in found["notes"]] == ["no-checksum"]
-    assert "simulated-time" in {of["code"] for of in found["report"]["findings"]}
+    found = only_run(tmp_path / "tcpipe-store").manifest
+    assert found.damage == ()
+    assert [of.code for of in found.notes] == ["no-checksum"]
+    assert "simulated-time" in {of.code for of in found.read_report.findings}
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
@@ -122,7 +117,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
         "1 log failed before and was skipped; --retry-failed tries it again",
         "1 log known as damaged or empty; 'tcpipe acknowledge RUN' after you have checked it",
     ]
-    (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
+    (run_id,) = {run.run_id for run in Store(tmp_path / "tcpipe-store").runs() if run.run_id.startswith("cut-")}
     refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
     assert f"nosuch: is no run or log with a known problem in tcpipe-store; known problems: {junk}, {run_id}" in refused
     done = tcpipe("acknowledge", run_id, "logs/junk.bag", cwd=tmp_path)
@@ -191,7 +186,7 @@ def test_logs_in_object_storage(tmp_path):
         first = tcpipe("ingest", "s3://drives", cwd=tmp_path, env=environment)
         assert "s3://drives/junk.bag: not a log" in plain_lines(first, 3)
         assert "1 done, 1 failed" in first.stdout
-        assert run_json(tmp_path / "tcpipe-store")["source"]["paths"] == ["s3://drives/run.mcap"]
+        assert only_run(tmp_path / "tcpipe-store").facts.log.paths == ("s3://drives/run.mcap",)
         assert set(fetched) == {"junk.bag", "run.mcap"}
         requests = len(fetched)
         again = tcpipe("ingest", "s3://drives/run.mcap", cwd=tmp_path, env=environment)
