@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock docs pictures release clean
+.PHONY: help demo test test-benchmarks test-operations test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock docs pictures release clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -57,6 +57,10 @@ check-and-train: check
 # Each program of benchmarks/ once, at its smallest size; some minutes on two cores.
 test-benchmarks: .venv/installed-dev
 	$(BIN)/pytest benchmarks/test_benchmarks.py $(PYTEST)
+
+# Kills and interruptions at every request of calls on one store; about an hour on two cores.
+test-operations: .venv/installed-dev
+	TCPIPE_TEST_OPERATIONS=1 $(BIN)/pytest -rs tests/unit/pipeline/test_store_attacks.py $(PYTEST)
 
 # Stores in a real object store: OBJECT_STORAGE is a program that starts and stops one below a directory, which `start` fills with `env`.
 OBJECT_STORAGE ?= ../shared/tools/object-storage

@@ -127,6 +127,8 @@ class RunningCall:
     """Whether all of its work is done, so that killed calls that were to do the same are closed."""
     result: dict[str, Any] = field(default_factory=dict)
     """Values of its record when it ends: exit code, counts and such."""
+    error: StoreError | None = None
+    """Why its record could not be written: the store cannot be written to."""
 
     def begin(self) -> None:
         """Write the first document of the call, unless it is written."""
@@ -139,6 +141,7 @@ class RunningCall:
         try:
             self.store.put(self.state, "calls", self.key, call)
         except StoreError as error:
+            self.error = error
             logger.debug("%s", error)
 
 
@@ -191,11 +194,6 @@ def _close_killed_calls(running: RunningCall) -> None:
         if each.key == running.key or not _is_done_by(each.call, running.call):
             continue
         close_call(running.store, running.state, each, f"its work was done by {CALL_PREFIX}{running.key}")
-
-
-def make_blob_name() -> str:
-    """Return the name of a folder of payload that nobody else writes to: random."""
-    return secrets.token_hex(8)
 
 
 def close_call(store: Store, state: State, killed: OpenCall, message: str) -> None:

@@ -126,6 +126,8 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path) -> Ing
     tell(chain(_iterate_missing(found), _iterate_finished(call.state, steps)))
     if any(step.is_todo for step in steps):
         call.begin()
+        if call.error is not None:  # before logs are read for hours
+            raise call.error
         tell(_iterate_results(call, steps, jobs=options.jobs, cluster=options.cluster))
     summary = IngestSummary(store.root, tuple(results[index] for index in sorted(results)))
     call.is_whole = shard is None

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
+from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.integrity import compute_checksums
 from tcpipe.formats.json_files import to_plain
@@ -30,7 +31,6 @@ from tcpipe.formats.stored_runs import (
     write_streams,
 )
 from tcpipe.logs.topics import split_notes
-from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.log_sources import LogSource, find_damaged_log, find_total_loss
 from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
@@ -272,7 +272,7 @@ def put_run(store: Store, state: State, run: Run, directory: Path, stored: RunFa
     """Put the files of a run into the store, then its manifest; ``stored`` has streams that are there already."""
     files = compute_checksums(directory)
     streams = {name: checksum for name, checksum in files.items() if name.startswith(f"{STREAMS}/")}
-    store.put_blob(blob := make_blob_name(), directory)
+    store.put_blob(blob := make_unique_name(), directory)
     run = replace(
         run,
         blob=blob,

@@ -1,0 +1,353 @@
+"""Every call on a store is recorded: how it ended and why; one that was killed is a problem until another has done its work."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+
+import pytest
+from click.testing import CliRunner
+from object_gateway import open_bucket
+from synthetic_store import add_run, lanes, segments
+from wheel_drives import START_NS, ask_status, drive_at
+
+from tcpipe.cli import cli
+from tcpipe.errors import StoreError, TcpipeError, UsageError
+from tcpipe.formats.store_records import Call
+from tcpipe.pipeline import calls
+from tcpipe.pipeline import ingest as ingest_module
+from tcpipe.pipeline import status as status_module
+from tcpipe.pipeline.calls import close_call, identify_process, list_open_calls, record_call
+from tcpipe.pipeline.ingest import CallOptions, ingest
+from tcpipe.pipeline.problems import acknowledge
+from tcpipe.recipe import Recipe
+from tcpipe.store import open_store
+
+NIGHT_S = 86_400
+
+
+@pytest.fixture(params=["directory", "bucket"])
+def root(request, tmp_path, monkeypatch):
+    """Where a store is to be."""
+    if request.param == "directory":
+        return tmp_path / "store"
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return f"{url}/store"
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("killed")
+    drive_at(folder / "one.mcap")
+    drive_at(folder / "two.mcap", seed=1, start_ns=START_NS + 10**13)
+    return folder
+
+
+@pytest.fixture
+def logs(drives, tmp_path):
+    """Two logs that were written long ago."""
+    shutil.copytree(drives, tmp_path / "logs")
+    for path in (tmp_path / "logs").iterdir():
+        os.utime(path, ns=(10**18, 10**18))
+    return tmp_path / "logs"
+
+
+def kill(logs, store, monkeypatch, **how):
+    """Let an ingest end as if it were killed, by what no handler of errors sees, and its process be gone."""
+
+    def died(*_, **__):
+        raise SystemExit
+
+    with monkeypatch.context() as patch, suppress(SystemExit):
+        patch.setattr(ingest_module, "_iterate_results", died)
+        patch.setattr(calls, "identify_process", lambda: replace(identify_process(), start="1"))
+        ingest([logs], store=store, **{"recipe": Recipe(), **how})
+
+
+def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_it(tmp_path, logs):
+    code = (
+        "import os, signal, sys; from tcpipe.pipeline import ingest; from tcpipe.recipe import Recipe\n"
+        "ingest._iterate_results = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "ingest.ingest([sys.argv[1]], store=sys.argv[2], recipe=Recipe())"
+    )
+    done = subprocess.run([sys.executable, "-c", code, logs, tmp_path / "store"], check=False)
+    assert done.returncode == -9
+    found = CliRunner().invoke(cli, ["status", str(tmp_path / "store"), "--json"], standalone_mode=False)
+    assert found.return_value == 3
+    (finding,) = json.loads(found.stdout)["problems"]
+    assert (finding["code"], finding["names"]["command"]) == ("call-killed", "ingest")
+    lines = CliRunner().invoke(cli, ["status", str(tmp_path / "store")], standalone_mode=False).stderr
+    (killed,) = ask_status(tmp_path / "store").open_calls
+    assert f"was killed. To acknowledge it: 'tcpipe acknowledge {killed.name}' [call-killed]" in lines
+    assert json.loads(found.stdout)["counts"] == {"pending": 2}
+    assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0
+    assert (ask_status(tmp_path / "store").exit_code, ask_status(tmp_path / "store").open_calls) == (0, ())
+
+
+def read_calls(root):
+    """Return command, exit code and the first words of the message of each call, the earliest first."""
+    calls_of = [call for _, call in reversed(open_store(root).scan().calls)]
+    return [(call.command, call.exit_code, call.message.partition(":")[0]) for call in calls_of]
+
+
+def test_every_call_is_recorded_with_its_exit_code_and_message_also_one_that_is_refused_at_once(root, logs):
+    ingest([logs], store=root, recipe=Recipe())
+    ingest([logs], store=root, recipe=Recipe())
+    junk = logs / "junk.bag"
+    junk.write_bytes(b"junk" * 100)
+    assert ingest([logs], store=root, recipe=Recipe()).exit_code == 3
+    wrong = [
+        lambda: ingest([logs], store=root, recipe=Recipe(), robot="nosuch"),
+        lambda: ingest([logs / "gone"], store=root, recipe=Recipe()),
+        lambda: ingest([logs], store=root, recipe=logs / "nosuch.toml"),
+        lambda: acknowledge(["nosuch"], store=root),
+    ]
+    for call in wrong:
+        with pytest.raises(TcpipeError):
+            call()
+    assert acknowledge([str(junk)], store=root).acknowledged
+    found = read_calls(root)
+    assert [call[:2] for call in found] == [
+        ("ingest", 0), ("ingest", 0), ("ingest", 3), ("ingest", 2), ("ingest", 2), ("ingest", 2), ("acknowledge", 2), ("acknowledge", 0),
+    ]  # fmt: skip
+    assert [message for _, _, message in found[2:7]] == [
+        str(junk), "robot 'nosuch' is not known; known", str(logs / "gone"), str(logs / "nosuch.toml"), "nosuch",
+    ]  # fmt: skip
+    assert [call.exit_code for call in ask_status(root).history] == [code for _, code, _ in reversed(found)]
+    assert f"exit code 3: {junk}: " in str(ask_status(root))
+    assert ask_status(root).open_calls == ()
+
+
+def test_an_internal_error_ends_a_call_with_exit_code_1(root, logs, monkeypatch):
+    ingest([logs / "one.mcap"], store=root, recipe=Recipe())
+    monkeypatch.setattr(ingest_module, "plan", lambda *_: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        ingest([logs], store=root, recipe=Recipe())
+    assert read_calls(root)[-1] == ("ingest", 1, "ZeroDivisionError")
+
+
+@pytest.mark.parametrize("how", ["robot", "log", "recipe", "existing store"])
+def test_a_call_that_is_refused_on_a_new_store_creates_nothing(tmp_path, logs, how, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wrong = {
+        "robot": {"robot": "nosuch"},
+        "log": {"logs": [tmp_path / "gone"]},
+        "recipe": {"recipe": tmp_path / "nosuch.toml"},
+        "existing store": {"existing_store": True},
+    }
+    with pytest.raises(TcpipeError):
+        ingest(**{"logs": [logs], "store": tmp_path / "new", "recipe": Recipe(), **wrong[how]})
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_store_that_has_to_be_there_and_is_not_is_one_line_and_a_new_one_is_said(root, logs):
+    told = []
+    with pytest.raises(TcpipeError) as caught:
+        ingest([logs], store=root, recipe=Recipe(), existing_store=True, on_note=told.append)
+    assert caught.value.problems == (f"{root}: there is no store here (--existing-store); is a disk not mounted?",)
+    assert (caught.value.exit_code, told) == (1, [])
+    for _ in range(2):
+        assert ingest([logs / "one.mcap"], store=root, recipe=Recipe(), on_note=told.append).exit_code == 0
+    assert told == [f"new store: {root}"]
+    assert ingest([logs], store=root, recipe=Recipe(), existing_store=True, on_note=told.append).exit_code == 0
+    assert len(told) == 1
+
+
+def test_a_call_that_runs_is_no_problem(root, logs):
+    assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
+    with record_call(open_store(root), "ingest", [str(logs)], CallOptions()):
+        found = ask_status(root)
+        assert (found.exit_code, [call.state for call in found.open_calls]) == (0, ["running"])
+        assert "running: ingest of 20" in str(found)
+    assert ask_status(root).open_calls == ()
+
+
+def test_a_call_with_nothing_to_do_writes_its_record_alone(root, logs):
+    ingest([logs], store=root, recipe=Recipe())
+    store = open_store(root)
+    before = {entry.name for entry in store.place.entries()}
+    again = ingest([logs], store=root, recipe=Recipe())
+    assert [result.status for result in again.results] == ["unchanged"] * 2
+    new = {entry.name for entry in store.place.entries()} - before
+    assert len(new) == 2
+    assert all(name.startswith("calls/") for name in new)
+
+
+def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypatch):
+    kill(logs, root, monkeypatch)
+    assert ask_status(root).exit_code == 3
+    ingest([logs / "one.mcap"], store=root, recipe=Recipe())
+    ingest([logs], store=root, recipe=Recipe(), robot="jackal")
+    assert len(list_open_calls(open_store(root).scan())) == 1, "other logs, another robot: none is its work"
+    ingest([logs], store=root, recipe=Recipe(), shard=(1, 1))
+    assert ask_status(root).exit_code == 3, "a task of an array does its share alone"
+    ingest([logs], store=root, recipe=Recipe())
+    assert ask_status(root).exit_code == 0
+    kill(logs, root, monkeypatch, shard=(1, 1), force=True)
+    assert ask_status(root).exit_code == 3
+    assert ingest([logs.parent / "logs"], store=root, recipe=Recipe()).exit_code == 0
+    assert ask_status(root).exit_code == 0
+    kill(logs / "two.mcap", root, monkeypatch, force=True)
+    ingest([logs], store=root, recipe=Recipe())
+    assert ask_status(root).exit_code == 0, "a folder is all the logs in it"
+
+
+def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, logs, monkeypatch):
+    kill(logs, root, monkeypatch)
+    (call,) = ask_status(root).open_calls
+    with pytest.raises(UsageError, match="nosuch: is no run or log with a known problem"):
+        acknowledge(["nosuch"], store=root)
+    assert [of.finding.code for of in acknowledge([call.name], store=root).acknowledged] == ["call-killed"]
+    assert (ask_status(root).exit_code, ask_status(root).open_calls) == (0, ())
+    kill(logs, root, monkeypatch)
+    assert ask_status(root).exit_code == 3
+
+
+def test_a_call_that_was_done_by_another_says_by_which(root, logs, monkeypatch):
+    kill(logs, root, monkeypatch)
+    ingest([logs], store=root, recipe=Recipe())
+    killed, other = (call for _, call in reversed(open_store(root).scan().calls))
+    key = open_store(root).scan().calls[0][0]
+    assert (killed.exit_code, killed.message) == (1, f"its work was done by call-{key}")
+    assert other.exit_code == 0
+
+
+def test_a_call_that_ends_while_another_takes_it_for_killed_keeps_its_own_end(root, logs):
+    """Its process is gone, and the scan was made before it ended."""
+    ingest([logs / "one.mcap"], store=root, recipe=Recipe())
+    store = open_store(root)
+    with record_call(store, "ingest", ["/logs"], CallOptions()) as call:
+        before = store.scan()
+        call.result = {"exit_code": 3, "message": "its own"}
+    (open_call,) = list_open_calls(before)
+    close_call(store, before, open_call, "acknowledged as killed")
+    assert read_calls(root)[-1] == ("ingest", 3, "its own")
+
+
+def test_an_error_ends_a_call_and_an_interrupt_leaves_it(tmp_path):
+    store = open_store(tmp_path, create=True)
+    add_run(store, "a", segments("a", *lanes(0.0, 0.0, 5.0)))
+    for error, left in ((StoreError("full"), 0), (KeyboardInterrupt(), 1)):
+        with suppress(StoreError, KeyboardInterrupt), record_call(store, "ingest", ["/logs"]):
+            raise error
+        assert len(list_open_calls(store.scan())) == left
+
+
+HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid": os.getpid()}
+
+
+@pytest.mark.parametrize(
+    ("other", "age_s", "state"),
+    [
+        ({}, 0, "running"),
+        ({}, 9 * NIGHT_S, "running"),
+        ({"start": "1"}, 0, "killed"),  # its number was given to another process since
+        ({"pid": 2**22 + 1}, 0, "killed"),
+        ({"boot": "a"}, 0, "killed"),  # the power was lost
+        ({"host": "node7"}, 60, "perhaps running"),
+        ({"host": "node7"}, NIGHT_S + 60, "killed"),
+        ({"host": "node7"}, -600, "perhaps running"),  # its clock is ahead
+        ({"host": "node7"}, -900 * NIGHT_S, "killed"),
+        ({"machine": "another of this name"}, 60, "perhaps running"),
+        ({"namespace": "pid:[2]"}, 60, "perhaps running"),  # a container
+        ({"boot": "", "start": ""}, 60, "perhaps running"),  # no Linux
+    ],
+)
+def test_a_call_that_runs_is_told_from_a_killed_one_as_far_as_can_be_seen(tmp_path, monkeypatch, other, age_s, state):
+    here = replace(identify_process(), **HERE)
+    monkeypatch.setattr(calls, "identify_process", lambda: here)
+    begin = (datetime.now(UTC) - timedelta(seconds=age_s)).isoformat(timespec="milliseconds")
+    store = open_store(tmp_path, create=True)
+    begun = Call(command="ingest", version="2", works_on=("/logs",), process=replace(here, **other), begin=begin)
+    store.put(store.scan(), "calls", f"{1:016x}", begun)
+    (call,) = list_open_calls(store.scan())
+    assert call.state == state
+    if state == "killed":
+        assert call.problem.finding.code == ("call-lost" if "host" in other else "call-killed")
+
+
+def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_path, logs, monkeypatch):
+    store, now_ns = tmp_path / "store", status_module.time.time_ns
+    ingest([logs], store=store, recipe=Recipe())
+    drive_at(logs / "new.mcap", seed=2, start_ns=START_NS + 10**14)
+    drive_at(logs / "future.mcap", seed=3, start_ns=START_NS + 2 * 10**14)
+    os.utime(logs / "new.mcap", ns=(10**18, 10**18))
+    os.utime(logs / "future.mcap", ns=(4 * 10**18, 4 * 10**18))
+
+    def after(nights):
+        later = SimpleNamespace(time_ns=lambda: now_ns() + nights * NIGHT_S * 10**9 + 10**9)
+        monkeypatch.setattr(status_module, "time", later)
+        return ask_status(store)
+
+    assert after(0).exit_code == 0, "a copy keeps its old modification time; it came today"
+    assert after(1).exit_code == 0
+    found = after(2)
+    assert (found.exit_code, found.counts) == (3, {"done": 2, "pending": 1, "growing": 1})
+    assert {(of.code, of.subject.name, of.names["state"]) for of in found.problems} == {
+        ("log-waiting", str(logs / "new.mcap"), "pending"),
+        ("log-waiting", str(logs / "future.mcap"), "growing"),
+    }
+    with record_call(open_store(store), "ingest", [str(logs)], CallOptions()):
+        assert after(2).exit_code == 0, "somebody is at it"
+    elsewhere = drive_at(tmp_path / "archive" / "old.mcap", seed=4)
+    os.utime(elsewhere, ns=(10**18, 10**18))
+    monkeypatch.setattr(status_module, "time", SimpleNamespace(time_ns=lambda: now_ns() + 9 * NIGHT_S * 10**9))
+    assert ask_status(store, elsewhere.parent).exit_code == 0, "no ingest was asked for it"
+    acknowledge([str(logs / "new.mcap"), str(logs / "future.mcap")], store=store)
+    assert after(9).exit_code == 0
+    os.utime(logs / "future.mcap")
+    assert ingest([logs], store=store, recipe=Recipe()).exit_code == 0
+    assert after(9).counts == {"done": 4}
+
+
+def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path, logs, monkeypatch):
+    ingest([logs], store=tmp_path / "store", recipe=Recipe())
+    store = open_store(tmp_path / "store")
+
+    def refused(*_, **__):
+        raise StoreError("read-only")
+
+    for verb in ("put", "put_files", "delete"):
+        monkeypatch.setattr(type(store.place), verb, refused)
+    with record_call(store, "build-dataset", ["/out"]):
+        assert list_open_calls(store.scan()) == []
+    assert ask_status(tmp_path / "store").exit_code == 0
+    assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0, "there is nothing new"
+    drive_at(logs / "later.mcap", seed=7)
+    monkeypatch.setattr(ingest_module, "ingest_one", lambda *_: pytest.fail("it is read before that is known"))
+    with pytest.raises(StoreError, match="read-only"):
+        ingest([logs], store=tmp_path / "store", recipe=Recipe())
+
+
+# --- the options of a call ------------------------------------------------------------------------------------------
+
+
+def test_status_without_logs_asks_with_the_options_that_the_latest_call_was_given(tmp_path, logs):
+    store = tmp_path / "store"
+    assert ingest([logs], store=store, recipe=Recipe(), robot="jackal").exit_code == 0
+    assert ask_status(store).counts == {"done": 2}
+    assert ask_status(store, logs).counts == {"outdated": 2}, "who names the logs names the options, too"
+    assert ingest([logs], store=store, recipe=Recipe()).exit_code == 0
+    assert ask_status(store).counts == {"done": 2}
+
+
+def test_status_without_logs_asks_each_folder_as_the_call_was_that_was_given_it(tmp_path, logs):
+    store, parts, definitions = tmp_path / "store", tmp_path / "parts", tmp_path / "definitions"
+    definitions.mkdir()
+    (definitions / "Own.msg").write_text("float64 volt\n")
+    parts.mkdir()
+    for number in range(2):
+        drive_at(parts / f"{number}.mcap", seed=8 + number, start_ns=START_NS + number * 10**11)
+    for path in parts.iterdir():
+        os.utime(path, ns=(10**18, 10**18))
+    assert ingest([parts], store=store, recipe=Recipe(), as_one=True).exit_code == 0
+    assert ingest([logs], store=store, recipe=Recipe(), message_definitions=definitions).exit_code == 0
+    found = ask_status(store)
+    assert (found.counts, found.problems) == ({"done": 3}, ())
+    assert ask_status(store, parts).counts == {"pending": 2}
+    assert ask_status(store, logs).counts == {"outdated": 2}
