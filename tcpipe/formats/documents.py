@@ -222,7 +222,7 @@ def _join_runs(facts: Mapping[Kind, Mapping[str, Any]]) -> dict[str, RunFacts]:
 
 
 def _find_beginning(row: RunFacts) -> tuple[object, ...] | None:
-    if row.recording is None:
+    if row.recording is None or not row.blob:  # what was pruned takes the place of nothing
         return None
     return row.robot, row.ingest_key, row.recording.first_ns, row.recording.beginning
 
