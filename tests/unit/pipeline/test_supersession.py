@@ -11,7 +11,7 @@ from tcpipe.formats.logs.writing import write_mcap
 from tcpipe.formats.runs import LogOrigin, Recording
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.problems import forget_tables
-from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.recipe import ReadConfig, Recipe, TableMapping
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Subject, make_finding
 
@@ -152,17 +152,15 @@ def test_a_log_that_lost_its_end_takes_the_place_of_nothing(tmp_path):
 @pytest.mark.parametrize("rest_s", [0.0, 3.0])
 def test_drives_in_tables_whose_time_starts_at_0_do_not_supersede_each_other(tmp_path, rest_s):
     """Also where each robot rests at first, so that its odometer gives the same values in each drive."""
-    (tmp_path / "tcpipe.toml").write_text(
-        '[tables.wheel_odometry]\nfile = "drive_*.csv"\ntime = "t"\ntime_unit = "s"\n'
-        'velocity_mps = "v"\nyaw_rate_radps = "w"\n'
-    )
+    wheels = TableMapping("drive_*.csv", stamp="t", stamp_unit="s", columns={"linear_x": "v", "angular_z": "w"})
+    recipe = Recipe(tables={"wheel_odometry": wheels})
+    (tmp_path / "logs").mkdir()
     for seed in range(2):
         t = np.arange(0.0, 40.0, 0.05)
         v = np.where(t < rest_s, 0.0, 1.0 + 0.01 * np.random.default_rng(seed).standard_normal(len(t)))
         lines = (f"{time:.2f},{speed:.6f},0.0" for time, speed in zip(t, v, strict=True))
-        (tmp_path / "logs").mkdir(exist_ok=True)
         (tmp_path / "logs" / f"drive_{seed}.csv").write_text("\n".join(["t,v,w", *lines]))
-    summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=tmp_path / "tcpipe.toml")
+    summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=recipe)
     assert [result.status for result in summary.results] == ["done", "done"], summary.results
     assert superseded(Store(tmp_path / "store")) == {}
 
