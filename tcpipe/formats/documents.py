@@ -227,7 +227,7 @@ Beginning: TypeAlias = tuple[str, str, int, str]
 
 
 def _find_beginning(row: RunFacts) -> Beginning | None:
-    if row.recording is None:
+    if row.recording is None or not row.blob:  # what was pruned takes the place of nothing
         return None
     return row.robot, row.ingest_key, row.recording.first_ns, row.recording.beginning
 

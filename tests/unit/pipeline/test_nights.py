@@ -5,20 +5,17 @@ import os
 import shutil
 
 import pytest
-from tcpipe.formats.run_documents import LogOrigin, RunJson
 from wheel_drives import START_NS, ask_status, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
+from tcpipe.formats import documents
 from tcpipe.formats.logs.writing import MessageStream, write_bag, write_rosbag2
-from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import plan as plan_module
-from tcpipe.pipeline.calls import LogWriter
 from tcpipe.pipeline.ingest import ingest, run_ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe
@@ -53,7 +50,7 @@ def copy_part(whole, to, share):
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "run.mcap.active"])
-def test_a_half_copied_log_is_superseded_when_it_is_complete_and_counts_when_it_is_back(tmp_path, night, name):
+def test_a_half_copied_log_is_superseded_as_soon_as_the_whole_one_is_there(tmp_path, night, name):
     whole, log, first = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap", tmp_path / "logs" / name
     copy_part(whole, first, 0.6)
     half = (
@@ -61,52 +58,19 @@ def test_a_half_copied_log_is_superseded_when_it_is_complete_and_counts_when_it_
         if name == "run.mcap"
         else ingest([first], store=tmp_path / "store").results[0].run.run_id
     )
+    assert half in counted(tmp_path)
     first.unlink()
     shutil.copy(whole, log)
     found, code = night()
     assert (code, found["run.mcap"].status) == (0, "done")
-    assert found["run.mcap"].notes == (
-        f"run {half}, made from this path before, is superseded: this log contains its content",
-    )
+    assert found["run.mcap"].notes == (f"run {half} is superseded: this log begins in the same way and is longer",)
     assert half not in counted(tmp_path)
     assert inspect(tmp_path / "store", recipe=Recipe()).superseded == {half: found["run.mcap"].run.run_id}
     assert night()[0]["run.mcap"].notes == ()  # said once
-    for place in ("run.mcap", "elsewhere.mcap"):  # back where it was, then under another name
-        copy_part(whole, tmp_path / "logs" / place, 0.6)
-        assert f"run {half} counts again: its log is available again" in night()[0][place].notes
-        assert half in counted(tmp_path)
-        (tmp_path / "logs" / place).unlink()
-        shutil.copy(whole, log)
-        night()
-        assert half not in counted(tmp_path)
-
-
-def test_a_half_copied_log_that_lies_elsewhere_too_still_counts(tmp_path, night):
-    whole, log = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap"
-    copy_part(whole, log, 0.6)
-    shutil.copy(log, tmp_path / "logs" / "twin.mcap")
-    half = night()[0]["run.mcap"].run.run_id
-    shutil.copy(whole, log)
-    (note,) = night()[0]["run.mcap"].notes
-    assert note.endswith(f"stays: its log is at {tmp_path}/logs/twin.mcap")
-    assert half in counted(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("later", "why"),
-    [
-        ({"seed": 1, "start_ns": START_NS + 10**12}, "its content differs"),
-        ({"seed": 1}, "its content differs"),  # no battery behind the clock: each drive begins at one instant
-        ({"rows": 700}, "this log contains 47% of it"),
-    ],
-)
-def test_a_name_used_again_and_a_log_that_lost_something_supersede_nothing(tmp_path, night, later, why):
-    log = drive_at(tmp_path / "logs" / "latest.mcap")
-    before = night()[0]["latest.mcap"].run.run_id
-    drive_at(log, **later)
-    found, code = night()
-    assert (code, found["latest.mcap"].notes) == (0, (f"run {before}, made from this path before, stays: {why}",))
-    assert {before, found["latest.mcap"].run.run_id} <= counted(tmp_path)
+    copy_part(whole, tmp_path / "logs" / "elsewhere.mcap", 0.6)
+    assert night()[0]["elsewhere.mcap"].status == "unchanged"
+    assert half not in counted(tmp_path)
+    assert ask_status(tmp_path / "store").counts == {"done": 2, "superseded": 1}
 
 
 # --- logs that are still written ------------------------------------------------------------------------------------
@@ -171,7 +135,7 @@ def test_what_may_pass_is_tried_again(night, monkeypatch, error):
     def failing(*_, **__):
         raise error
 
-    monkeypatch.setattr(ingestion, "_fuse_and_label", failing)
+    monkeypatch.setattr(ingestion, "run_stages", failing)
     assert [told(night, "other.mcap") for _ in range(2)] == [("failed", False, 1)] * 2
     monkeypatch.undo()
     assert told(night, "other.mcap") == ("done", False, 0)
@@ -201,35 +165,46 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
     assert (code, found["cut.mcap"].acknowledged, found["junk.bag"].acknowledged) == (0, True, True)
     copy_part(tmp_path / "whole.mcap", cut, 0.5)
     assert night()[1] == 3  # that is another damage
-    checked = verify(tmp_path / "store")
-    assert checked.problems == ()
-    assert checked.read["commits"] == len(list((tmp_path / "store" / "log").iterdir()))
+    assert verify(tmp_path / "store").problems == ()
 
 
 # --- the memory of logs ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("broken", ["a digit", "half", "[]", "nothing", "gone"])
-def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost_for_good(tmp_path, night, broken):
-    run_id = night()[0]["other.mcap"].run.run_id
+def test_a_manifest_that_is_not_as_it_was_written_is_a_problem_and_its_log_is_ingested_again(tmp_path, night, broken):
+    run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run.run_id
     store = Store(tmp_path / "store")
-    number = store.state().runs[run_id, next(iter(store.state().runs))[1]].commit
-    commit = tmp_path / "store" / "log" / f"{number:010}.json"
-    whole = commit.read_bytes()
-    sha256 = run_id.rsplit("-", 1)[1].encode()
-    contents = {"a digit": whole.replace(sha256, b"0" * 8), "half": whole[:40], "[]": b"[]", "nothing": b""}
-    commit.write_bytes(contents[broken]) if broken in contents else commit.unlink()
+    (name,) = [name for (kind, _), name in store.scan().names.items() if kind == "runs"]
+    path = store.root / name
+    whole = path.read_bytes()
+    contents = {"a digit": whole.replace(b"1", b"2", 1), "half": whole[:40], "[]": b"[]", "nothing": b""}
+    path.write_bytes(contents[broken]) if broken in contents else path.unlink()
+    documents._DECODED.clear()  # as a later call would find it
     found = ask_status(store.root, min_age_s=0.0)
-    assert (found.exit_code, [of.code for of in found.problems]) == (
-        3,
-        ["commit-missing" if broken == "gone" else "commit-damaged"],
-    )
-    assert any(str(commit) in line for line in verify(store.root).problems)
-    assert [night()[0]["other.mcap"].status for _ in range(2)] == ["done", "unchanged"], "its manifest is found"
+    assert [of.code for of in found.problems] == ([] if broken == "gone" else ["document-damaged"])
+    assert (found.exit_code, found.counts) == (0 if broken == "gone" else 3, {"pending": 1})
+    (tmp_path / "logs" / "junk.mcap").write_bytes(JUNK)
+    assert [night()[0]["other.mcap"].status for _ in range(2)] == ["done", "unchanged"]
     assert counted(tmp_path) == {run_id}
-    assert ask_status(store.root, min_age_s=0.0).exit_code == 3, "what else it held nobody knows"
-    acknowledge([str(commit)], store=store.root)
+    assert [run.facts.tags for run in store.runs()] == [{"weather": "dry"}]
+    assert ask_status(store.root, min_age_s=0.0).problems == (), "a new manifest has taken its place"
+
+
+def test_a_document_that_is_damaged_and_that_no_call_writes_again_is_acknowledged(tmp_path, night):
+    night(tags={"weather": "dry"})
+    store = Store(tmp_path / "store")
+    (file,) = store.place.list("tags")
+    (store.root / "tags" / file).write_bytes(b"")
+    documents._DECODED.clear()  # as a later call would find it
+    night()
+    found = ask_status(store.root, min_age_s=0.0)
+    assert (found.exit_code, [of.subject.name for of in found.problems]) == (3, [f"tags/{file}"])
+    assert [run.facts.tags for run in store.runs()] == [{}]
+    acknowledge([f"tags/{file}"], store=store.root)
     assert ask_status(store.root, min_age_s=0.0).exit_code == 0
+    night(tags={"weather": "wet"})
+    assert [run.facts.tags for run in store.runs()] == [{"weather": "wet"}]
 
 
 def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, monkeypatch):
@@ -251,119 +226,86 @@ class _Killed(BaseException):
     pass
 
 
-def test_after_a_kill_between_manifest_and_commit_the_run_is_found_and_not_fused_again(tmp_path, night, monkeypatch):
-    real = LogWriter.commit
-
-    def killed(self, kind, entries):
-        if kind == "ingested":
-            raise _Killed
-        real(self, kind, entries)
+def test_after_a_kill_between_tables_and_manifest_the_log_is_ingested_by_the_next_call(tmp_path, night, monkeypatch):
+    def killed(*_):
+        raise _Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(LogWriter, "commit", killed)
+        patch.setattr(Store, "put_run", killed)
         with pytest.raises(_Killed):
             night()
     assert counted(tmp_path) == set()
-    assert any("no commit names it" in line for line in verify(tmp_path / "store").problems)
-    monkeypatch.setattr(ingestion, "_fuse_and_label", lambda *_: pytest.fail("it is fused again"))
+    assert ask_status(tmp_path / "store").counts == {"growing": 1}
     assert night()[0]["other.mcap"].status == "done"
     assert len(counted(tmp_path)) == 1
-    assert verify(tmp_path / "store").problems == ()
+    assert len(Store(tmp_path / "store").scan().blobs) == 2, "'tcpipe prune' removes the other"
 
 
-def test_what_an_ingest_under_another_recipe_replaces_can_be_pruned(tmp_path, night):
-    night()
+def test_after_a_kill_between_manifest_and_the_memory_of_the_log_nothing_is_fused_again(tmp_path, night, monkeypatch):
+    real = Store.put
+
+    def killed(self, state, kind, key, record, **how):
+        if kind == "seen":
+            raise _Killed
+        real(self, state, kind, key, record, **how)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "put", killed)
+        with pytest.raises(_Killed):
+            night()
+    monkeypatch.setattr(ingestion, "run_stages", lambda *_, **__: pytest.fail("it is fused again"))
+    assert night()[0]["other.mcap"].status == "unchanged"
+    assert len(counted(tmp_path)) == 1
+
+
+def test_runs_of_two_recipes_live_side_by_side_and_share_their_streams(tmp_path, night, monkeypatch):
+    night(tags={"soil": "dry"})
     other = Recipe(label=LabelConfig(velocity="fused"))
+    monkeypatch.setattr(ingestion, "_read", lambda *_: pytest.fail("the log is read again"))
     ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=other)
-    assert (
-        prune(store=tmp_path / "store", recipe=Recipe()).removed == ()
-    )  # the first recipe's results are the older ones
-    (old,) = prune(store=tmp_path / "store", recipe=other).removed
-    assert old.what == "old recipe"
-    assert verify(tmp_path / "store").problems == ()
+    first, second = Store(tmp_path / "store").runs()
+    assert first.run_id == second.run_id
+    assert first.facts.blob != second.facts.blob
+    assert first.facts.streams_blob == second.facts.streams_blob
+    assert [run.facts.tags for run in (first, second)] == [{"soil": "dry"}] * 2
+    for recipe in (Recipe(), other):
+        assert {
+            result.status for result in ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=recipe).results
+        } == {"unchanged"}
 
 
-def test_a_run_that_is_pruned_while_it_is_ingested_is_not_committed_but_made_by_the_next_call(
-    tmp_path, night, monkeypatch
-):
-    """Its files may be about to go; so may those of its other recipes, which a call commits again with their tags."""
-    store, other, real = tmp_path / "store", Recipe(label=LabelConfig(velocity="fused")), ingest_module._make_entries
-    night()
-    ingest([tmp_path / "logs"], store=store, recipe=other)
-
-    def meanwhile(log, task, of):
-        assert of.rows
-        monkeypatch.setattr(ingest_module, "_make_entries", real)
-        assert len(prune(store=store, recipe=other).removed) == 1
-        return real(log, task, of)
-
-    monkeypatch.setattr(ingest_module, "_make_entries", meanwhile)
-    (result,) = ingest([tmp_path / "logs" / "other.mcap"], store=store, recipe=Recipe(), force=True).results
-    assert result.status == "failed"
-    assert result.problems[0].startswith(f"{result.log}: 'tcpipe prune' removed run other-")
-    assert result.problems[0].endswith(" at the same time; run the command again")
-    assert len(Store(store).state().runs) == 1
-    assert night()[0]["other.mcap"].status == "done"
-    assert len(Store(store).runs()) == 2
-    assert verify(store).problems == ()
-
-
-def test_a_superseded_run_that_is_pruned_while_its_log_is_back_is_made_by_the_next_call(tmp_path, night, monkeypatch):
-    whole, log, store = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap", tmp_path / "store"
-    copy_part(whole, log, 0.6)
-    half = night()[0]["run.mcap"].run.run_id
-    shutil.copy(whole, log)
-    night()
-    copy_part(whole, tmp_path / "logs" / "back.mcap", 0.6)
-    real, other = ingest_module._make_entries, Recipe(label=LabelConfig(velocity="fused"))
-
-    def meanwhile(log, task, of):
-        monkeypatch.setattr(ingest_module, "_make_entries", real)
-        assert [each.what for each in prune(store=store).removed] == ["superseded run"]
-        return real(log, task, of)
-
-    def ingest_again():
-        (result,) = ingest([tmp_path / "logs" / "back.mcap"], store=store, recipe=other).results
-        return result
-
-    monkeypatch.setattr(ingest_module, "_make_entries", meanwhile)
-    result = ingest_again()
-    assert (result.status, Store(store).state().find_rows(half)) == ("failed", [])
-    result = ingest_again()
-    assert (result.status, result.run.run_id in counted(tmp_path)) == ("damaged", True)
-    assert verify(store).problems == ()
-
-
-def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit_wins(tmp_path, night, monkeypatch):
+def test_of_two_calls_that_ingest_one_recording_under_two_names_there_is_one_run(tmp_path, night, monkeypatch):
     shutil.copy(drive_at(tmp_path / "elsewhere" / "first.mcap", seed=7), tmp_path / "logs" / "second.mcap")
-    real = ingest_module._make_entries
+    real = ingestion.run_stages
 
-    def meanwhile(log, task, of):
-        if of.result.log.endswith("second.mcap") and of.rows:
-            monkeypatch.setattr(ingest_module, "_make_entries", real)
+    def meanwhile(*args, run_id):
+        if run_id.startswith("second"):
+            monkeypatch.setattr(ingestion, "run_stages", real)
             ingest([tmp_path / "elsewhere"], store=tmp_path / "store", recipe=Recipe())
-        return real(log, task, of)
+        return real(*args, run_id=run_id)
 
-    monkeypatch.setattr(ingest_module, "_make_entries", meanwhile)
+    monkeypatch.setattr(ingestion, "run_stages", meanwhile)
+    found, code = night()
+    assert (found["second.mcap"].status, code) == ("done", 0)
+    assert len(counted(tmp_path)) == 2, "of this and of other.mcap"
     found, code = night()
     assert (found["second.mcap"].status, code) == ("unchanged", 0)
-    assert found["second.mcap"].same_as == str(tmp_path / "elsewhere" / "first.mcap")
-    found, code = night()
-    assert (found["second.mcap"].status, code) == ("unchanged", 0)
-    assert str(found["second.mcap"].run.run_id).startswith("first-")
+    (kept,) = counted(tmp_path) - {found["other.mcap"].run.run_id}
+    assert found["second.mcap"].run.run_id == kept
 
 
 def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, served):
-    """Beyond one request for each commit that no snapshot has yet."""
+    """Beyond one request for each document that the index does not have yet."""
     store, logs, counts = "s3://tests/store", tmp_path / "logs", {"new log": [], "nothing new": [], "status": []}
     for number in range(4):
         drive_at(logs / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
         calls = {"new log": run_ingest, "nothing new": run_ingest, "status": find_status}
         for what, call in calls.items():
-            commits = Store(store).state().number
-            served.requests = 0
+            documents._DECODED.clear()  # as another process
+            before, served.requests = len(served), 0
             assert call(IngestOptions([logs], store=store, recipe=Recipe())).exit_code == 0
-            counts[what].append(served.requests - commits)
+            read = sum(name.endswith(".json") for name in served[before:])
+            counts[what].append(served.requests - read)
     assert {what: len(set(of[1:])) for what, of in counts.items()} == dict.fromkeys(counts, 1), counts
 
 
@@ -379,34 +321,11 @@ def test_a_link_is_called_what_the_user_calls_it(tmp_path):
     (result,) = summary.results
     assert result.log == str(tmp_path / "logs" / "run.mcap")
     assert result.run.run_id.startswith("run-")
-    (known,) = [Store(tmp_path / "store").run_json(run_id) for run_id in counted(tmp_path)]
-    assert known.source.paths == (result.log,)
+    (known,) = Store(tmp_path / "store").runs()
+    assert known.facts.log.paths == (result.log,)
     annexed.unlink()
     with pytest.raises(UsageError, match=rf"run\.mcap: is a link to {annexed}, which is not there"):
         ingest([tmp_path / "logs" / "run.mcap"], store=tmp_path / "store", recipe=Recipe())
-
-
-def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_path):
-    store, names = Store(tmp_path), []
-    hashes = ["abcdef01" + digit * 56 for digit in "012"] + ["abcdef01" + "0" * 55 + "9"]
-    for sha256 in hashes:
-        names.append(store.name_run("latest", sha256))
-        store.write_run_json(names[-1], RunJson(LogOrigin(("/latest.bag",), sha256)))
-    assert names == ["latest-abcdef01", "latest-abcdef011111", "latest-abcdef012222", "latest-abcdef010000"]
-    for sha256, name in zip(hashes, names, strict=True):
-        assert store.name_run("latest", sha256) == name
-
-
-def test_a_run_json_that_is_not_as_it_was_written_costs_no_other_log_and_is_made_again(tmp_path, night):
-    run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run.run_id
-    path = tmp_path / "store" / "runs" / run_id / "run-1.json"
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-9])
-    (tmp_path / "logs" / "junk.mcap").write_bytes(JUNK)
-    found, _ = night()
-    assert [found[name].status for name in ("other.mcap", "junk.mcap")] == ["done", "failed"]
-    assert path.with_name("run-2.json").read_bytes() == whole, "its tags are those of the manifest, which is whole"
-    assert night()[0]["other.mcap"].status == "unchanged"
 
 
 def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_before(tmp_path):
@@ -417,7 +336,8 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     write_bag(second, wheel_drive(seed=1, start_ns=int(stream.log_time_ns[-1]) + 10**7))
     summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
     assert [result.status for result in summary.results] == ["done", "done"]
-    known = [Store(tmp_path / "store").run_json(result.run.run_id).notes for result in summary.results]
+    store = Store(tmp_path / "store")
+    known = [store.find_runs(result.run.run_id)[0].manifest.notes for result in summary.results]
     assert [[of.names["earlier"] for of in notes if "earlier" in of.names] for notes in known] == [[], ["run_0.bag"]]
 
 
@@ -431,11 +351,3 @@ def test_damage_that_leaves_no_message_is_the_cause_and_no_sensor_is_missing(tmp
     inspected = inspect(path, recipe=Recipe())
     assert inspected.problems == ("the log is damaged, and no message can be read",)
     assert {of.code for of in inspected.findings} == {"log-damaged"}
-
-
-def test_a_log_that_was_lost_is_written_again_from_the_runs(tmp_path, night):
-    run_id = night()[0]["other.mcap"].run.run_id
-    shutil.rmtree(tmp_path / "store" / "log")
-    found = night()[0]["other.mcap"]
-    assert (found.run.run_id, found.status) == (run_id, "done")
-    assert counted(tmp_path) == {run_id}

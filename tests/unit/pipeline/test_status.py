@@ -1,25 +1,27 @@
 """List the state and problems of every log: each state once, told by what ingest did, and the same after it."""
 
-import json
 import os
 import shutil
 from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
-from tcpipe.formats.commits import CallRecord, Entries
+from synthetic_store import add_run, lanes, segments
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
+from tcpipe.formats.store_records import Call, Output
 from tcpipe.pipeline import calls
+from tcpipe.pipeline import ingest as ingest_module
+from tcpipe.pipeline import ingest_run as ingest_run_module
 from tcpipe.pipeline import plan as plan_module
-from tcpipe.pipeline.calls import open_log
-from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.problems import acknowledge
+from tcpipe.pipeline.calls import record_call
+from tcpipe.pipeline.ingest import CallOptions, ingest
+from tcpipe.pipeline.problems import acknowledge, forget_tables
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 
 OLD_NS = 10**18
 
@@ -64,39 +66,55 @@ def test_what_ingest_did_is_what_status_says_and_the_calls_are_remembered(first_
     assert (found.exit_code, found.to_do, found.problems) == (3, None, ())
     (call,) = found.history
     assert (call.command, call.counts, call.exit_code) == ("ingest", {"done": 2, "damaged": 1, "failed": 1}, 3)
-    assert call.logs == (str(first_night / "logs"),)
+    assert call.works_on == (str(first_night / "logs"),)
     sizes = [(first_night / "logs" / f"{name}.mcap").stat().st_size for name in ("whole", "second", "cut")]
     assert call.done_bytes == sum(sizes)
-    kept = [path for path in (first_night / "store" / "runs").rglob("*") if path.is_file()]
+    kept = [path for path in (first_night / "store" / "blobs").rglob("*") if path.is_file()]
     assert call.written_bytes == sum(path.stat().st_size for path in kept)
     assert call.wall_s > 0.0
     assert call.cpu_s > 0.0
     assert call.end > call.begin
 
 
-def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
+def test_the_first_line_says_what_to_do_now(first_night, night, tmp_path):
     found = where(first_night)
-    ledgers = [
-        json.loads(path.read_text())["distance_by_reason_m"]
-        for path in (first_night / "store").rglob("manifest-1.json")
-    ]
-    assert len(ledgers) == 3
-    driven_m = sum(sum(ledger.values()) for ledger in ledgers)
-    for loss in found.losses:
-        assert loss.metres == pytest.approx(sum(ledger[loss.reason] for ledger in ledgers))
-        assert loss.share == pytest.approx(loss.metres / driven_m)
-    metres = [loss.metres for loss in found.losses]
-    assert metres == sorted(metres, reverse=True)
-    kept_m = sum(ledger["kept"] for ledger in ledgers)
-    assert sum(metres) == pytest.approx(driven_m - kept_m, abs=0.5)
-    assert f" m ({found.losses[0].share:.1%}) {found.losses[0].reason.replace('_', ' ')} in " in str(found)
-    assert not where(first_night, recipe=replace(Recipe(), read=ReadConfig(ignore_topics=["/other"]))).losses
+    assert str(found).splitlines()[0] == found.to_do_now
+    assert found.to_do_now == "to do now: look at 1 logs that are partial, or acknowledge them"
+    assert where(night).to_do_now == "to do now: tcpipe ingest (4 logs)"
+    drive_at(tmp_path / "logs" / "only.mcap")
+    os.utime(tmp_path / "logs" / "only.mcap", ns=(OLD_NS, OLD_NS))
+    ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
+    assert where(tmp_path).to_do_now == "nothing to do"
+    (tmp_path / "logs" / "only.mcap").unlink()
+    gone = ask_status(tmp_path / "store")
+    assert gone.to_do_now.startswith(f"to do now: {tmp_path / 'logs'}: contains no readable log. ")
+    assert gone.to_do_now.endswith("[log-missing]")
+
+
+def test_an_output_whose_last_call_failed_is_a_problem_until_a_call_for_it_ends_well(night):
+    store = Store(night / "store")
+    ingest([night / "logs"], store=store.root, recipe=Recipe())
+    for run_id in [str(night / "logs" / "junk.bag"), *(row.run_id for row in store.scan().list_rows() if row.damage)]:
+        acknowledge([run_id], store=store.root)
+
+    def end(code, message, at):
+        output = Output(where="/out", exit_code=code, message=message, at=at)
+        store.put(store.scan(), "outputs", "0" * 16, output)
+        return [of for of in where(night).problems if of.code == "output-failed"], where(night).exit_code
+
+    assert end(0, "", "2026-11-01T00:00:00") == ([], 0)
+    (finding,), code = end(1, "the disk is full\nmore", "2026-11-02T00:00:00")
+    assert (code, finding.subject.name, finding.names["message"]) == (3, "/out", "the disk is full")
+    assert end(0, "", "2026-11-03T00:00:00") == ([], 0)
 
 
 def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
     assert ask_status(first_night / "store").counts == where(first_night).counts
+    add_run(store := open_store(tmp_path / "store", create=True), "a", segments("a", *lanes(0.0, 0.0, 5.0)))
     with pytest.raises(UsageError, match="no earlier call of ingest is known; give the logs"):
-        ask_status(tmp_path)
+        ask_status(store.root)
+    with pytest.raises(UsageError, match="there is no store here; run 'tcpipe ingest' first"):
+        ask_status(tmp_path / "none")
 
 
 def test_a_log_that_is_gone_is_trouble_only_where_the_latest_call_was_given_it(first_night, tmp_path):
@@ -133,8 +151,8 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     shutil.copy(logs / "second.mcap", logs / "whole.mcap")
     os.utime(logs / "whole.mcap", ns=(OLD_NS, OLD_NS + 1))
     line = f"{logs / 'passing.mcap'}: No space left on device (28)"
-    call = CallRecord("ingest", "0", 3, {"failed": 1}, failed={str(logs / "passing.mcap"): line})
-    open_log(Store(store)).commit("ended", Entries(calls=(calls.start_stopwatch()(call),)))
+    with record_call(Store(store), "ingest", [str(logs)], CallOptions()) as call:
+        call.result = {"exit_code": 3, "failed": {str(logs / "passing.mcap"): line}}
     found = where(night)
     assert found.counts == {"done": 2, "quarantined": 1, "growing": 1, "pending": 2, "failed_transient": 1}
     told = {(group.state, group.cause): group.logs for group in found.groups}
@@ -204,15 +222,26 @@ def test_logs_with_findings_of_one_code_are_one_line_with_the_first_cause(first_
     assert told() == (2, "2 reasons, the first: not a log: it is 400 bytes that begin with b'junkjunk'")
 
 
-def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_night, tmp_path):
-    shutil.copytree(first_night / "store", tmp_path / "store", copy_function=shutil.copy2)
-    (gone,) = (tmp_path / "store" / "runs").glob("whole-*/run-1.json")
-    gone.unlink()
-    found = ask_status(tmp_path / "store", first_night / "logs")
-    (group,) = [group for group in found.groups if group.state == "pending"]
-    assert (group.cause, group.logs) == ("files of its run are missing", (str(first_night / "logs" / "whole.mcap"),))
-    assert [(of.code, of.names["file"]) for of in found.problems] == [("run-incomplete", str(gone))]
-    assert found.exit_code == 3
+@pytest.mark.parametrize("how", ["gone", "pruned", "acknowledged"])
+def test_a_run_whose_tables_are_gone_is_named_and_asked_for_again_until_it_is_given_up(first_night, tmp_path, how):
+    root = shutil.copytree(first_night / "store", tmp_path / "store", copy_function=shutil.copy2)
+    store, log = Store(root), str(first_night / "logs" / "whole.mcap")
+    (row,) = [row for row in store.scan().list_rows() if row.run_id.startswith("whole-")]
+    shutil.rmtree(root / "blobs" / row.blob)
+    if how == "gone":
+        found = ask_status(root, first_night / "logs")
+        (group,) = [group for group in found.groups if group.state == "pending"]
+        assert (group.cause, group.logs) == ("the files of its run are missing", (log,))
+        assert [(of.code, of.names["file"]) for of in found.problems] == [("run-incomplete", f"blobs/{row.blob}")]
+        assert found.exit_code == 3
+        assert ingest([first_night / "logs"], store=root, recipe=Recipe()).exit_code == 0
+        assert ask_status(root, first_night / "logs").problems == ()
+        return
+    acknowledge([row.run_id], store=root) if how == "acknowledged" else forget_tables(store, store.scan(), row)
+    found = ask_status(root, first_night / "logs")
+    (group,) = [group for group in found.groups if group.state == "superseded"]
+    assert (group.cause, group.logs) == ("its run was pruned; --force ingests it again", (log,))
+    assert found.problems == ()
 
 
 def test_a_store_that_is_not_there_is_named_as_it_was_given(tmp_path, monkeypatch):
@@ -234,7 +263,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_pat
 
 
 def test_an_estimate_is_what_the_like_took():
-    night = CallRecord("ingest", "0", 0, {}, cpu_s=2_000.7, done_bytes=10**9, written_bytes=5 * 10**8)
+    night = Call(command="ingest", version="0", cpu_s=2_000.7, done_bytes=10**9, written_bytes=5 * 10**8)
     other = replace(night, cpu_s=1_000.7, done_bytes=5 * 10**8, written_bytes=10**8)
     quiet, build = replace(night, done_bytes=0, cpu_s=9.0), replace(night, command="build-dataset")
     found = calls.estimate([night, other, quiet, build], "ingest", 10**9, jobs=4)
@@ -244,7 +273,7 @@ def test_an_estimate_is_what_the_like_took():
 
 
 def test_a_small_call_tells_little_of_a_million_samples():
-    small = CallRecord("build-dataset", "0", 0, {"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
+    small = Call(command="build-dataset", version="0", counts={"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
     found = calls.estimate([small], "build-dataset", 1_000_000, jobs=1)
     assert 100.0 < found.wall_s < 300.0, "185 s (docs/explanation/scale.md); 7,400 s in proportion"
     assert found.written_bytes < 5e9
@@ -274,9 +303,57 @@ def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
     shown = run("status", *how)
     assert (shown.return_value, "1 empty" in shown.output) == (3, True)
     assert "1 of 1 runs: No segments [no-segments]" in shown.output
-    (run_id,) = Store(tmp_path / "store").run_ids()
+    (run_id,) = [row.run_id for row in Store(tmp_path / "store").scan().list_rows()]
     acknowledged = run("acknowledge", run_id, *how[:2])
     assert "[no-segments]" in acknowledged.output
     shown = run("status", *how)
     assert (shown.return_value, "done, empty, acknowledged" in shown.output) == (0, True)
     assert run(*ingest_it).return_value == 0
+
+
+# --- versions -------------------------------------------------------------------------------------------------------
+
+
+def raise_version(monkeypatch):
+    for module in (plan_module, ingest_module, ingest_run_module):
+        monkeypatch.setattr(module, "RESULTS_VERSION", 7)
+
+
+def test_a_version_with_other_results_makes_all_runs_again_and_says_how_many_and_how_long(night, monkeypatch, caplog):
+    logs, store = night / "logs", night / "store"
+    ingest([logs], store=store, recipe=Recipe())
+    raise_version(monkeypatch)
+    found = where(night)
+    assert found.counts == {"outdated": 3, "failed_permanent": 1}
+    assert {group.cause for group in found.groups if group.state == "outdated"} == {
+        "made with version 1 of the results, which now are version 7"
+    }
+    caplog.clear()
+    summary = ingest([logs], store=store, recipe=Recipe())
+    (line,) = [line for line in caplog.messages if "gives other results" in line]
+    assert f"tcpipe {__version__} gives other results (version 7): 3 runs are made again: " in line
+    assert ": about " in line
+    assert sorted(result.status for result in summary.results) == ["damaged", "done", "done", "failed"]
+    assert {run.facts.results_version for run in Store(store).runs()} == {7}
+    caplog.clear()
+    ingest([logs], store=store, recipe=Recipe())
+    assert caplog.messages == []
+
+
+def test_a_version_with_the_same_results_makes_no_run_again_but_tries_failed_and_damaged_logs(
+    night, monkeypatch, caplog
+):
+    logs, store = night / "logs", night / "store"
+    ingest([logs], store=store, recipe=Recipe())
+    monkeypatch.setattr(plan_module, "__version__", "9.9.9")
+    found = where(night)
+    assert found.counts == {"done": 2, "outdated": 1, "pending": 1}
+    told = {name.rsplit("/", 1)[-1]: group.cause for group in found.groups for name in group.logs}
+    assert told["cut.mcap"] == f"its damaged log was read by tcpipe {__version__}"
+    assert told["junk.bag"] == f"failed with tcpipe {__version__}; to be tried again"
+    monkeypatch.setattr(ingest_run_module, "__version__", "9.9.9")
+    monkeypatch.setattr(ingest_module, "__version__", "9.9.9")
+    summary = ingest([logs], store=store, recipe=Recipe())
+    assert sorted(result.status for result in summary.results) == ["damaged", "failed", "unchanged", "unchanged"]
+    assert where(night).counts == {"done": 2, "partial": 1, "failed_permanent": 1}
+    assert caplog.messages == []
