@@ -15,7 +15,7 @@ from wheel_drives import START_NS, drive_at
 
 from tcpipe.errors import UsageError
 from tcpipe.formats import documents, place
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.atomic import make_scratch_directory, make_unique_name
 from tcpipe.formats.documents import BLOBS, State, make_key, parse_name, read_record
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import ingest_key
@@ -23,7 +23,7 @@ from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.formats.store_records import Output, Process, StoredMap
 from tcpipe.formats.stored_runs import STREAMS
 from tcpipe.pipeline import calls, ingest_run, prune
-from tcpipe.pipeline.calls import ADD_MAP, BUILD, list_open_calls, make_blob_name, record_call
+from tcpipe.pipeline.calls import ADD_MAP, BUILD, list_open_calls, record_call
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.plan import IngestTask, make_result
 from tcpipe.pipeline.problems import acknowledge
@@ -161,7 +161,7 @@ class World:
         opened = open_store(self.root, create=True)
         with record_call(opened, ADD_MAP, ["site"], {"content": text}) as call:
             call.begin()
-            with opened.new_map("site", make_blob_name()) as (path, put):
+            with opened.new_map("site", make_unique_name()) as (path, put):
                 (path / "height").mkdir(parents=True)
                 (path / "zarr.json").write_text(text)
                 (path / "height" / "zarr.json").write_text(text)
