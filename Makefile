@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock docs pictures release clean
+.PHONY: help demo test test-benchmarks test-operations test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock docs pictures release clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -58,6 +58,10 @@ check-and-train: check
 test-benchmarks: .venv/installed-dev
 	$(BIN)/pytest benchmarks/test_benchmarks.py $(PYTEST)
 
+# Kills and interruptions at every request of calls on one store; about an hour on two cores.
+test-operations: .venv/installed-dev
+	TCPIPE_TEST_OPERATIONS=1 $(BIN)/pytest -rs tests/unit/pipeline/test_store_attacks.py $(PYTEST)
+
 # Stores in a real object store: OBJECT_STORAGE is a program that starts and stops one below a directory, which `start` fills with `env`.
 OBJECT_STORAGE ?= ../shared/tools/object-storage
 test-object-storage: .venv/installed-dev
@@ -69,7 +73,7 @@ kernels: .venv/installed-dev
 	$(BIN)/python tests/tiny_pipeline.py .venv/tiny
 	@rm -rf .venv/tiny
 
-# The definitions for Dagster, executed (docs/how-to/dagster.md); its pins want an environment of their own.
+# The definitions for Dagster, executed (docs/how-to/run-unattended.md); its pins want an environment of their own.
 .venv-dagster/installed: pyproject.toml
 	$(PYTHON) -m venv .venv-dagster
 	.venv-dagster/bin/python -m pip --disable-pip-version-check install --quiet --no-compile dagster==1.13.27 hypothesis pytest pytest-randomly --editable '.[tables]'

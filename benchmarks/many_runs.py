@@ -28,7 +28,7 @@ from tcpipe.formats.logs.writing import write_mcap
 from tcpipe.formats.runs import LogOrigin, Run
 from tcpipe.formats.store_records import find_lineage
 from tcpipe.formats.stored_runs import StoredRun
-from tcpipe.pipeline.calls import INGEST, make_blob_name, record_call
+from tcpipe.pipeline.calls import INGEST, make_unique_name, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.problems import forget_tables
@@ -84,7 +84,7 @@ def _add_first(store: Store, run: Run) -> StoredRun:
 def _add_copy(store: Store, state: State, first: StoredRun, table: pa.Table, source: LogSource) -> None:
     number = int(source.stem.removeprefix(STEM))
     sha256 = hashlib.sha256(str(number).encode()).hexdigest()
-    run_id, offset_ns, blob = f"{source.stem}-{sha256[:8]}", number * DAY_NS, make_blob_name()
+    run_id, offset_ns, blob = f"{source.stem}-{sha256[:8]}", number * DAY_NS, make_unique_name()
     changed = {name: pc.add(table.column(name), offset_ns) for name in ("start_ns", "end_ns")}
     changed["run_id"] = pa.array([run_id] * table.num_rows)
     changed["segment_id"] = pa.array([f"{run_id}-{stamp}" for stamp in changed["start_ns"].to_pylist()])

@@ -127,7 +127,7 @@ _ANSWERS = """## What commands print with `--json`
 
 `ingest` prints a line for each log (`ingest-log`) and one summary (`ingest-summary`); the key `kind` tells what `inspect` prints.
 `evaluate` prints the file `evaluation`, and with `--drive` the answer `evaluate-drives`.
-A command that fails prints `exit_code` and `problems`.
+A command that fails prints `failure` instead: `transient` tells a scheduler whether to try again.
 """
 
 _PRINTED = "; ``str`` of it is what the command prints."

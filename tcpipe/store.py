@@ -18,13 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import check_local_output
+from tcpipe.formats.atomic import check_local_output, make_unique_name
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
 from tcpipe.formats.cache import fetch_cached
 from tcpipe.formats.documents import (
     BLOBS,
     KINDS,
     Kind,
+    Record,
     State,
     make_key,
     make_run_key,
@@ -62,7 +63,7 @@ class Store:
         """Return what its documents say now."""
         return scan(self.place)
 
-    def put(self, state: State, kind: Kind, key: str, record: object, *, facts: object = None) -> None:
+    def put(self, state: State, kind: Kind, key: str, record: Record, *, facts: RunFacts | None = None) -> None:
         """Write a document, which counts from now on for its kind and key, and add it to the state."""
         put_document(self.place, state, kind, key, record, facts=facts)
 
@@ -71,9 +72,11 @@ class Store:
         facts = convert_record(run, RunFacts)
         self.put(state, "runs", make_run_key(run.log.sha256, run.recipe_id), strip_repeated(run), facts=facts)
 
-    def put_blob(self, name: str, directory: Path) -> None:
-        """Put the files of a directory in the workshop of this place into a folder of payload with a fresh random name."""
+    def put_blob(self, directory: Path) -> str:
+        """Put the files of a directory in the workshop of this place into a new folder of payload, and return its name."""
+        name = make_unique_name()
         self.place.put_files(f"{BLOBS}/{name}", directory)
+        return name
 
     def runs(self, state: State | None = None) -> list[StoredRun]:
         """Return the runs that count, by run and recipe: of this data model, with payload, and not superseded."""
@@ -116,14 +119,13 @@ class Store:
         return found
 
     @contextmanager
-    def new_map(self, name: str, blob: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
+    def new_map(self, name: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
         """Yield where a map is to be written, and beside it a picture ``.png``, and a function that puts both into the store."""
         with self.place.workshop() as directory, convert_run_errors(self.place.where(name), directory):
 
             def put(state: State) -> None:
                 files = compute_checksums(directory)
-                self.put_blob(blob, directory)
-                record = StoredMap(name, DATA_MODEL_VERSION, blob, files)
+                record = StoredMap(name, DATA_MODEL_VERSION, self.put_blob(directory), files)
                 self.put(state, "maps", make_key(name), record)
 
             yield directory / f"{name}.zarr", put

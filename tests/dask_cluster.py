@@ -41,7 +41,10 @@ class DaskCluster:
 
 def _started(*arguments: str) -> subprocess.Popen[bytes]:
     said, path = subprocess.DEVNULL, [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
-    malloc = {"MALLOC_MMAP_THRESHOLD_": "33554432", "MALLOC_TRIM_THRESHOLD_": "134217728"}  # docs/how-to/cluster.md
+    malloc = {
+        "MALLOC_MMAP_THRESHOLD_": "33554432",
+        "MALLOC_TRIM_THRESHOLD_": "134217728",
+    }  # docs/how-to/run-unattended.md#dask
     env = {**os.environ, **malloc, "PYTHONPATH": os.pathsep.join(filter(None, path))}  # the tasks below
     return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stdout=said, stderr=said, env=env)
 

@@ -118,7 +118,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _list(self, bucket: Path, query: dict[str, list[str]]) -> None:
         if bucket.is_dir():
-            asked = (query.get(name, [""])[0] for name in ("prefix", "delimiter", "start-after"))
+            asked = (query.get(name, [""])[0] for name in ("prefix", "delimiter"))
             self._send(200, _listing(bucket, *asked))
         else:
             self._send(404, b"<Error><Code>NoSuchBucket</Code></Error>")
@@ -175,9 +175,9 @@ def object_store(root: Path) -> Iterator[tuple[dict[str, str], Fetched]]:
         server.server_close()
 
 
-def _listing(bucket: Path, prefix: str, delimiter: str, after: str) -> bytes:
+def _listing(bucket: Path, prefix: str, delimiter: str) -> bytes:
     names = sorted(path.relative_to(bucket).as_posix() for path in bucket.rglob("*") if path.is_file())
-    names = [name for name in names if name.startswith(prefix) and name > after]
+    names = [name for name in names if name.startswith(prefix)]
     deeper = {name for name in names if delimiter and delimiter in name[len(prefix) :]}
     contents = "".join(
         f"<Contents><Key>{escape(name)}</Key><LastModified>{_format_time((bucket / name).stat().st_mtime)}</LastModified>"

@@ -20,6 +20,17 @@ def tables(store: Path, name: str = "segments") -> list[Path]:
     return [table(run, name) for run in Store(store).runs()]
 
 
+def map_path(store: Path, name: str) -> Path:
+    """The Zarr group of a map."""
+    opened = Store(store)
+    return Path(opened.place.where(opened.find_map(name).zarr))
+
+
+def checksums(store: Path) -> dict[str, object]:
+    """Size and sha256 of each file of the runs of a store, by run."""
+    return {run.run_id: {**run.facts.tables, **run.facts.streams} for run in Store(store).runs()}
+
+
 def only_run(store: Path) -> StoredRun:
     (run,) = Store(store).runs()
     return run

@@ -19,7 +19,6 @@ from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.runs import Counts, LogOrigin, Recording, Run
 from tcpipe.formats.stored_runs import write_streams
-from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.ingest_run import describe_recording, put_run, tag_log, write_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -299,7 +298,7 @@ def _build_world(name, layers):
 
 def add_world(store, *, name="site", layers=("ortho", "terrain")):
     """Put the analytic map into the store."""
-    with store.new_map(name, make_blob_name()) as (path, put):
+    with store.new_map(name) as (path, put):
         shutil.copytree(_build_world(name, layers), path)
         put(store.scan())
 
@@ -313,7 +312,7 @@ def open_world(directory: Path, **how) -> Store:
 
 def put_map(store, name, **how):
     """Put a map into the store, over one that is there, without a quick look."""
-    with store.new_map(name, make_blob_name()) as (path, put):
+    with store.new_map(name) as (path, put):
         build_map(path, name=name, **{"agreed": PAPER_SCHEME, **how})
         put(store.scan())
 

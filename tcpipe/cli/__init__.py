@@ -21,7 +21,7 @@ from typing import Any, NoReturn, TypeVar
 import click
 
 from tcpipe import __version__
-from tcpipe.cli.output import print_failure, print_traceback, write_debug_log
+from tcpipe.cli.output import Failure, print_failure, print_traceback, write_debug_log
 from tcpipe.errors import TcpipeError, UsageError, hide_secrets
 
 _EXTRAS = {"torch": "train", "lightgbm": "tables", "dask": "cluster", "distributed": "cluster", "dagster": "dagster"}
@@ -191,8 +191,9 @@ def _watch(read_end: int) -> None:
         if not ending and received[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             end, ending = time.monotonic() + _LATEST_S, received[0]
         left_s = max(0.0, end - time.monotonic()) if ending else None
-    print_failure([f"{Terminated(ending)}; {_NOTHING_HALF}"], 128 + ending, as_json="--json" in sys.argv)
-    os._exit(128 + ending)
+    failure = Failure(128 + ending, (f"{Terminated(ending)}; {_NOTHING_HALF}",), transient=True)
+    print_failure(failure, as_json="--json" in sys.argv)
+    os._exit(failure.exit_code)
 
 
 def _end(number: int, _: object) -> None:
@@ -219,7 +220,7 @@ def main() -> None:
         prepare_process()
         _run()
     except Terminated as ended:  # before a command begins
-        _fail([f"{ended}; {_NOTHING_HALF}"], ended.exit_code)
+        _fail([f"{ended}; {_NOTHING_HALF}"], ended.exit_code, ended)
 
 
 @terminate_on_signal()
@@ -228,26 +229,26 @@ def _run() -> NoReturn:
         _refuse_empty(sys.argv[1:])
         code = cli.main(prog_name="tcpipe", standalone_mode=False)
         sys.stdout.flush()
-    except (click.exceptions.Abort, KeyboardInterrupt):
-        _fail([f"interrupted; {_NOTHING_HALF}"], 128 + signal.SIGINT)
+    except (click.exceptions.Abort, KeyboardInterrupt) as interrupt:
+        _fail([f"interrupted; {_NOTHING_HALF}"], 128 + signal.SIGINT, interrupt)
     except Terminated as ended:
-        _fail([f"{ended}; {_NOTHING_HALF}"], ended.exit_code)
+        _fail([f"{ended}; {_NOTHING_HALF}"], ended.exit_code, ended)
     except click.UsageError as error:
         if not sys.argv[1:]:
             error.show()
             sys.exit(error.exit_code)
         command = error.ctx.command_path if error.ctx else "tcpipe"
-        _fail([f"{error.format_message().rstrip('.')} (see {command} --help)"], error.exit_code)
+        _fail([f"{error.format_message().rstrip('.')} (see {command} --help)"], error.exit_code, error)
     except TcpipeError as error:
-        _fail([*error.problems, *_list_causes(error)], error.exit_code)
+        _fail([*error.problems, *_list_causes(error)], error.exit_code, error)
     except BrokenPipeError:
         _drop_stdout()
         sys.exit(1)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _fail([f"{where}{error.strerror or error}"], 1)
+        _fail([f"{where}{error.strerror or error}"], 1, error)
     except Exception as error:  # noqa: BLE001  the last resort
-        _fail([_describe_unforeseen(error)], 1)
+        _fail([_describe_unforeseen(error)], 1, error)
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -274,16 +275,27 @@ def _refuse_empty(arguments: list[str]) -> None:
             raise UsageError(f"{argument or 'an argument'} is empty; is a variable not set?")
 
 
-def _fail(problems: Sequence[str], code: int) -> NoReturn:
+def _fail(problems: Sequence[str], code: int, error: BaseException) -> NoReturn:
     """Print the problems, with ``--json`` as an object on stdout too, and exit."""
     if "--debug" in sys.argv:
         print_traceback()
     try:
-        print_failure(problems, code, as_json="--json" in sys.argv)
+        print_failure(Failure(code, tuple(problems), _is_transient(error)), as_json="--json" in sys.argv)
         sys.stdout.flush()
     except OSError:
         _drop_stdout()
     sys.exit(code)
+
+
+def _is_transient(error: BaseException) -> bool:
+    """Tell whether the same call may succeed later; an impossible call and a package that is not installed stay so."""
+    if isinstance(error, click.exceptions.Abort | KeyboardInterrupt | Terminated):
+        return True
+    if isinstance(error, click.UsageError | UsageError | ModuleNotFoundError):
+        return False
+    from tcpipe.pipeline.log_sources import is_transient
+
+    return is_transient(error)
 
 
 def _drop_stdout() -> None:

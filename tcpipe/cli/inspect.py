@@ -176,7 +176,7 @@ def _print_dataset(found: InspectedDataset) -> None:
     print_line("")
     print_line(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
     print_line(
-        f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}"
+        f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps) or 'not stated'}"
     )
     for line in list_verdict(found.verdict):
         print_line(f"verdict: {line}")

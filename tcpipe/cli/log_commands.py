@@ -344,9 +344,7 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 @click.argument("runs", nargs=-1, metavar="[RUN]...", shell_complete=complete_runs)
 @store_option
 @recipe_option
-@click.option(
-    "--forget", multiple=True, metavar="OUT", help="Remove what only this deleted dataset needs; repeatable."
-)
+@click.option("--forget", multiple=True, metavar="OUT", help="Remove what only this deleted dataset needs; repeatable.")
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
 @json_option
 def prune(

@@ -7,11 +7,12 @@ import logging
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import click
 
@@ -259,10 +260,21 @@ def print_traceback() -> None:
     click.echo(hide_secrets(traceback.format_exc()), err=True, nl=False)
 
 
-def print_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> None:
-    """Print problems on stderr, and on stdout as a JSON object if that is requested."""
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """The answer of a command that failed."""
+
+    exit_code: int
+    problems: tuple[str, ...]
+    transient: bool
+    """Whether the same call may succeed later: the disk was full, the network or a worker failed, a signal ended it."""
+    kind: Literal["failure"] = "failure"
+
+
+def print_failure(failure: Failure, *, as_json: bool) -> None:
+    """Print the problems on stderr, and on stdout one line of JSON if that is requested."""
     with suppress(OSError):
-        for problem in problems:
+        for problem in failure.problems:
             print_line(f"tcpipe: {problem}", err=True)
     if as_json:
-        click.echo(json.dumps({"exit_code": exit_code, "problems": [hide_secrets(problem) for problem in problems]}))
+        click.echo(json.dumps({**asdict(failure), "problems": [*map(hide_secrets, failure.problems)]}))

@@ -113,6 +113,7 @@ _ANSWERS = {
     "evaluate-drives.answer": "planning.drives.Drives",
     "explain.answer": "pipeline.explain.Explained",
     "export.answer": "pipeline.export.Exported",
+    "failure.answer": "cli.output.Failure",
     "ingest-log.answer": "pipeline.plan.LogLine",
     "ingest-summary.answer": "pipeline.ingest.SummaryLine",
     "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",

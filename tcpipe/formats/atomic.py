@@ -46,6 +46,11 @@ _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 
 
+def make_unique_name() -> str:
+    """Return 16 random hexadecimal digits: the name of a folder that nobody else writes to."""
+    return uuid.uuid4().hex[:16]
+
+
 @contextmanager
 def write_atomic_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path; on success it is synced and renamed to ``path``, on failure removed."""
@@ -151,8 +156,9 @@ def remove(path: Path, staging: Path) -> None:
 def _sync_files(directory: Path) -> None:
     """Sync a directory and all files and directories below it."""
     for above, _, files in os.walk(directory):
-        for name in (*files, ""):
-            _sync(Path(above, name))
+        for path in (Path(above, name) for name in (*files, "")):
+            if not path.is_symlink():
+                _sync(path)
 
 
 @contextmanager
@@ -232,7 +238,7 @@ def _make_locked_holder(place: Path) -> Iterator[Path]:
 
 def _make_locked_directory(parent: Path, prefix: str, mode: int = 0o777) -> tuple[Path, int]:
     while True:
-        holder = parent / f"{prefix}{uuid.uuid4().hex[:8]}"
+        holder = parent / f"{prefix}{make_unique_name()[:8]}"
         try:
             holder.mkdir(mode)
             with suppress(FileNotFoundError):  # another process took it for abandoned before it was locked

@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import os
+import shutil
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,6 +35,7 @@ from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
 from tcpipe.formats.place import Place
+from tcpipe.formats.published_outputs import REPORT_PATCHES
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
@@ -286,6 +289,35 @@ def read_intact_card(directory: Path) -> DatasetCard:
     with _convert_errors():
         prove_files(directory, card.checksums, [SAMPLES, *described])
     return card
+
+
+_DESKTOP_FILES = (".DS_Store", ".directory", "Thumbs.db", "desktop.ini")
+_STATISTICS = ".aux.xml"
+
+
+def is_desktop_file(name: str) -> bool:
+    """Return whether a file is one that file managers leave in folders, or GDAL and QGIS beside rasters."""
+    return name.rpartition("/")[2] in _DESKTOP_FILES or name.endswith(_STATISTICS)
+
+
+def find_foreign_files(directory: Path, checksums: Collection[str]) -> list[str]:
+    """Return the files in the directory of a dataset that tcpipe did not write; ``checksums`` are the names that its card lists."""
+    files = (path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir())
+    names = {path.relative_to(directory).as_posix() for path in files} - {*checksums, CARD, REPORT}
+    return sorted(name for name in names if not name.startswith(f"{REPORT_PATCHES}/"))
+
+
+def keep_foreign_files(names: Iterable[str], before: Path, directory: Path) -> None:
+    """Link or copy files of others from the directory of a dataset into the one that replaces it; `DatasetError` if one is there."""
+    for name in names:
+        target = directory / name
+        if target.exists():
+            raise DatasetError(f"{before / name}: has the name of a file of the new dataset; rename it")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(before / name, target, follow_symlinks=False)
+        except OSError:  # a file system without links
+            shutil.copy2(before / name, target, follow_symlinks=False)
 
 
 def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Table:

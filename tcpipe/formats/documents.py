@@ -46,7 +46,8 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 """In the order in which they are listed: calls first, so that a call that ends later is seen as open."""
 BLOBS = "blobs"
 INDEX = "index.parquet"
-RECORDS: Mapping[Kind, type] = {
+Record: TypeAlias = Call | RunFacts | Failure | Tags | LogSnapshot | Problem | StoredMap | Output
+RECORDS: Mapping[Kind, type[Record]] = {
     "calls": Call, "runs": RunFacts, "failed": Failure, "tags": Tags, "seen": LogSnapshot, "acknowledged": Problem, "maps": StoredMap,
     "outputs": Output,
 }  # fmt: skip
@@ -83,7 +84,7 @@ def parse_name(kind: Kind, file: str) -> Name | None:
     return Name(kind, parts[0], int(parts[1]), parts[2]) if is_document else None
 
 
-def make_key(*parts: object) -> str:
+def make_key(*parts: str | None) -> str:
     """Return the key of a document about something."""
     return _hash_bytes(to_compact_json(parts))
 
@@ -185,7 +186,7 @@ class State:
         self.blobs |= {row.blob, row.streams_blob} - {""}
         self._joined = None
 
-    def add(self, name: Name, record: object) -> None:
+    def add(self, name: Name, record: Record) -> None:
         """Add a document that was written after the scan."""
         key = name.kind, name.key
         self.beaten += [self.names[key]] if key in self.names else []
@@ -204,7 +205,7 @@ def _join_runs(facts: Mapping[Kind, Mapping[str, Any]]) -> dict[str, RunFacts]:
 
     Of runs of one robot and recipe that begin with the same measurements the longest recording counts.
     """
-    longest, joined = dict[tuple[object, ...], RunFacts](), dict[str, RunFacts]()
+    longest, joined = dict[Beginning, RunFacts](), dict[str, RunFacts]()
     tags: Mapping[str, Tags] = facts["tags"]
     tags_by_log = {each.log: each.tags for each in tags.values()}
     for row in facts["runs"].values():
@@ -221,7 +222,11 @@ def _join_runs(facts: Mapping[Kind, Mapping[str, Any]]) -> dict[str, RunFacts]:
     return joined
 
 
-def _find_beginning(row: RunFacts) -> tuple[object, ...] | None:
+Beginning: TypeAlias = tuple[str, str, int, str]
+"""Robot, recipe, first stamp and hash of the first measurements of a recording."""
+
+
+def _find_beginning(row: RunFacts) -> Beginning | None:
     if row.recording is None or not row.blob:  # what was pruned takes the place of nothing
         return None
     return row.robot, row.ingest_key, row.recording.first_ns, row.recording.beginning
@@ -233,7 +238,7 @@ def _rank_recording(row: RunFacts) -> tuple[int, int, bool, str]:
     return recording.last_ns, recording.rows, not row.damage, row.log.sha256
 
 
-_DECODED: dict[str, dict[str, object]] = {}
+_DECODED: dict[str, dict[str, Record]] = {}
 """Records that this process has read, of the place that it read last, by the names of their documents."""
 
 
@@ -252,7 +257,7 @@ def scan(place: Place) -> State:
             gc.enable()
 
 
-def _scan(place: Place, decoded: dict[str, object]) -> State:
+def _scan(place: Place, decoded: dict[str, Record]) -> State:
     state, turn = State(), dict[tuple[Kind, str], list[Name]]()
     for kind in KINDS:
         for file in place.list(kind):
@@ -262,8 +267,9 @@ def _scan(place: Place, decoded: dict[str, object]) -> State:
     for key, names in turn.items():
         names.sort(key=lambda name: (-name.number, name.digest))
         state.highest[key] = names[0].number
-    all_decoded = all(str(names[0]) in decoded for names in turn.values())
-    indexed, fresh = dict[str, bytes]() if all_decoded else _read_index(place), dict[str, bytes]()
+    unread = sum(str(names[0]) not in decoded for names in turn.values())
+    indexed = _read_index(place) if unread > _UNREAD else dict[str, bytes]()
+    fresh = dict[str, bytes]()
     while turn:  # once, and again where the document that should count is damaged
         fresh |= _decode(place, [names[0] for names in turn.values()], indexed, decoded)
         damaged = dict[tuple[Kind, str], list[Name]]()
@@ -286,7 +292,7 @@ def _scan(place: Place, decoded: dict[str, object]) -> State:
 
 
 def _decode(
-    place: Place, names: Iterable[Name], indexed: Mapping[str, bytes], decoded: dict[str, object]
+    place: Place, names: Iterable[Name], indexed: Mapping[str, bytes], decoded: dict[str, Record]
 ) -> dict[str, bytes]:
     """Add records of documents to ``decoded``, and return those that are not in the index as the index has them."""
     unread, fresh = list[Name](), dict[str, bytes]()
@@ -300,7 +306,7 @@ def _decode(
     found: list[bytes | None] = place.map(lambda name: _read_document(place, name), unread)
     for name, data in zip(unread, found, strict=True):
         if data is not None:
-            record: object = parse_typed_json(data, RECORDS[name.kind], place.where(str(name)))
+            record: Record = parse_typed_json(data, RECORDS[name.kind], place.where(str(name)))
             decoded[str(name)], fresh[str(name)] = record, to_compact_json(record)
     return fresh
 
@@ -358,7 +364,9 @@ def _seal(rows: Mapping[str, bytes]) -> bytes:
     return found.hexdigest().encode()
 
 
-def put_document(place: Place, state: State, kind: Kind, key: str, record: object, *, facts: object = None) -> str:
+def put_document(
+    place: Place, state: State, kind: Kind, key: str, record: Record, *, facts: RunFacts | None = None
+) -> str:
     """Write the record that counts from now on for a kind and key, add it to the state, and return the name of its document.
 
     ``facts`` is the part of the record that `scan` returns, if it is not the record itself.
@@ -367,6 +375,8 @@ def put_document(place: Place, state: State, kind: Kind, key: str, record: objec
     name = Name(kind, key, state.highest.get((kind, key), 0) + 1, _hash_bytes(data))
     place.put(str(name), data)
     state.add(name, record if facts is None else facts)
+    if (decoded := _DECODED.get(place.where())) is not None:
+        decoded[str(name)] = record if facts is None else facts
     return str(name)
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.atomic import make_scratch_directory, make_unique_name
 from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_json
 from tcpipe.formats.object_storage import is_bucket
@@ -105,7 +104,7 @@ def write_output(url: str, card: str) -> Iterator[Path]:
     Raises `UsageError`: something else is at the URL; `StoreError`: the place cannot be read or written.
     """
     check_kind(url, card)
-    place, folder = open_place(url), f"{BUILDS}/{secrets.token_hex(8)}"
+    place, folder = open_place(url), f"{BUILDS}/{make_unique_name()}"
     with make_scratch_directory() as scratch:
         directory = scratch / url.rstrip("/").rpartition("/")[2]
         directory.mkdir()

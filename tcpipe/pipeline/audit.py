@@ -35,6 +35,7 @@ from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, name_pose, prepare_inputs, prepare_pose
 from tcpipe.stages.read import find_read_config, read_run
+from tcpipe.store import is_store
 from tcpipe.tables.arrays import number_column, select_rows
 from tcpipe.tables.columns import read_float_columns, to_integers
 from tcpipe.tables.levels import Streams, Track
@@ -268,6 +269,8 @@ def read_audited(
     if not is_path(run):
         stored = find_named_run(run, store)
         return stored.streams(), stored.manifest.recipe.fuse
+    if is_store(run):
+        raise UsageError(f"{run}: is a store; name one of its runs: tcpipe audit RUN --store {run}")
     path = run if is_url(run) else Path(run)
     step("reading")
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as log:

@@ -196,11 +196,6 @@ def _close_killed_calls(running: RunningCall) -> None:
         close_call(running.store, running.state, each, f"its work was done by {CALL_PREFIX}{running.key}")
 
 
-def make_blob_name() -> str:
-    """Return the name of a folder of payload that nobody else writes to: random."""
-    return secrets.token_hex(8)
-
-
 def close_call(store: Store, state: State, killed: OpenCall, message: str) -> None:
     """Write the end of a killed call, unless it has written it itself meanwhile."""
     key = killed.key

@@ -152,11 +152,12 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     """
     opened = open_store(store)
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
-    card, sample = read_intact_card(directory), _read_sample(directory, sample_id)
+    card = read_intact_card(directory)
     if card.without_coordinates:
         raise DatasetError(
             f"{directory}: is without coordinates, so that its samples have no known source; explain the dataset with them"
         )
+    sample = _read_sample(directory, sample_id)
     run = _find_run(opened, state := opened.scan(), directory, card, sample)
     source = open_map(*opened.map_at(opened.find_map(sample["map"], state)))
     return Explained(sample_id, _read_history(card, sample, run, source=source))

@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
@@ -163,7 +163,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
             logger.warning(text, pattern, list_first(run_ids, _MOST_RUNS))
 
 
-def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[str, object]:
+def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[str, Any]:
     """Return what the record of a call holds of its work."""
     done = [result for result in summary.results if result.status in ("done", "damaged", "empty")]
     sizes = {task.source.name: task.source.size_bytes for task in tasks}

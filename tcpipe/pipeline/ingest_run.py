@@ -31,7 +31,6 @@ from tcpipe.formats.stored_runs import (
     write_streams,
 )
 from tcpipe.logs.topics import split_notes
-from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.log_sources import LogSource, find_damaged_log, find_total_loss
 from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
@@ -284,7 +283,7 @@ def put_run(store: Store, state: State, run: Run, directory: Path, stored: RunFa
     """Put the files of a run into the store, then its manifest; ``stored`` has streams that are there already."""
     files = compute_checksums(directory)
     streams = {name: checksum for name, checksum in files.items() if name.startswith(f"{STREAMS}/")}
-    store.put_blob(blob := make_blob_name(), directory)
+    blob = store.put_blob(directory)
     run = replace(
         run,
         blob=blob,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -46,7 +46,7 @@ class InspectedRecipe(RunFacts):
     """A run under one recipe: its facts, and the verdict by the catalogue of this version."""
 
     counts: Counts
-    verdict: Verdict
+    verdict: Verdict = field()  # else its default were the property of `RunFacts`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +126,7 @@ def inspect(
     path = Path(path)
     if (path / "dataset.json").is_file():
         return _inspect_dataset(path, str(path))
-    if path.is_dir() and is_store(path):
+    if is_store(path):
         return _inspect_store(Store(path))
     if path.suffix == ".zarr":
         from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect

@@ -21,7 +21,7 @@ from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.store_records import StoredMap
-from tcpipe.pipeline.calls import ADD_MAP, RunningCall, make_blob_name, record_call
+from tcpipe.pipeline.calls import ADD_MAP, RunningCall, record_call
 from tcpipe.pipeline.options import AddMapOptions, Files
 from tcpipe.report.pictures import draw_quick_look, write_overview
 from tcpipe.store import Store, check_map_name, open_store
@@ -87,7 +87,7 @@ def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
     )
     if name in state.maps and not options.force:
         return _find_unchanged(store, state, name, inputs)
-    with store.new_map(name, make_blob_name()) as (path, put):
+    with store.new_map(name) as (path, put):
         build_map(
             path,
             name=name,

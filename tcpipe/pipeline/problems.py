@@ -10,7 +10,7 @@ from tcpipe.errors import UsageError, list_first
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.runs import Run, RunFacts
-from tcpipe.formats.store_records import Problem
+from tcpipe.formats.store_records import Call, Problem
 from tcpipe.pipeline.calls import ACKNOWLEDGE, INGEST, close_call, list_open_calls, record_call
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.store import Store, open_store
@@ -55,8 +55,12 @@ def make_waiting(source: LogSource, state: str) -> Problem:
 
 def make_missing(path: str, state: State) -> Problem:
     """Return the problem that a path given to `ingest` holds no log; after the next call that is given the path it is a new one."""
-    latest = max((call.begin for _, call in state.calls if call.command == INGEST and path in call.works_on), default="")
+    latest = max((call.begin for call in _list_ingests(state) if path in call.works_on), default="")
     return Problem(make_finding("log-missing", Subject("log", path)), f"{path} {latest}", (path,))
+
+
+def _list_ingests(state: State) -> list[Call]:
+    return [call for _, call in state.calls if call.command == INGEST]
 
 
 def is_acknowledged(problems: Sequence[Problem], state: State) -> bool:
@@ -142,7 +146,7 @@ def _name_problems(name: str, known: Iterable[Problem], state: State) -> list[Pr
 
 def _make_missing_problem(name: str, state: State) -> list[Problem]:
     """Return the problem of a path that `ingest` was given and that holds no log."""
-    given = {log for _, call in state.calls if call.command == INGEST for log in call.works_on}
+    given = {log for call in _list_ingests(state) for log in call.works_on}
     path = next((path for path in (name, str(Path(name).absolute())) if path in given), None)
     if path is None:
         return []

@@ -6,35 +6,28 @@ a second scan and that no document of this scan names. While another call may ru
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.dataset_files import CARD, REPORT, parse_card
-from tcpipe.formats.documents import BLOBS, State, make_run_key, read_record
+from tcpipe.formats.dataset_files import CARD, parse_card
+from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.object_storage import make_absolute
+from tcpipe.formats.payload import find_unnamed, list_named_files, list_payload, read_records
 from tcpipe.formats.place import Entry
 from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
-from tcpipe.formats.store_records import Output, StoredMap
-from tcpipe.formats.stored_runs import STREAMS
+from tcpipe.formats.store_records import Output
 from tcpipe.pipeline.calls import PRUNE, OpenCall, format_bytes, is_alive, list_open_calls, record_call
 from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
-TABLES = ("track.parquet", "segments.parquet", "rejections.parquet", REPORT)
-"""Files of a run in its folder of payload, beside the folder of its streams."""
-BLOB = re.compile(r"[0-9a-f]{16}")
-"""Name of a folder of payload."""
-_NOTES = re.compile(r"(.*/)?(\.DS_Store|\.directory|Thumbs\.db|[^/]*\.aux\.xml)")
-"""Files that other programs put beside those that they look at."""
 _MAX_CALLS = 50
 """Ended calls of each command that are kept."""
 
@@ -98,7 +91,7 @@ def prune(
     changes.
     """
     ruling, opened = ingest_key(resolve_recipe(recipe)), open_store(store)
-    forgotten = [make_absolute(name) for name in forget]
+    forgotten, left = [make_absolute(name) for name in forget], _find_temporaries(opened)
     with nullcontext() if dry_run else record_call(opened, PRUNE, runs, {"forget": forgotten}) as call:
         first, mine = (opened.scan(), "") if call is None else (call.state, call.key)
         if unknown := [name for name in forgotten if name not in first.outputs]:
@@ -108,13 +101,14 @@ def prune(
         removal = _Removal(opened, first, dry_run, forgotten)
         if (waits_for := _find_running(first, dead, mine)) is None:
             removal.give_up(chosen)
-            payload = list_payload(opened)
+            payload = list_payload(opened.place)
             second = opened.scan()
             waits_for = _find_running(second, dead, mine)
             removal.take_back(second, is_all=waits_for is not None)
             if waits_for is None:
                 removal.choose_documents(second)
                 removal.choose_payload(second, payload)
+                removal.removed += left
                 removal.execute()
         found = removal.describe(waits_for)
         if call is not None:
@@ -195,49 +189,6 @@ def _read_inputs(where: str) -> str | None:
         return None
 
 
-def list_payload(store: Store) -> dict[str, list[Entry]]:
-    """Return the files of each folder of payload."""
-    found: dict[str, list[Entry]] = {name: [] for name in store.place.list(BLOBS) if BLOB.fullmatch(name)}
-    for entry in store.place.entries(BLOBS):
-        _, blob, name = entry.name.split("/", 2) if entry.name.count("/") > 1 else ("", "", "")
-        if BLOB.fullmatch(blob):
-            found.setdefault(blob, []).append(entry._replace(name=name))
-    return found
-
-
-def name_payload(records: Iterable[RunFacts | StoredMap]) -> dict[str, set[str]]:
-    """Return the folders of payload that records name, with the parts that they use: ``tables``, ``streams``."""
-    named = dict[str, set[str]]()
-    for record in records:
-        named.setdefault(record.blob, set()).add("tables")
-        named.setdefault(record.streams_blob if isinstance(record, RunFacts) else record.blob, set()).add(STREAMS)
-    return named
-
-
-def is_payload(name: str) -> bool:
-    """Return whether tcpipe writes a file of this name into a folder of payload."""
-    folder, _, file = name.partition("/")
-    return name in TABLES or folder.endswith((".zarr", ".png")) or (folder == STREAMS and file.endswith(".parquet"))
-
-
-def is_note(name: str) -> bool:
-    """Return whether file managers or GDAL write a file of this name into folders that they look at."""
-    return _NOTES.fullmatch(name) is not None
-
-
-def read_beaten(store: Store, names: Iterable[str]) -> tuple[list[RunFacts | StoredMap], list[str]]:
-    """Return the runs and maps in documents that do not count, and the names of damaged documents."""
-    records, damaged = list[RunFacts | StoredMap](), list[str]()
-    for name in names:
-        kind = name.partition("/")[0]
-        if kind in ("runs", "maps"):
-            try:
-                records.append(read_record(store.place, name, RunFacts) if kind == "runs" else read_record(store.place, name, StoredMap))
-            except StoreError:
-                damaged.append(name)
-    return records, damaged
-
-
 @dataclass(slots=True)
 class _Removal:
     """What one call removes, decided step by step, then executed."""
@@ -253,7 +204,7 @@ class _Removal:
     documents: list[list[str]] = field(default_factory=list)
     """Group after group: a kill between them lets no replaced document count again."""
     payload: list[str] = field(default_factory=list)
-    """Folders, and files of folders of which a part is used."""
+    """Folders, and files of folders in use."""
     removed: list[Leftover] = field(default_factory=list)
     kept: list[Leftover] = field(default_factory=list)
 
@@ -261,13 +212,17 @@ class _Removal:
         """Write that runs have no tables, but those to which an output refers."""
         held = _find_references(self.first, self.forgotten) if chosen else {}
         for key, (row, what) in chosen.items():
-            name = row.run_id, row.recipe_id
-            if name in held:
-                self.kept.append(Leftover(what, "/".join(name), _measure_tables(row), held[name]))
+            if why := held.get((row.run_id, row.recipe_id)):
+                self.kept.append(_describe(row, what, why))
                 continue
-            self.chosen[key], self.earlier[key] = (row, what), self.first.names["runs", key]
-            if not self.dry_run:
-                forget_tables(self.store, self.first, row)
+            document = self.first.names["runs", key]
+            try:
+                if not self.dry_run:
+                    forget_tables(self.store, self.first, row)
+            except StoreError as error:
+                self.kept.append(_describe(row, what, error.problems[0]))
+                continue
+            self.chosen[key], self.earlier[key] = (row, what), document
 
     def take_back(self, second: State, *, is_all: bool) -> None:
         """Let runs count again if an output refers to them that was written meanwhile, or if nothing can be removed now."""
@@ -277,61 +232,44 @@ class _Removal:
             why = held.get((row.run_id, row.recipe_id))
             if is_all or why is not None:
                 del self.chosen[key]
-                self.kept += [Leftover(what, f"{row.run_id}/{row.recipe_id}", _measure_tables(row), why)] if why else []
+                self.kept += [_describe(row, what, why)] if why else []
+                earlier = self.earlier.pop(key)
                 if not self.dry_run:
-                    self.store.put_run(second, read_record(self.store.place, self.earlier[key], Run))
+                    self.store.put_run(second, read_record(self.store.place, earlier, Run))
 
     def choose_documents(self, second: State) -> None:
         """Choose the documents that did not count in the first scan, then calls before the latest and forgotten outputs."""
         counting = {*second.names.values()} - ({*self.earlier.values()} if self.dry_run else set())
         replaced = dict.fromkeys([*self.first.beaten, *self.earlier.values()])
         self.documents.append([name for name in replaced if name not in counting])
-        last = [("calls", key) for key in _find_old_calls(self.first)]
-        outputs = second.facts["outputs"].items()
-        last += [("outputs", key) for key, output in outputs if output.where in self.forgotten]
-        names = [self.first.names[each] for each in last]  # type: ignore[index]
-        self.documents.append([name for name in names if name in counting])
+        last = [self.first.names["calls", key] for key in _find_old_calls(self.first)]
+        last += [self.first.names["outputs", make_key(where)] for where in self.forgotten]
+        self.documents.append([name for name in last if name in counting])
 
     def choose_payload(self, second: State, payload: Mapping[str, Sequence[Entry]]) -> None:
         """Choose payload that no document names, also none that does not count and stays."""
         going = {name for group in self.documents for name in group}
-        runs = [row for key, row in second.facts["runs"].items() if second.names["runs", key] not in going]
-        beaten, damaged = read_beaten(self.store, [name for name in second.beaten if name not in going])
-        named = name_payload([*runs, *second.facts["maps"].values(), *beaten])
-        damaged += [name for name in second.damaged if name.startswith(("runs/", "maps/"))]
-        sizes, labels = dict[str, int](), {row.blob: key for key, (row, _) in self.chosen.items()}
-        for blob, entries in payload.items():
-            parts = named.get(blob, set())
-            over = [
-                entry for entry in entries if (STREAMS if entry.name.startswith(STREAMS) else "tables") not in parts
-            ]
-            over = over if not parts else [entry for entry in over if is_payload(entry.name)]
-            if parts and not over:
+        records, damaged = read_records(self.store.place, second, going)
+        labels = {row.blob: (what, f"{row.run_id}/{row.recipe_id}") for row, what in self.chosen.values()}
+        sizes = dict.fromkeys(labels.values(), 0)
+        for name, size_bytes, foreign in find_unnamed(payload, list_named_files(records)):
+            is_folder = name.count("/") == 1
+            if foreign and not is_folder:
                 continue
-            where, size = self.store.place.where(f"{BLOBS}/{blob}"), sum(entry.size_bytes for entry in over)
-            foreign = next((entry.name for entry in over if not (is_payload(entry.name) or is_note(entry.name))), None)
+            label = labels.get(name.split("/")[1], ("payload that no document names", self.store.place.where(name)))
             why = f"it contains {foreign}, which tcpipe did not write" if foreign else None
-            if damaged:
-                why = f"{damaged[0]} is damaged and may name it; 'tcpipe verify' lists repairs"
-            if why is not None:
-                self.kept.append(Leftover("payload", where, size, why))
-                continue
-            self.payload += [f"{BLOBS}/{blob}/{entry.name}" for entry in over] if parts else [f"{BLOBS}/{blob}"]
-            if blob in labels:
-                sizes[labels[blob]] = size
+            why = f"{damaged[0]} is damaged and may name it; 'tcpipe verify' lists repairs" if damaged else why
+            if why is None:
+                self.payload.append(name)
+                sizes[label] = sizes.get(label, 0) + size_bytes
             else:
-                self.removed.append(Leftover("payload that no document names", where, size))
-        rows = [(what, f"{row.run_id}/{row.recipe_id}", sizes.get(key, 0)) for key, (row, what) in self.chosen.items()]
-        self.removed = [*(Leftover(*row) for row in rows), *self.removed]
+                self.kept.append(Leftover("payload", self.store.place.where(name), size_bytes, why))
+        self.removed += [Leftover(*label, size_bytes) for label, size_bytes in sizes.items()]
 
     def execute(self) -> None:
         """Remove what is chosen, and what killed calls left on disk."""
-        place = self.store.place
-        for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
-            if is_abandoned(path):
-                size = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
-                self.removed.append(Leftover("left by a killed call", str(path), size))
         if not self.dry_run:
+            place = self.store.place
             for names in (*self.documents, self.payload):
                 place.map(place.delete, names)
             place.clear()
@@ -343,8 +281,20 @@ class _Removal:
         return Pruned(str(self.store.root), self.dry_run, *told, waits_for)
 
 
-def _measure_tables(row: RunFacts) -> int:
-    return sum(checksum.size_bytes for checksum in row.tables.values())
+def _find_temporaries(store: Store) -> list[Leftover]:
+    """Return what killed calls left on disk: the next call that writes removes it."""
+    paths = sorted(store.place.path.glob(f"{TEMPORARY_PREFIX}*")) if store.place.path else []
+    sizes = {
+        path: sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+        for path in paths
+        if is_abandoned(path)
+    }
+    return [Leftover("left by a killed call", str(path), size_bytes) for path, size_bytes in sizes.items()]
+
+
+def _describe(row: RunFacts, what: str, why: str) -> Leftover:
+    size_bytes = sum(checksum.size_bytes for checksum in row.tables.values())
+    return Leftover(what, f"{row.run_id}/{row.recipe_id}", size_bytes, why)
 
 
 def _find_old_calls(state: State) -> Iterator[str]:

@@ -61,7 +61,7 @@ def report(
     ``patches``: of a dataset, write pictures of all patches beside the page.
     """
     is_there = is_path(path)
-    is_one = is_there and (is_url(path) or Path(path).is_dir()) and is_store(path)
+    is_one = is_there and is_store(path)
     if is_there and not is_one and (is_url(path) or (Path(path) / CARD).is_file()):
         return [_report_dataset(path, patches=patches)]
     if patches:

@@ -191,7 +191,9 @@ def _find_tasks(
             found = find_sources(mine, as_one=again.as_one, staging=staging, tables=recipe.tables)
         missing |= found.problems
         new = make_tasks(found.sources, again, root, recipe)
-        tasks += new if options.shard is None else [new[at] for at in select_shard(found.sources, options.shard)]
+        new = new if options.shard is None else [new[at] for at in select_shard(found.sources, options.shard)]
+        known = {task.source.origins for task in tasks}  # of later calls
+        tasks += [task for task in new if task.source.origins not in known]
     return tasks, missing
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -9,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, parse_card
+from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, find_foreign_files, is_desktop_file, parse_card
 from tcpipe.formats.documents import (
     BLOBS,
     INDEX,
@@ -26,13 +27,13 @@ from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_column_names, read_row_count
+from tcpipe.formats.payload import BLOB, find_unnamed, list_named_files, list_payload, read_records
 from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.published_outputs import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.pipeline.calls import list_open_calls
 from tcpipe.pipeline.named_runs import find_named_runs
 from tcpipe.pipeline.problems import find_incomplete_runs
-from tcpipe.pipeline.prune import BLOB, is_note, is_payload, list_payload, name_payload, read_beaten
 from tcpipe.store import Store, is_store
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.levels import COORDINATES, DATA_MODEL_VERSION
@@ -64,6 +65,7 @@ _REPAIRS: Mapping[Kind, str] = {
     "outputs": "remove it and build the dataset again",
 }  # fmt: skip
 """By kind of document: how to repair one that is damaged."""
+_DESKTOP = "a file manager or a GIS program left it; tcpipe ignores it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +143,10 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     wrong = list(find_wrong_files(place, checksums))
     yield from _repair_by(Repair(f"{repair} with --force"), wrong)
     yield "files", len(checksums)
-    yield from (f"{name}: is no file of this {kind}" for name in find_unlisted_files(path) if not is_note(name))
+    is_local = kind == "dataset" and place.path is not None
+    for name in find_foreign_files(Path(path), checksums) if is_local else find_unlisted_files(path):
+        full = place.where(name) if is_local else name
+        yield Repair(f"{full}: {_DESKTOP}") if is_desktop_file(name) else f"{full}: is no file of this {kind}"
     if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
         yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 
@@ -178,7 +183,7 @@ def _verify_map(path: Path) -> Iterator[CheckResult]:
     place, checksums = Place(path), read_checksums(path)
     yield from _verify_files(place, checksums, Repair(f"{path}: copy it again, or add the map again with --force"))
     strange = [entry.name for entry in place.entries() if entry.name not in {*checksums, CHECKSUMS}]
-    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_note(name))
+    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_desktop_file(name))
 
 
 def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator[CheckResult]:
@@ -203,7 +208,7 @@ def _verify_store(store: Store) -> Iterator[CheckResult]:
         yield "maps", 1
         repair = Repair(f"map {each.name}: copy the store again, or add the map again with --force")
         yield from _verify_files(place.below(f"{BLOBS}/{each.blob}"), each.files, repair)
-    yield from _verify_names(store, state)
+    yield from _verify_names(place, state)
 
 
 def _verify_documents(place: Place) -> Iterator[CheckResult]:
@@ -211,16 +216,18 @@ def _verify_documents(place: Place) -> Iterator[CheckResult]:
     for kind in KINDS:
         names = [str(name) for file in place.list(kind) if (name := parse_name(kind, file)) is not None]
         yield "documents", len(names)
-        for line in filter(None, place.map(lambda name, kind=kind: _check_document(place, kind, name), names)):  # type: ignore[misc]
-            yield from (line, Repair(f"{line.partition(': ')[0]}: copy it again, or {_REPAIRS[kind]}"))
+        damaged = place.map(lambda name, kind=kind: _is_damaged(place, kind, name), names)  # type: ignore[misc]
+        for where in map(place.where, itertools.compress(names, damaged)):
+            yield f"{where}: is missing or has changed since it was written"
+            yield Repair(f"{where}: copy it again, or {_REPAIRS[kind]}")
 
 
-def _check_document(place: Place, kind: Kind, name: str) -> str | None:
+def _is_damaged(place: Place, kind: Kind, name: str) -> bool:
     try:
         read_record(place, name, RECORDS[kind])
-    except StoreError as error:
-        return error.problems[0].partition(";")[0]
-    return None
+    except StoreError:
+        return True
+    return False
 
 
 def _verify_page(place: Place) -> Iterator[CheckResult]:
@@ -263,34 +270,19 @@ def _verify_rows(place: Place, row: RunFacts, document: str) -> Iterator[CheckRe
             yield f"{place.where(document)}: {_COUNTS[table]} is {count}, but {table}.parquet has {rows} rows"
 
 
-def _verify_names(store: Store, state: State) -> Iterator[CheckResult]:
-    """Yield payload that no document names, and files that tcpipe did not write."""
-    place, beaten = store.place, read_beaten(store, state.beaten)[0]
-    listed = {(row.blob, name) for row in state.runs.values() for name in row.tables}
-    listed |= {(row.streams_blob, name) for row in state.runs.values() for name in row.streams}
-    listed |= {(each.blob, name) for each in state.maps.values() for name in each.files}
-    named = name_payload([*state.runs.values(), *state.maps.values(), *beaten])
-    replaced = {record.blob for record in beaten}
-    is_quiet = all(call.state == "killed" for call in list_open_calls(state))
+def _verify_names(place: Place, state: State) -> Iterator[CheckResult]:
+    """Yield payload that no document names, unless a call may still name it, and files that tcpipe did not write."""
     strange = [name for name in place.list() if name not in (*KINDS, BLOBS, INDEX, REPORT)]
-    strange += [
-        *find_strange_files(place),
-        *(f"{BLOBS}/{name}" for name in place.list(BLOBS) if not BLOB.fullmatch(name)),
-    ]
-    for blob, entries in list_payload(store).items():
-        if blob not in named:
-            yield from [f"{place.where(f'{BLOBS}/{blob}')}: {_KILLED}"] if is_quiet else []
-            continue
-        for entry in entries:
-            if (blob, entry.name) in listed or entry.name == REPORT or blob in replaced:
-                continue
-            if is_payload(entry.name) and is_quiet:
-                yield f"{place.where(f'{BLOBS}/{blob}/{entry.name}')}: {_KILLED}"
-            elif not is_payload(entry.name):
-                strange.append(f"{BLOBS}/{blob}/{entry.name}")
+    strange += find_strange_files(place)
+    strange += [f"{BLOBS}/{name}" for name in place.list(BLOBS) if not BLOB.fullmatch(name)]
+    is_quiet = all(call.state == "killed" for call in list_open_calls(state))
+    left = [str(path) for path in (place.path.glob(f"{TEMPORARY_PREFIX}*") if place.path else ()) if is_abandoned(path)]
+    for each in find_unnamed(list_payload(place), list_named_files(read_records(place, state)[0])):
+        if each.foreign and each.name.endswith(each.foreign):
+            strange.append(each.name)
+        elif is_quiet:
+            left.append(place.where(each.name))
+    yield from (f"{name}: {_KILLED}" for name in sorted(left))
     for name in strange:
         line = f"{place.where(name)}: is no file of this store"
-        yield Repair(line) if is_note(name) else line
-    for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
-        if is_abandoned(path):
-            yield f"{path}: {_KILLED}"
+        yield Repair(line) if is_desktop_file(name) else line

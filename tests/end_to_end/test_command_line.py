@@ -21,7 +21,7 @@ import rasterio
 from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from stored_files import only_run, read_files, tables
+from stored_files import checksums, map_path, only_run, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, make_tiny, simulate
@@ -307,7 +307,7 @@ def test_one_recording_is_one_run_under_any_name(log: Path, tmp_path: Path) -> N
     assert again.returncode == 0
     assert "nothing to do: 4 of 4 logs" in again.stdout
     assert "new\\nline.mcap is a duplicate of" in again.stdout
-    assert len(list((tmp_path / "tcpipe-store" / "runs").iterdir())) == 1
+    assert len(Store(tmp_path / "tcpipe-store").runs()) == 1
 
 
 def test_power_logged_apart_is_one_drive(log: Path, store: Path, tmp_path: Path) -> None:
@@ -319,7 +319,7 @@ def test_power_logged_apart_is_one_drive(log: Path, store: Path, tmp_path: Path)
     ]
     assert found[0].num_rows > 0
     assert found[0].equals(found[1])
-    assert len(list(tmp_path.glob("joined/runs/*"))) == 1
+    assert len(Store(tmp_path / "joined").runs()) == 1
     shutil.copy(drive, tmp_path / "twin.mcap")
     twice = tcpipe("ingest", drive, tmp_path / "twin.mcap", "--as-one", cwd=tmp_path)
     assert "the same recording as" in plain_lines(twice, 1, most=1)
@@ -365,9 +365,7 @@ def test_tags_are_kept_and_changed_without_doing_the_work_again(log: Path, store
     assert "nothing to do" in _run("ingest", log, cwd=tmp_path)
     assert segments.stat().st_mtime_ns == made
     run = only_run(tmp_path / "tcpipe-store")
-    known = Store(tmp_path / "tcpipe-store").run_json(run.run_id)
-    assert known is not None
-    assert run.manifest.tags == known.tags == {"weather": "dry", "driver": "x"}
+    assert run.manifest.tags == run.facts.tags == {"weather": "dry", "driver": "x"}
 
 
 def test_a_place_without_home_and_with_nothing_writable_but_the_store(logs: list[Path], tmp_path: Path) -> None:
@@ -423,13 +421,13 @@ def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
         seed = ["--seed", "3"] if command[0] == "simulate" else []
         assert "nothing to do" in _run(*command, *seed, cwd=tmp_path), command
     assert _written(tmp_path) == before
-    run = next((tmp_path / "tcpipe-store" / "runs").iterdir())
+    run = only_run(tmp_path / "tcpipe-store")
     expected = {
-        "tcpipe-store": run.name,
-        str(Store(tmp_path / "tcpipe-store").map_files("site")[0]): "EPSG:32633",
-        "dataset": run.name,
-        str(run): "weather=dry",
-        only_run(tmp_path / "tcpipe-store").where: "m kept",
+        "tcpipe-store": run.run_id,
+        str(map_path(tmp_path / "tcpipe-store", "site")): "EPSG:32633",
+        "dataset": run.run_id,
+        run.run_id: "weather=dry",
+        run.name: "m kept",
         "site": "wheel_odometry",
     }
     for path, said in expected.items():
@@ -498,7 +496,7 @@ def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_pa
     again = _run("ingest", *logs, "--retry-failed", cwd=tmp_path)
     assert [line.split()[0] for line in again.splitlines() if "robot husky" in line] == ["unchanged", "done", "done"]
     _run("ingest", logs[0], "--store", "alone", cwd=tmp_path)
-    by_worker, alone = (read_files(tmp_path / name / "runs") for name in ("tcpipe-store", "alone"))
+    by_worker, alone = (checksums(tmp_path / name) for name in ("tcpipe-store", "alone"))
     assert {name: by_worker.get(name) for name in alone} == alone != {}, "a worker makes the same bytes"
 
 
@@ -509,7 +507,7 @@ def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_p
     for process in running:
         _, told = process.communicate(timeout=HANGS_S)
         assert process.returncode == 0, told
-    state = open_store(tmp_path / "tcpipe-store").state()
-    assert (len(state.runs), len(state.seen)) == (2, 3)
+    state = open_store(tmp_path / "tcpipe-store").scan()
+    assert (len(state.runs), len(state.facts["seen"])) == (2, 3)
     assert not list(tmp_path.rglob(".tmp-*"))
     assert "nothing to do: 3 of 3" in _run("ingest", *batches[0], *batches[1], cwd=tmp_path)

@@ -10,11 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 from installed_command import tcpipe
 from mcap.writer import Writer
+from stored_files import map_path, only_run
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import read_class_scheme
 from tcpipe.simulation import simulate
-from tcpipe.store import Store
 
 DRAWS_DATASET_PAGES = True
 
@@ -57,8 +57,8 @@ def test_no_command_prints_or_writes_a_name_as_anything_but_text(work):
     harmless(tcpipe(*ingest, cwd=here), 0, 3)
     harmless(tcpipe("add-map", "site", *layers, "--classes", "classes.csv", cwd=here), 0)
     harmless(tcpipe("build-dataset", cwd=here), 0, 3)
-    run = next((here / "tcpipe-store/runs").iterdir())
-    for path in (run, "tcpipe-store", Store(here / "tcpipe-store").map_files("site")[0], "dataset"):
+    run = only_run(here / "tcpipe-store").run_id
+    for path in (run, "tcpipe-store", map_path(here / "tcpipe-store", "site"), "dataset"):
         harmless(tcpipe("inspect", path, cwd=here), 0, 3)
     json.loads(harmless(tcpipe("inspect", run, "--json", cwd=here), 0, 3))
     for path in ("tcpipe-store", "dataset"):

@@ -14,6 +14,7 @@ import xarray as xr
 from click.testing import CliRunner
 from map_worlds import write_tif
 from rasterio import Affine
+from stored_files import map_path
 from synthetic_store import WORLD, add_run, lanes, segments
 
 import tcpipe
@@ -24,7 +25,7 @@ from tcpipe.learning.models import load_model
 from tcpipe.learning.training import _report_layers
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
-from tcpipe.store import Store, open_store
+from tcpipe.store import open_store
 from tcpipe.terrain.classes import PAPER_CLASSES
 from tcpipe.terrain.layers import Layer
 
@@ -177,7 +178,7 @@ def test_all_that_describes_a_dataset_tells_of_them(datasets):
     kinds = {field["name"]: field["dataType"] for field in fields}
     assert (kinds["moisture"], kinds["canopy"]) == ("sc:Float", "sc:Integer")
     assert "canopy" in (datasets / "zarr" / "report.html").read_text()
-    listed = CliRunner().invoke(cli, ["inspect", str(Store(datasets / "store").map_files("own")[0])]).output
+    listed = CliRunner().invoke(cli, ["inspect", str(map_path(datasets / "store", "own"))]).output
     assert all(name in listed for name in ("moisture", "canopy", "ortho_red", "embedding"))
     sample_id = tcpipe.open_dataset(datasets / "zarr")["train"].column("sample_id")[0]
     assert explain(sample_id, dataset=datasets / "zarr", store=datasets / "store").facts.map.name == "own"

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,6 +15,7 @@ from stored_files import only_run
 from wheel_drives import drive_at
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap, write_rosbag2
+from tcpipe.store import Store
 from tcpipe.tables.findings import select_findings
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -37,32 +37,25 @@ def drive(*, simulated: bool = False) -> list[MessageStream]:
     return [MessageStream("/wheel/odom", ODOMETRY, log_ns, columns, texts)]
 
 
-def run_json(store: Path) -> dict:
-    (path,) = store.glob("runs/*/run-1.json")
-    return json.loads(path.read_text())
-
-
 @pytest.mark.parametrize(("content", "store"), [(b"nonsense", "tcpipe-store"), (b"#ROSBAG V2.0\n", "deep/down/store")])
-def test_what_cannot_be_ingested_leaves_no_store(tmp_path, content, store):
+def test_what_cannot_be_ingested_is_known_to_fail_from_then_on(tmp_path, content, store):
     (tmp_path / "a.bag").write_bytes(content)
     done = tcpipe("ingest", "a.bag", "--store", store, cwd=tmp_path)
     plain_lines(done, 1)
+    assert done.stdout.splitlines()[1] == f"new store: {store}"
     assert done.stdout.splitlines()[-1] == f"1 log failed; no run was added to {store}"
-    assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
     found = told(tcpipe("ingest", "a.bag", "--store", store, "--json", cwd=tmp_path))
-    assert (found["store"], found["exit_code"], found["results"][0]["status"]) == (None, 1, "failed")
-    (tmp_path / store).mkdir(parents=True)
-    plain_lines(tcpipe("ingest", "a.bag", "--store", store, cwd=tmp_path), 1)
-    assert (tmp_path / store).is_dir()
+    assert (found["store"], found["exit_code"], found["results"][0]["known"]) == (store, 0, True)
+    plain_lines(tcpipe("ingest", "a.bag", "--store", store, "--retry-failed", cwd=tmp_path), 1)
 
 
 def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     write_rosbag2(tmp_path / "run", drive(simulated=True), storage="sqlite3")
     assert tcpipe("ingest", "run", cwd=tmp_path).returncode == 0
-    found = run_json(tmp_path / "tcpipe-store")
-    assert found["damage"] == []
-    assert [of["code"] for of in found["notes"]] == ["no-checksum"]
-    assert "simulated-time" in {of["code"] for of in found["report"]["findings"]}
+    found = only_run(tmp_path / "tcpipe-store").manifest
+    assert found.damage == ()
+    assert [of.code for of in found.notes] == ["no-checksum"]
+    assert "simulated-time" in {of.code for of in found.read_report.findings}
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
@@ -122,7 +115,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
         "1 log failed before and was skipped; --retry-failed tries it again",
         "1 log known as damaged or empty; 'tcpipe acknowledge RUN' after you have checked it",
     ]
-    (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
+    (run_id,) = {run.run_id for run in Store(tmp_path / "tcpipe-store").runs() if run.run_id.startswith("cut-")}
     refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
     assert f"nosuch: is no run or log with a known problem in tcpipe-store; known problems: {junk}, {run_id}" in refused
     done = tcpipe("acknowledge", run_id, "logs/junk.bag", cwd=tmp_path)
@@ -176,7 +169,8 @@ def test_shares_of_a_folder_and_parts_of_a_bag(tmp_path):
     logs = [
         {result["log"].rsplit("/", 1)[1]: result["status"] for result in told(share)["results"]} for share in shares
     ]
-    assert logs == [dict.fromkeys(["bag", "run1.mcap"], "done"), {"run0.mcap": "done"}]
+    assert logs[0].keys().isdisjoint(logs[1])
+    assert logs[0] | logs[1] == dict.fromkeys(["bag", "run0.mcap", "run1.mcap"], "done")
     part = tcpipe("ingest", "logs/bag/bag_1.mcap", cwd=tmp_path)
     assert f"is one of the 2 parts of the ROS 2 bag {tmp_path / 'logs' / 'bag'}" in plain_lines(part, 2, most=1)
 
@@ -191,7 +185,7 @@ def test_logs_in_object_storage(tmp_path):
         first = tcpipe("ingest", "s3://drives", cwd=tmp_path, env=environment)
         assert "s3://drives/junk.bag: not a log" in plain_lines(first, 3)
         assert "1 done, 1 failed" in first.stdout
-        assert run_json(tmp_path / "tcpipe-store")["source"]["paths"] == ["s3://drives/run.mcap"]
+        assert only_run(tmp_path / "tcpipe-store").facts.log.paths == ("s3://drives/run.mcap",)
         assert set(fetched) == {"junk.bag", "run.mcap"}
         requests = len(fetched)
         again = tcpipe("ingest", "s3://drives/run.mcap", cwd=tmp_path, env=environment)

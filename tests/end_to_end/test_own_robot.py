@@ -69,7 +69,8 @@ def segments(store, result):
 
 
 def run_of(store, result):
-    return next(run for run in Store(store).recipes_of(result.run.run_id) if run.recipe_id == result.run.recipe_id)
+    (run,) = Store(store).find_runs(f"{result.run.run_id}/{result.run.recipe_id}")
+    return run
 
 
 def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path):

@@ -2,11 +2,13 @@
 
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from changed_drives import NAMES, energy_ratio, make
 from click.testing import CliRunner
+from stored_files import only_run
 
 from tcpipe.cli import cli
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
@@ -83,7 +85,7 @@ def test_currents_in_milliamperes_come_first_and_are_cured_by_the_recipe_as_it_i
     told = run("ingest", log, "--store", tmp_path / "without").output
     assert any(line.strip().startswith("error: ") for line in told.splitlines() if line.endswith("[power-rejected]"))
     run("report", tmp_path / "without")
-    (page,) = (tmp_path / "without" / "runs").rglob("report.html")
+    page = Path(only_run(tmp_path / "without").folder.where("report.html"))
     verdict = page.read_text().split('class="verdict"')[1].split("</section>")[0]
     assert "energy <b>not usable</b>" in verdict
     assert "current_scale = 0.001" in verdict.split("[power-rejected]")[1].split("</pre>")[0]

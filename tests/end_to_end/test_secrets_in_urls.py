@@ -126,7 +126,7 @@ def test_a_signature_is_in_nothing_that_is_written_or_printed(site, tmp_path):
     assert [(result["status"], result["run"]["run_id"]) for result in again] == [
         ("unchanged", first[2]["run"]["run_id"])
     ]
-    assert len(Store(tmp_path / "tcpipe-store").run_ids()) == 1
+    assert len(Store(tmp_path / "tcpipe-store").runs()) == 1
     secrets = ("5ecretS1gnature", OTHER, "wr0ngS1gnature", "X-Amz-Signature")
     assert_hidden(printed, *secrets[:3])
     assert_hidden(written_bytes(tmp_path), *secrets)

@@ -14,6 +14,8 @@ from installed_command import COMMAND, plain_lines, tcpipe
 from mcap.reader import make_reader
 from pyproj import Geod
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from stored_files import manifest as manifest_path
+from stored_files import only_run
 
 from tcpipe.simulation import simulate
 
@@ -78,11 +80,11 @@ def test_a_sample_is_traced_to_its_log(work, ids):
     found = json.loads(tcpipe("explain", ids[-1], "--json", "--quiet", cwd=work).stdout)
     facts, gnss = found["facts"], found["facts"]["messages"]["gnss"]
     assert facts["sample"]["start_ns"] <= gnss["first_ns"] <= gnss["last_ns"] < facts["sample"]["end_ns"]
-    assert facts["source"]["paths"][0].endswith(".mcap")
+    assert facts["run"]["log"]["paths"][0].endswith(".mcap")
 
 
 def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):
-    (run,) = (work / "tcpipe-store" / "runs").iterdir()
+    run = only_run(work / "tcpipe-store").run_id
     (log,) = (work / "site" / "logs").glob("*.mcap")
     done = tcpipe("overlay", run, "over.mcap", cwd=work)
     assert done.returncode == 0, done.stderr
@@ -91,7 +93,7 @@ def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):
     assert (work / "over.mcap").read_bytes() == whole, "it is not the same again"
     read = messages_of(work / "over.mcap", "/tcpipe/fix", "/tcpipe/segment", "/tcpipe/segments")
     segments = [message for _, message in read["/tcpipe/segment"]]
-    table = pq.read_table(next(run.glob("*/*/segments.parquet")))
+    table = only_run(work / "tcpipe-store").segments()
     assert [message.segment_id for message in segments] == table["segment_id"].to_pylist()
     assert [message.energy_joule for message in segments] == table["energy_joule"].to_pylist()
     # A segment is a chord of one metre, and the track passes its start when the message says so.
@@ -123,8 +125,7 @@ def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):
 
 def test_a_preflight_promises_what_ingesting_gives(work):
     (log,) = (work / "site" / "logs").glob("*.mcap")
-    (made,) = (work / "tcpipe-store" / "runs").glob("*/*/manifest-1.json")
-    manifest = json.loads(made.read_text())
+    manifest = json.loads(manifest_path(only_run(work / "tcpipe-store")).read_text())
     done = tcpipe("preflight", log, "--json", "--quiet", cwd=work)
     found = json.loads(done.stdout)
     promise, label = found["expected_yield"], manifest["info"]["report"]["facts"]["label"]
@@ -157,8 +158,9 @@ def test_an_audit_holds_a_track_against_what_is_withheld_from_it(work):
     assert (fixes["windows"], fixes["within_2_sigma"]) == (1, 1.0)
     assert any(line.startswith("gnss, 30 s: covers ") and "40 s are needed" in line for line in found["skipped"])
     # The same from the store, and as text.
-    (run,) = (work / "tcpipe-store" / "runs").iterdir()
-    assert json.loads(tcpipe("audit", run, "--json", cwd=work).stdout)["scores"] == found["scores"]
+    run = only_run(work / "tcpipe-store")
+    by_name = tcpipe("audit", run.name, "--store", "tcpipe-store", "--json", cwd=work)
+    assert json.loads(by_name.stdout)["scores"] == found["scores"]
     text = tcpipe("audit", log, "-q", "--robot", "husky", cwd=work).stdout
     assert re.search(r"^ *gnss  +10 s +1 +\d+ +0\.\d{3} .* 100% .*$", text, re.MULTILINE)
     assert not list(work.glob("*audit*"))
@@ -176,7 +178,7 @@ def test_an_audit_of_a_run_without_fixes_or_without_anything_to_compare(work):
     said = plain_lines(tcpipe("audit", log, "--recipe", "fixes.toml", "-q", cwd=work), 2)
     assert "nothing can be withheld and compared" in said
     assert "gnss, no other sensor measures motion" in said
-    assert "tcpipe-store/runs/RUN" in plain_lines(tcpipe("audit", "tcpipe-store", "-q", cwd=work), 2)
+    assert "tcpipe audit RUN --store tcpipe-store" in plain_lines(tcpipe("audit", "tcpipe-store", "-q", cwd=work), 2)
     for name in ("wheels.toml", "fixes.toml"):
         (work / name).unlink()
 

@@ -14,7 +14,7 @@ from page_reading import data_of
 from scipy.interpolate import CubicHermiteSpline
 
 import tcpipe as package
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
 from tcpipe.simulation import Truth, compute_true_cost, find_scenario, read_truth
 from tcpipe.store import Store
@@ -25,7 +25,7 @@ DRAWS_DATASET_PAGES = True
 Demo = tuple[Path, subprocess.CompletedProcess[str]]
 """Where ``tcpipe demo`` put all it made, and what it said."""
 
-Drives = list[tuple[RunDirectory, Truth]]
+Drives = list[tuple[StoredRun, Truth]]
 """Runs, each with the truth of its drive."""
 
 

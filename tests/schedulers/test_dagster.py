@@ -4,8 +4,11 @@
 """
 
 import importlib.util
+import json
 import os
 import shutil
+import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -60,6 +63,25 @@ def data_version(materialization):
     return materialization.tags["dagster/data_version"]
 
 
+@pytest.fixture
+def command(module, tmp_path, monkeypatch):
+    """A function that puts a program in place of ``tcpipe``."""
+
+    def replace(program):
+        path = tmp_path / "program.py"
+        path.write_text(program)
+        monkeypatch.setattr(module, "_COMMAND", [sys.executable, str(path)])
+
+    return replace
+
+
+def ingest_one(defs, instance, name="tiny.mcap"):
+    """Run the job of one log; return it with the events of its steps."""
+    instance.add_dynamic_partitions("logs", [name])
+    job = defs.resolve_job_def("one_log")
+    return job.execute_in_process(instance=instance, partition_key=name, raise_on_error=False)
+
+
 def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs, site):
     with dg.DagsterInstance.ephemeral() as instance:
         tick = found(defs, instance)
@@ -68,7 +90,7 @@ def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs,
         assert (request.partition_key, wanted.partition_keys) == ("tiny.mcap", ["tiny.mcap"])
         instance.add_dynamic_partitions("logs", ["tiny.mcap"])
         assert not found(defs, instance).dynamic_partitions_requests
-        assert [again.run_key for again in found(defs, instance).run_requests] == [request.run_key]
+        assert [again.partition_key for again in found(defs, instance).run_requests] == ["tiny.mcap"]
 
         done = defs.resolve_job_def("one_log").execute_in_process(instance=instance, partition_key="tiny.mcap")
         made = {
@@ -99,11 +121,11 @@ def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs,
         first, second = (of.asset_materializations_for_node("dataset")[0] for of in (built, again))
         assert data_version(first) == data_version(second), "nothing has changed"
         assert metadata["samples"].value == made["run"]["segments"].value
-        assert "accelerating" in metadata["where_every_metre_went"].value
+        assert "accelerating" in metadata["distance_breakdown"].value
         assert metadata["map"].value.startswith("![map](data:image/png;base64,")
         assert {c.check_name: c.passed for c in built.get_asset_check_evaluations()} == {
             "as_written": True,
-            "as_asked_for": False,
+            "as_requested": False,
             "held_out": True,
         }
 
@@ -155,36 +177,96 @@ def test_ten_thousand_logs_are_asked_for_a_hundred_at_a_time(defs, site, tmp_pat
     assert asked == [places[:100], places[100:200], places[200:] + places[:50], places[50:150]]
 
 
-def test_another_recipe_asks_for_a_log_again_under_another_key(defs, site, tmp_path, monkeypatch):
+def test_another_recipe_requests_a_log_again(defs, site, tmp_path, monkeypatch):
+    ingest([site / "logs"], store=site / "store")
     (recipe := tmp_path / "recipe.toml").write_text("[segment]\nchord_m = 2.0\n")
     with dg.DagsterInstance.ephemeral() as instance:
         instance.add_dynamic_partitions("logs", ["tiny.mcap"])
-        keys = [request.run_key for request in found(defs, instance).run_requests]
+        assert not found(defs, instance).run_requests
         monkeypatch.setenv("TCPIPE_RECIPE", str(recipe))
+        assert [request.partition_key for request in found(defs, instance).run_requests] == ["tiny.mcap"]
+
+
+def test_a_log_that_a_run_works_on_is_not_requested_again(defs, site):
+    with dg.DagsterInstance.ephemeral() as instance:
         (request,) = found(defs, instance).run_requests
-        assert request.run_key not in keys
+        instance.create_run_for_job(defs.resolve_job_def("one_log"), tags={"dagster/partition": request.partition_key})
+        assert not found(defs, instance).run_requests
 
 
 def test_a_run_of_one_log_looks_at_no_other(module, monkeypatch):
-    monkeypatch.setattr(module, "find_sources", None)
+    calls, run_command = [], module._run_command
+    monkeypatch.setattr(
+        module, "_run_command", lambda log, *words, **how: (calls.append(words), run_command(log, *words, **how))[1]
+    )
     with dg.DagsterInstance.ephemeral() as instance:
-        instance.add_dynamic_partitions("logs", ["tiny.mcap", *map(str, range(1000))])
-        job = module.defs.resolve_job_def("one_log")
-        assert job.execute_in_process(instance=instance, partition_key="tiny.mcap").success
+        instance.add_dynamic_partitions("logs", list(map(str, range(1000))))
+        assert ingest_one(module.defs, instance).success
+    assert [(words[0], Path(words[1]).name.split("-")[0]) for words in calls] == [
+        ("ingest", "tiny.mcap"),
+        ("verify", "tiny"),
+    ]
+
+
+def test_progress_is_logged_when_it_comes(module, command, tmp_path):
+    """The program ends only when its first line was logged."""
+    go = tmp_path / "go"
+    command(
+        "import sys, time, pathlib\n"
+        f"print('reading', file=sys.stderr, flush=True)\ngo = pathlib.Path({str(go)!r})\n"
+        "while not go.exists(): time.sleep(0.01)\n"
+        """print('{"kind": "log"}\\n{"kind": "summary", "results": []}')"""
+    )
+    lines, answers = [], []
+
+    class Log:
+        def info(self, line):
+            lines.append(line)
+            go.touch()
+
+    thread = threading.Thread(target=lambda: answers.append(module._run_command(Log(), "ingest")), daemon=True)
+    thread.start()
+    thread.join(60)
+    assert (lines, [answer.result["kind"] for answer in answers]) == (["reading"], ["summary"])
+
+
+@pytest.mark.parametrize(
+    ("printed", "ended"),
+    [
+        ((1, {"kind": "failure", "transient": False}), ("the reason", "once")),
+        ((1, {"kind": "failure", "transient": True}), ("the reason", "again")),
+        ((2, {"kind": "failure", "transient": False}), ("the reason", "once")),
+        ((1, {"status": "failed", "problems": ["no GNSS"], "notes": [], "transient": False}), ("no GNSS", "once")),
+        ((1, {"status": "failed", "problems": ["full"], "notes": [], "transient": True}), ("full", "again")),
+        ((0, {"status": "waiting", "problems": [], "notes": ["young"], "transient": False}), ("young", "again")),
+        ((137, None), ("the reason", "again")),
+    ],
+)
+def test_only_a_failure_that_may_pass_is_retried(module, command, monkeypatch, printed, ended):
+    monkeypatch.setattr(dg.RetryPolicy, "calculate_delay", lambda *_: 0)
+    exit_code, answer = printed
+    text = "" if answer is None else json.dumps(answer if "kind" in answer else {"results": [answer]})
+    command(f"import sys\nprint('tcpipe: the reason', file=sys.stderr)\nprint({text!r})\nsys.exit({exit_code})")
+    with dg.DagsterInstance.ephemeral() as instance:
+        done = ingest_one(module.defs, instance)
+    assert not done.success
+    is_retried = any(event.is_step_up_for_retry for event in done.all_events)
+    (event,) = [event for event in done.all_events if event.is_step_failure]
+    assert (event.step_failure_data.user_failure_data.description, "again" if is_retried else "once") == ended
 
 
 def test_no_model_is_trained_on_a_dataset_that_is_not_as_written(module, site, monkeypatch):
     ingest([site / "logs"], store=site / "store")
-    answers = module._run_command
+    run_command = module._run_command
     monkeypatch.setattr(dg.RetryPolicy, "calculate_delay", lambda *_: 0)
 
     for problems, trained in ((["one byte differs"], set()), ([], {"model"})):
 
-        def answer(command, *arguments, problems=problems, **how):
+        def answer(log, command, *arguments, problems=problems, **how):
             if command == "train":
-                return [{"model": "boosting"}]
-            found = answers(command, *arguments, **how)
-            return [{**found[0], "problems": problems}] if command == "verify" else found
+                return module.Answer({"model": "boosting"}, [])
+            answer = run_command(log, command, *arguments, **how)
+            return module.Answer({**answer.result, "problems": problems}, []) if command == "verify" else answer
 
         monkeypatch.setattr(module, "_run_command", answer)
         with dg.DagsterInstance.ephemeral() as instance:

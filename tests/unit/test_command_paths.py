@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 import tcpipe
 from tcpipe.cli import cli
-from tcpipe.cli.options import ONE_OF_SEVERAL, Place
+from tcpipe.cli.options import ONE_OF_SEVERAL, PATH_OR_RUN, Place
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.pipeline.export import export
@@ -19,7 +19,7 @@ from tcpipe.store import open_store
 TEXTS = {
     "name", "robot", "cluster", "map_name", "tags", "sample_id", "scenario", "names", "topics", "crs",
     "start", "goal", "holdout", "strays", "shard", "min_age_s", "keep", "forget", "drives",
-    "adapt", "budget_joule", "layers", "predictor", "reason",
+    "adapt", "budget_joule", "layers", "predictor", "reason", "run", "runs",
 }  # fmt: skip
 """Parameters of commands that are text and no path."""
 
@@ -54,7 +54,7 @@ def test_what_is_given_is_looked_at_before_the_command_begins(of, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     _, parameter = of
-    if parameter.type is ONE_OF_SEVERAL:
+    if parameter.type in (ONE_OF_SEVERAL, PATH_OR_RUN):
         return
     if parameter.type.written:
         urls = ("S3:/bucket/out", "s3://bucket/out", "file:///tmp/out", "gs://bucket")

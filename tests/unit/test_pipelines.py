@@ -1,13 +1,16 @@
 """The shipped recipes parse and say what their comments claim; schedulers call what there is."""
 
+import ast
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import polars as pl
 import pytest
 
+import tcpipe
 from tcpipe.cli import cli
 from tcpipe.formats.logs.log_joining import AnyLog, open_logs
 from tcpipe.formats.logs.table_log import open_tables
@@ -91,25 +94,39 @@ def test_rellis_plays_its_roles_by_the_topics_of_its_readme() -> None:
 def test_schedulers_call_commands_and_options_that_exist() -> None:
     """Their own parsers read them in addition (systemd-analyze verify, crontab -n, bash -n), where those are."""
     checks = {
+        "nightly.sh": ["bash", "-n"],
         "slurm/night.sbatch": ["bash", "-n"],
         "slurm/cluster.sbatch": ["bash", "-n"],
         "crontab": ["crontab", "-n"],
         "systemd/tcpipe-night.timer": ["systemd-analyze", "calendar"],
     }
     seen = 0
-    for path in (PIPELINES / "systemd/tcpipe-night.service", *(PIPELINES / name for name in checks)):
-        for call in re.findall(
-            r"(?<!Description=)\btcpipe (ingest|build-dataset|status)\b([^;|>&\n]*)", path.read_text()
-        ):
+    for path in (PIPELINES / name for name in checks):
+        for call in re.findall(r"\b(?:tcpipe|run) (ingest|build-dataset|status)\b([^;|>&\n]*)", path.read_text()):
             options = {option for of in cli.commands[call[0]].params for option in of.opts}
-            assert set(re.findall(r"--[a-z-]+", call[1])) <= options, (path, call)
+            given = set(re.findall(r"--[a-z-]+", call[1]))
+            assert given <= options, (path, call)
+            assert call[0] != "ingest" or "--existing-store" in given, path
             seen += 1
-    assert seen >= 6
+    assert seen >= 5
     for name, checker in checks.items():
         if shutil.which(checker[0]):
             what = "*-*-* 02:15:00" if checker[1] == "calendar" else PIPELINES / name
             assert subprocess.run([*checker, what], capture_output=True, check=False).returncode == 0
     assert "OnCalendar=*-*-* 02:15:00\n" in (PIPELINES / "systemd/tcpipe-night.timer").read_text()
+
+
+def test_the_dagster_definitions_import_only_the_public_api() -> None:
+    tree = ast.parse((PIPELINES / "dagster/definitions.py").read_text())
+    modules = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    modules |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {name for name in modules if name.partition(".")[0] not in sys.stdlib_module_names} == {"dagster", "tcpipe"}
+    used = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "tcpipe"
+    }
+    assert used <= set(tcpipe.__all__)
 
 
 def test_fau_and_borealtc_map_the_columns_that_are_published(tmp_path: Path) -> None:

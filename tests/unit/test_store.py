@@ -15,7 +15,6 @@ from synthetic_store import add_run, change_run, lanes, segments, supersede, tag
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.documents import scan
 from tcpipe.formats.place import Place
-from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, check_map_name, is_store, name_run, open_store
@@ -306,7 +305,7 @@ def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, served):
 
 
 def add_map(store, text, *, before=lambda: None):
-    with store.new_map("site", make_blob_name()) as (directory, put_map):
+    with store.new_map("site") as (directory, put_map):
         directory.mkdir()
         (directory / "tile").write_text(text)
         before()

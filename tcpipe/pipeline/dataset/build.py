@@ -16,14 +16,15 @@ from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
-    CROISSANT,
-    REPORT,
+    find_foreign_files,
+    keep_foreign_files,
     parse_card,
     read_card,
     read_intact_card,
 )
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
+from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
@@ -60,6 +61,8 @@ class BuildResult:
     """The recipe's source, as a command found it."""
     estimate: Estimate | None = None
     """Estimate of a dry run, as if each segment became a sample."""
+    foreign_files: tuple[str, ...] = ()
+    """Files in its directory that tcpipe did not write, and keeps."""
 
     def __str__(self) -> str:
         """Return counts, distance breakdown, noise floor, verdict and findings, as plain lines."""
@@ -93,9 +96,11 @@ class BuildResult:
         return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
 
     def _closing(self) -> list[str]:
+        names = list_first(self.foreign_files, most=3)
+        kept = [f"{self.path}: contains {names}, not of the dataset; kept"] if names else []
         if self.card is None or not self.card.without_coordinates:
-            return []
-        return [f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"]
+            return kept
+        return [*kept, f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
@@ -180,6 +185,7 @@ def _build(
     job = _read_job(call.state, call.store, options, place)
     if job.is_made and job.known is not None:
         result = _make_result(place, "unchanged", job.known, job.left_out, reported)
+        result = replace(result, foreign_files=_find_foreign_files(place, job.known))
         call.result |= {"exit_code": result.exit_code, "counts": {"unchanged": 1}}
         return result, job.inputs
     prove_maps(call.store, job.inputs.map_records)
@@ -190,7 +196,10 @@ def _build(
     with output as directory:
         card = write_dataset(directory, job.inputs, job.marks, options.jobs)
         _refuse_others_since(place, {job.known.inputs if job.known else None, job.inputs.digest})
-    result = _make_result(place, "done", card, job.left_out, reported)
+        foreign = _find_foreign_files(place, job.known)
+        if isinstance(place, Path):
+            keep_foreign_files(foreign, place, directory)
+    result = replace(_make_result(place, "done", card, job.left_out, reported), foreign_files=foreign)
     call.result |= {
         "exit_code": result.exit_code,
         "counts": {"runs": len(job.inputs.runs), "samples": card.samples},
@@ -199,7 +208,7 @@ def _build(
     return result, job.inputs
 
 
-def _describe_options(options: BuildDatasetOptions) -> dict[str, object]:
+def _describe_options(options: BuildDatasetOptions) -> dict[str, Json]:
     """Return the options of a call as JSON values, files as absolute paths, so that it can be planned again."""
     found = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name not in _NOT_RECORDED}
     for name in ("split", "keep_split", "recipe"):
@@ -265,6 +274,11 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         )
 
 
+def _find_foreign_files(place: Path | str, card: DatasetCard | None) -> tuple[str, ...]:
+    """Return the files of others in the directory of a dataset; in a bucket each build has a folder of its own."""
+    return tuple(find_foreign_files(place, card.checksums)) if isinstance(place, Path) and card is not None else ()
+
+
 def _find_left_out(
     inputs: Inputs, known: DatasetCard | None, options: BuildOptions, min_runs: int | None
 ) -> tuple[Finding, ...]:
@@ -316,10 +330,6 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     except DatasetError as error:
         proved = False
         logger.warning("%s; it is built again", error.problems[0])
-    ours = {*card.checksums, CARD, CROISSANT, REPORT}
-    others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
-    if others:
-        raise UsageError(f"{place}: contains {list_first(others)}, not of the dataset; move it or give another OUT")
     files = ((place / name, entry.size_bytes) for name, entry in card.checksums.items())
     is_whole = all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
     return card, proved and is_whole

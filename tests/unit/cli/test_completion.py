@@ -2,9 +2,14 @@
 
 import pytest
 from click.shell_completion import ShellComplete
+from synthetic_store import add_run, lanes, segments
 
 from tcpipe.cli import cli
+from tcpipe.formats.documents import make_key
+from tcpipe.formats.store_records import StoredMap
 from tcpipe.simulation.scenarios import SCENARIOS
+from tcpipe.store import open_store
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
 def offered(*words):
@@ -17,16 +22,16 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("TCPIPE_RECIPE", "TCPIPE_STORE"):
         monkeypatch.delenv(name, raising=False)
-    for run in ("run1-0123abcd", "run2-0123abcd", "other-0123abcd"):
-        (tmp_path / "field/runs" / run).mkdir(parents=True)
-        (tmp_path / "field/runs" / run / "run-1.json").touch()
-    (tmp_path / "field/maps").mkdir()
-    (tmp_path / "field/maps/site-1.json").touch()
+    store = open_store("field", create=True)
+    for run_id in ("run1-0123abcd", "run2-0123abcd", "other-0123abcd"):
+        add_run(store, run_id, segments(run_id, *lanes(0.0, 0.0, 2.0)))
+    store.put(store.scan(), "maps", make_key("site"), StoredMap("site", DATA_MODEL_VERSION, "0" * 16, {}))
     return tmp_path
 
 
 def test_runs_and_maps_of_the_store_are_offered(here):
     assert offered("acknowledge", "--store", "field", "run") == ["run1-0123abcd", "run2-0123abcd"]
+    assert offered("overlay", "--store", "field", "o") == ["other-0123abcd"]
     assert offered("build-dataset", "--store", "field", "--map", "") == ["site"]
     assert offered("acknowledge", "") == []
 

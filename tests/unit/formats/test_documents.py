@@ -14,6 +14,7 @@ from object_gateway import open_bucket
 
 from tcpipe.errors import StoreError
 from tcpipe.formats import documents
+from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import (
     INDEX,
     KINDS,
@@ -28,7 +29,6 @@ from tcpipe.formats.documents import (
 )
 from tcpipe.formats.place import Place
 from tcpipe.formats.store_records import Call, Failure, Output, Tags
-from tcpipe.pipeline.calls import make_blob_name
 
 
 @pytest.fixture(params=["directory", "bucket"])
@@ -103,7 +103,7 @@ def test_a_file_of_another_form_of_name_is_no_document(here, file):
 
 
 def test_folders_of_payload_have_names_that_nobody_else_takes(place):
-    names = {make_blob_name() for _ in range(1000)}
+    names = {make_unique_name() for _ in range(1000)}
     assert len(names) == 1000
     place.put(f"blobs/{min(names)}/a", b"a")
     assert scan(place).blobs == {min(names)}

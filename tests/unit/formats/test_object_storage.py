@@ -1,5 +1,6 @@
 """Logs behind a URL: read by range or copied, as any other, refused in one line."""
 
+import os
 import resource
 
 import pytest
@@ -21,6 +22,7 @@ def bucket(tmp_path, served):
     root = tmp_path / "served" / "drives"
     (root / "field").mkdir(parents=True)
     write_mcap(root / "field" / "my run.mcap", MESSAGES)
+    os.utime(root / "field" / "my run.mcap", (1_600_000_000, 1_600_000_000))
     write_rosbag2(root / "field" / "bag", MESSAGES)
     (root / "field" / "video.mp4").write_bytes(bytes(1000))
     (root / "junk.bag").write_bytes(b"nonsense")

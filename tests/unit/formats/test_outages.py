@@ -9,13 +9,12 @@ from wheel_drives import START_NS, drive_at
 
 from tcpipe.cli.output import show_progress
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.place import open_place
+from tcpipe.formats.place import Place, open_place
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
 
 LIBRARY = ("Generic", "reqwest", "Error performing", "retries", "HTTP error")
 
@@ -99,7 +98,7 @@ def test_what_several_workers_say_of_an_outage_is_one_line(capsys):
 
 @pytest.fixture
 def logs(tmp_path):
-    """Two logs, each of which is a commit of its own."""
+    """Two logs."""
     drive_at(tmp_path / "logs" / "one.mcap")
     drive_at(tmp_path / "logs" / "two.mcap", seed=1, start_ns=START_NS + 10**13)
     return tmp_path / "logs"
@@ -115,32 +114,25 @@ def _finish(logs):
     assert find_status(IngestOptions([logs], store="s3://tests/store", recipe=Recipe(), min_age_s=0.0)).counts == {
         "done": 2
     }
-    assert verify("s3://tests/store").problems == ()
+    left = verify("s3://tests/store").problems
+    assert all("/blobs/" in line and "'tcpipe prune' removes it" in line for line in left)
 
 
-def test_a_failed_upload_costs_its_own_log(served, logs, monkeypatch):
+@pytest.mark.parametrize("verb", ["put_files", "put"])
+def test_a_failed_upload_costs_its_own_log(served, logs, monkeypatch, verb):
+    """Of payload, or of the document that names it: the store is busy for the first name of its kind."""
     monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "0.01")
-    served.busy = "runs/one-"
-    found = _ingest(logs)
+    write, folder = getattr(Place, verb), {"put_files": "blobs/", "put": "runs/"}[verb]
+
+    def refuse_first(place, name, content):
+        served.busy = served.busy or (name if name.startswith(folder) else "")
+        write(place, name, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Place, verb, refuse_first)
+        found = _ingest(logs)
     assert {name: of.status for name, of in found.items()} == {"one": "failed", "two": "done"}
     assert "it cannot be written (the store answers 503" in found["one"].problems[0]
     assert found["one"].transient
     served.busy = ""
-    _finish(logs)
-
-
-def test_a_failed_commit_costs_its_own_logs(served, logs, monkeypatch):
-    monkeypatch.setattr("tcpipe.pipeline.ingest._TOGETHER_S", -1.0)
-    commit, refused = Store.commit, ["ingested"]
-
-    def refuse_first(store, state, stamp, kind, make):
-        if kind in refused:
-            refused.remove(kind)
-            raise StoreError("s3://tests/store/log/0000000002.json: it cannot be written (no answer)")
-        return commit(store, state, stamp, kind, make)
-
-    monkeypatch.setattr(Store, "commit", refuse_first)
-    found = _ingest(logs)
-    assert {name: of.status for name, of in found.items()} == {"one": "failed", "two": "done"}
-    assert "log/0000000002.json: it cannot be written" in found["one"].problems[0]
     _finish(logs)

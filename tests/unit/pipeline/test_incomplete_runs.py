@@ -7,55 +7,50 @@ from pathlib import Path
 import pytest
 from object_gateway import in_environment
 from storage_server import object_store
-from synthetic_store import add_run, commit_run, lanes, open_world, segments, supersede
+from synthetic_store import add_run, lanes, make_fixes, open_world, segments, supersede, tag_run
 from wheel_drives import START_NS, ask_status, drive_at
 
-from tcpipe.pipeline import report as reporting
+from tcpipe.formats import documents
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.prune import prune
-from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
-from tcpipe.tables.findings import Subject, make_finding, select_findings
+from tcpipe.tables.findings import select_findings
 
-LOST = {
-    "the only manifest": "runs/b/*/manifest-1.json",
-    "all manifests": "runs/twice/*/manifest-*.json",
-    "the last manifest": "runs/twice/*/manifest-2.json",
-    "the last run.json": "runs/twice/run-2.json",
-    "the only run.json": "runs/b/run-1.json",
-    "the last tags": "runs/twice/tags-1.json",
-    "segments": "runs/b/*/*/segments.parquet",
-    "a track": "runs/b/*/*/track.parquet",
-    "a run": "runs/b",
-}
+
+def find_files(root: Path, run_id: str) -> dict[str, Path]:
+    """Return the parts of a run in a directory: its manifest, its folder of tables, and two files in it."""
+    (run,) = Store(root).find_runs(run_id)
+    folder = run.folder.path
+    streams = root / "blobs" / run.facts.streams_blob / "streams"
+    return {
+        "manifest": root / run.document,
+        "folder": folder,
+        "segments": folder / "segments.parquet",
+        "streams": streams,
+    }
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A store with a map and three runs, one of them made twice and tagged since; its index is there."""
+    """A store with a map and three runs, one of them made twice and tagged since."""
     here = tmp_path_factory.mktemp("incomplete")
     store = open_world(here)
     for number, run_id in enumerate(("a", "b", "twice")):
         for more in (0.0, 1.0) if run_id == "twice" else (0.0,):
-            add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 9.0 + more)))
-            known = store.run_json(run_id)
-            if more:
-                store.write_run_json(
-                    run_id, type(known)(known.source, damage=(make_finding("file-cut", Subject("file", "cut")),))
-                )
-    store.tag_run("twice", {"weather": "dry"})
-    commit_run(store, "twice")
+            fixes = make_fixes((number * 10**12, number * 10**12 + 10**9), drive=number)
+            add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 9.0 + more)), streams=fixes)
+    tag_run(store, "twice", {"weather": "dry"})
     return here
 
 
 @pytest.fixture(params=["directory", "bucket"])
 def place(request, made, tmp_path, monkeypatch):
     """A copy of the store: where its files lie here, and what it is called."""
+    documents._DECODED.clear()
     files = tmp_path / "served" / "sets" / "store"
     shutil.copytree(made / "store", files, copy_function=shutil.copy2)
     if request.param == "directory":
@@ -66,15 +61,11 @@ def place(request, made, tmp_path, monkeypatch):
         yield files, "s3://sets/store"
 
 
-def lose(files: Path, pattern: str) -> Callable[[], None]:
-    """Remove part of a store; return what puts it back."""
-    held = {
-        path: path.read_bytes() for part in files.glob(pattern) for path in (part, *part.rglob("*")) if path.is_file()
-    }
+def lose(part: Path) -> Callable[[], None]:
+    """Remove a file or folder; return what puts it back."""
+    held = {path: path.read_bytes() for path in (part, *part.rglob("*")) if path.is_file()}
     assert held
-    for path in held:
-        path.unlink()
-    shutil.rmtree(files / pattern, ignore_errors=True)
+    shutil.rmtree(part) if part.is_dir() else part.unlink()
 
     def put_back() -> None:
         for path, data in held.items():
@@ -84,66 +75,67 @@ def lose(files: Path, pattern: str) -> Callable[[], None]:
     return put_back
 
 
-@pytest.mark.parametrize(
-    ("place", "lost"),
-    [*(("directory", lost) for lost in LOST), ("bucket", "the only manifest"), ("bucket", "a run")],
-    indirect=["place"],
-)
-def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, tmp_path, lost):
+def list_problems(root, out):
+    """What a dry run of build-dataset and status say about runs."""
+    result = build_dataset(out, store=root, recipe=Recipe(), dry_run=True)
+    build = [
+        (of.code, of.subject.name)
+        for of in select_findings(result.findings, "run-damaged", "run-gone", "run-incomplete")
+    ]
+    return build, [(of.code, of.subject.name) for of in ask_status(root, out.parent / "new.mcap").problems]
+
+
+@pytest.mark.parametrize("run_id", ["b", "twice"])
+def test_a_folder_that_is_lost_is_a_problem_to_every_command_until_it_is_back(place, tmp_path, run_id):
     files, root = place
-    before, new = Store(root).state(), tmp_path / "new.mcap"
-    new.write_bytes(b"to be ingested")
-    put_back = lose(files, LOST[lost])
-    name = LOST[lost].split("/")[1]
+    (tmp_path / "new.mcap").write_bytes(b"to be ingested")
+    before = Store(root).scan().runs
+    put_back = lose(find_files(files, run_id)["folder"])
     for _ in range(2):  # what the first call writes hides nothing from the next
-        result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
-        assert result.exit_code == 3
-        assert [of.subject.name for of in select_findings(result.findings, "run-damaged", "run-gone")] == [name]
-        found = ask_status(root, new)
-        assert (found.exit_code, [of.code for of in found.problems]) == (3, ["run-incomplete"])
-        assert verify(root).problems
-        assert list(inspect(root, recipe=Recipe()).damaged_runs)
-        assert len(Store(root).ingestions().finished) == 2
-    reporting.report(root, runs=False)
-    assert "files changed or missing" in (files / "report.html").read_text()
-    assert Store(root).state() == before
+        build, status = list_problems(root, tmp_path / "out")
+        assert build == [("run-damaged", run_id)]
+        assert status == [("run-incomplete", run_id)]
+        assert any(f"is missing (run {run_id})" in line for line in verify(root).problems)
+        assert len(inspect(root, recipe=Recipe()).runs) == 2
+        assert len(Store(root).runs()) == 2
+    assert Store(root).scan().runs == before
     put_back()
-    assert not Store(root).ingestions().damaged
-    assert build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True).exit_code == 0
+    assert list_problems(root, tmp_path / "out") == ([], [])
     assert verify(root).problems == ()
 
 
-@pytest.mark.parametrize("lost", LOST)
-def test_a_copy_whose_files_have_other_times_misses_the_same(made, tmp_path, lost):
-    store = Store(shutil.copytree(made / "store", tmp_path / "store", copy_function=shutil.copyfile))
-    lose(tmp_path / "store", LOST[lost])
-    for _ in range(2):
-        assert {run_id for run_id, _ in store.ingestions().damaged} == {LOST[lost].split("/")[1]}
-
-
-def test_what_no_commit_names_is_seen_by_verify_alone_until_it_is_committed(place, tmp_path):
+@pytest.mark.parametrize("part", ["segments", "streams"])
+def test_a_lost_file_is_found_by_who_reads_it(place, part):
     files, root = place
-    store, new = Store(root), tmp_path / "new.mcap"
-    new.write_bytes(b"to be ingested")
-    shutil.rmtree(files / "log")
-    assert store.ingestions().rows == {}
-    assert find_status(IngestOptions([new], store=root, recipe=Recipe(), min_age_s=600.0), create=True).problems == ()
-    assert sum("no commit names it; ingest its log again" in line for line in verify(root).problems) == 3
-    for run_id in ("a", "b", "twice"):
-        commit_run(store, run_id)
-    assert len(store.ingestions().finished) == 3
+    path = find_files(files, "b")[part]
+    lose(path)
+    assert any(f"/{path.name}" in line and "is missing" in line for line in verify(root).problems)
+    assert verify("b", store=root).problems
+    assert verify("a", store=root).problems == ()
+
+
+def test_a_manifest_that_is_lost_leaves_payload_that_nobody_names(place):
+    """A log whose manifest is gone is new: nothing else knows the run."""
+    files, root = place
+    parts = find_files(files, "b")
+    put_back = lose(parts["manifest"])
+    assert [run.run_id for run in Store(root).runs()] == ["a", "twice"]
+    (problem,) = verify(root).problems
+    assert problem.startswith(
+        f"{Store(root).place.where('blobs')}/{parts['folder'].name}: was left by a killed command"
+    )
+    put_back()
     assert verify(root).problems == ()
 
 
-def test_what_prune_removes_is_not_missed_and_what_a_person_removes_is(place):
+def test_what_prune_removes_is_not_missed_and_what_a_person_removes_is(place, tmp_path):
     files, root = place
-    store = Store(root)
-    supersede(store, "b", "a")
-    assert [each.what for each in prune(store=root, recipe=Recipe(), min_age_s=0.0).removed] != []
-    assert not store.runs_place.entries("b")
-    assert not store.ingestions().damaged
-    shutil.rmtree(files / "runs" / "a")
-    assert [run_id for run_id, _ in store.ingestions().damaged] == ["a"]
+    (tmp_path / "new.mcap").write_bytes(b"to be ingested")
+    supersede(Store(root), "b", "a")
+    assert [each.what for each in prune(store=root, recipe=Recipe()).removed] != []
+    assert ask_status(root, tmp_path / "new.mcap").problems == ()
+    lose(find_files(files, "a")["folder"])
+    assert [of.subject.name for of in ask_status(root, tmp_path / "new.mcap").problems] == ["a"]
 
 
 @pytest.fixture(scope="module")
@@ -157,16 +149,16 @@ def ingested(tmp_path_factory):
     return here
 
 
-@pytest.mark.parametrize(
-    "lost", ["runs/one-*/*/manifest-1.json", "runs/one-*", "runs/one-*/run-1.json", "runs/*/tags-1.json"]
-)
-def test_what_is_lost_is_made_again_from_the_log(ingested, tmp_path, lost):
+@pytest.mark.parametrize("part", ["manifest", "folder", "segments"])
+def test_what_is_lost_is_made_again_from_the_log(ingested, tmp_path, part):
     logs, root = ingested / "logs", shutil.copytree(ingested / "store", tmp_path / "store", copy_function=shutil.copy2)
-    for part in root.glob(lost):
-        shutil.rmtree(part) if part.is_dir() else part.unlink()
-    (finding,) = ask_status(root).problems
-    assert finding.code == "run-incomplete"
-    assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
+    one = next(run.run_id for run in Store(root).runs() if run.run_id.startswith("one"))
+    documents._DECODED.clear()
+    lose(find_files(root, one)[part])
+    assert ask_status(root).exit_code == (3 if part == "folder" else 0)
+    assert ingest([logs], store=root, recipe=Recipe(), force=part == "segments").exit_code == 0
     found = ask_status(root)
     assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
+    prune(store=root, recipe=Recipe())
     assert verify(root).problems == ()
+    assert [run.facts.tags for run in Store(root).find_runs(one)] == [{"load": "12"}]

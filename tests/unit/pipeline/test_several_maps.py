@@ -38,8 +38,9 @@ def put_map(store, directory, name, first_m, last_m, *, layers=("height", "ortho
         "terrain": WORLD.terrain(x, y).astype(np.uint8),
     }
     paths = {layer: write_tif(directory / f"{layer}.tif", values[layer][None], WORLD.crs, affine) for layer in layers}
-    with store.new_map(name) as path:
+    with store.new_map(name) as (path, put):
         build_map(path, name=name, crs=crs, **paths)
+        put(store.scan())
 
 
 @pytest.fixture(scope="module")

@@ -4,25 +4,22 @@ import json
 import os
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from made_tracks import with_columns
-from stored_files import flip, manifest, run_document, table
-from synthetic_store import add_run, box, commit_run, lanes, region_file, segments, small_store
-from tcpipe.formats.commits import Entries, LogSnapshot
-from tcpipe.formats.run_documents import MapDocument, read_as_at
+from stored_files import flip, manifest
+from synthetic_store import add_run, box, lanes, make_fixes, region_file, segments, small_store, tag_run
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats import documents, file_checks
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_page, write_sealed
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.place import Place
-from tcpipe.pipeline.calls import open_log
+from tcpipe.formats.store_records import Output
+from tcpipe.pipeline.calls import record_call
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import _match_by_time, diff
 from tcpipe.pipeline.explain import explain
@@ -30,9 +27,8 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.report.pictures import draw_quick_look, write_overview
 from tcpipe.store import Store
-from tcpipe.tables.levels import DATA_MODEL_VERSION, STREAMS, Sensor, Streams
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +43,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def copy(made, tmp_path):
+    documents._DECODED.clear()  # as another process
     return lambda name: shutil.copytree(made / name, tmp_path / name)
 
 
@@ -65,35 +62,25 @@ def test_what_is_whole_verifies(made, name):
 def test_a_store_its_runs_and_its_map_verify(made):
     found = verify(made / "store")
     assert (found.problems, found.kind, found.read["runs"], found.read["maps"]) == ((), "store", 2, 1)
-    assert verify(made / "store" / "runs" / "north").kind == "run"
-    assert verify(Store(made / "store").map_files("site")[0]).kind == "map"
+    store = Store(made / "store")
+    for name in ("north", store.find_runs("north")[0].name):
+        found = verify(name, store=store.root)
+        assert (found.problems, found.kind, found.read["runs"]) == ((), "run", 1)
+    with pytest.raises(UsageError, match="nosuch"):
+        verify("nosuch", store=store.root)
+    assert verify(store.map_at(store.find_map("site"))[0]).kind == "map"
 
 
 def dress(store):
-    """Add what `ingest`, `add-map` and `report` also leave in a store."""
-    open_log(store).commit("seen", Entries(seen=(LogSnapshot(("/logs/north.mcap",), (), "north"),)))
-    with store.new_map("site", after=1) as path:
-        shutil.copytree(store.map_files("site")[0], path)
-        write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
-    shutil.rmtree(store.map_files("site")[0].parents[1] / replaced(store))
-    (store.root / "maps" / "site-1.json").unlink()
-    sensor = Sensor("/power", "x/msg/Power", "base", "the only one", None, None)
+    """Add what `ingest` and `report` also leave in a store: streams, tags, pages."""
+    add_run(store, "streamed", segments("streamed", *lanes(0.0, -14.0, 14.0)), streams=make_fixes((0, 10**9)))
+    tag_run(store, "streamed", {"weather": "wet"})
+    (store.root / "report.html").write_text(seal_page("<p>all runs</p>"))
     for run in store.runs():
-        (Path(run.where) / "report.html").write_text(seal_page("<p>\nwhat was driven\n</p>"))
-        files = store.write_streams(
-            run.run_id, Streams({"power": STREAMS["power"].empty()}, {"power": sensor}, "husky"), key="k"
-        )
-        store.write_run_json(run.run_id, replace(store.run_json(run.run_id), streams=files, robot="husky"))
-        run_document(run).with_name("run-1.json").unlink()
-        commit_run(store, run.run_id)
+        (run.folder.path / "report.html").write_text(seal_page("<p>\nwhat was driven\n</p>"))
 
 
-def replaced(store):
-    """The directory of the map that was there first."""
-    return read_as_at(store.place.below("maps"), "site-1.json", MapDocument).zarr.split("/")[1]
-
-
-SEALED = ("dataset.json", "report.html", "run-2.json", "manifest-1.json", "site-2.json", "store.json")
+SEALED = ("dataset.json", "report.html")
 
 
 @pytest.mark.parametrize("name", ["zarr", "parquet", "store"])
@@ -101,7 +88,7 @@ def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
     directory, rng = copy(name), np.random.default_rng(0)
     if name == "store":
         dress(Store(directory))
-        shutil.rmtree(directory / "index")  # is believed by nobody: test_index.py
+        (directory / "index.parquet").unlink(missing_ok=True)  # nobody trusts it: test_index.py
     listed = [path for path in files(directory) if path.name not in SEALED]
     whole = {path: path.read_bytes() for path in files(directory)}
     for place in (0.0, *rng.random(2), 1.0):  # all that are listed at once, then each sealed one alone
@@ -150,63 +137,71 @@ def test_files_that_went_or_came_are_found(copy):
 
 
 def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
-    store = copy("store")
-    layers = Store(store).map_files("site")[0]
+    root = copy("store")
+    store = Store(root)
+    layers = store.map_at(store.find_map("site"))[0]
     flip(files(layers / "height" / "c")[0])
     shutil.rmtree(layers / "ortho" / "c")
-    shutil.rmtree(Store(store).recipes_of("north")[0].where)
+    shutil.rmtree(store.find_runs("north")[0].folder.path)
     assert any("height/c/0/0: its sha256" in problem for problem in verify(layers).problems)
     assert any("ortho/c/0/0: is missing" in problem for problem in verify(layers).problems)
-    problems = verify(store).problems
-    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is missing", "north: contains no finished run"):
+    problems = verify(root).problems
+    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is missing", "is missing (run north)"):
         assert any(words in problem for problem in problems), words
 
 
 def test_a_manifest_that_counts_otherwise_is_found(copy):
-    store = copy("store")
-    path = manifest(Store(store).recipes_of("south")[0])
-    found = json.loads(path.read_text())
-    found["counts"]["segments"] += 1
-    write_sealed(path, found)
-    problems = verify(store).problems
-    assert any("segments is 225, but segments.parquet has 224 rows" in problem for problem in problems)
+    store = Store(copy("store"))
+    (run,) = store.find_runs("south")
+    made = run.manifest
+    store.put_run(store.scan(), replace(made, counts=replace(made.counts, segments=made.counts.segments + 1)))
+    (problem,) = verify(store.root).problems
+    assert problem.endswith("segments is 225, but segments.parquet has 224 rows")
+
+
+def test_a_damaged_document_of_any_kind_is_named_with_its_repair(copy):
+    store = Store(copy("store"))
+    dress(store)
+    for path in store.root.glob("*/*.json"):
+        whole = path.read_bytes()
+        flip(path)
+        found = verify(store.root)
+        assert any(line.startswith(f"{path}: ") for line in found.problems), path
+        assert any(note.startswith(f"{path}: copy it again, or remove it") for note in found.notes), path
+        path.write_bytes(whole)
 
 
 def test_strange_files_in_a_store_are_named_and_what_a_killed_command_left_behind(copy):
-    store = copy("store")
-    stored, map_path = Store(store), Store(store).map_files("site")[0].relative_to(store)
-    recipe = Path(stored.recipes_of("south")[0].where).relative_to(store)
-    strange = ("notes.txt", "maps/notes.txt", "runs/north/notes.txt", f"{recipe}/notes.txt")
-    for name in (*strange, f"{map_path}/height/notes.txt"):
-        (store / name).write_text("mine")
-    (recipe_left := store / recipe / "0123456789abcdef").mkdir()
-    (recipe_left / "track.parquet").touch()
-    (store / ".tmp-new-01234567").mkdir()
-    problems = verify(store).problems
-    assert sum("is no file of this store" in problem for problem in problems) == 4
-    assert sorted(problem.partition(": ")[0] for problem in problems if "killed" in problem) == sorted(
-        str(store / name)
-        for name in (".tmp-new-01234567", recipe_left / "track.parquet", f"{map_path}/height/notes.txt")
-    )
-    assert len(problems) == 7
+    root = copy("store")
+    store = Store(root)
+    layers, run = store.map_at(store.find_map("site"))[0], store.find_runs("south")[0].folder.path
+    strange = [root / "notes.txt", root / "maps" / "notes.json", run / "notes.txt", layers / "height" / "notes.txt"]
+    strange += [root / "blobs" / "mine", root / "elsewhere"]
+    desktop = [root / ".DS_Store", run / "Thumbs.db", root / "runs" / ".directory"]
+    for path in (*strange, *desktop):
+        path.write_text("mine")
+    left = [root / "blobs" / "0123456789abcdef", root / ".tmp-new-01234567"]
+    for path in left:
+        path.mkdir()
+    found = verify(root)
+    assert {*found.problems} == {
+        *(f"{path}: is no file of this store" for path in strange),
+        *(f"{path}: was left by a killed command; 'tcpipe prune' removes it" for path in left),
+    }
+    assert {note.partition(": ")[0] for note in found.notes} == {*map(str, desktop)}
 
 
-def test_an_ingestion_that_lost_its_manifest_or_a_table_does_not_hide_behind_another(copy):
-    store = copy("store")
-    run = Store(store).recipes_of("north")[0]
-    other = Path(run.where).with_name("00000000")
-    shutil.copytree(run.where, other)
-    manifest(run).unlink()
-    (lost,) = other.glob("*/track.parquet")
-    lost.unlink()
-    problems = "\n".join(verify(store).problems)
-    assert f"{table(run, 'track')}: was left by a killed command" in problems
-    assert f"{lost}: is missing" in problems
+def test_payload_that_a_running_call_has_not_named_yet_is_no_problem(copy):
+    store = Store(copy("store"))
+    (store.root / "blobs" / "0123456789abcdef").mkdir()
+    with record_call(store, "ingest", ["/logs"]):
+        assert verify(store.root).problems == ()
+    assert len(verify(store.root).problems) == 1
 
 
 def test_what_is_none_of_these_is_said(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(UsageError, match="give"):
+        with pytest.raises(UsageError, match=r"give|name its store"):
             verify(path)
 
 
@@ -233,10 +228,10 @@ def test_an_unknown_sample_and_an_unknown_run_are_said(made, copy):
     for name, said in (("north", "did you mean north-"), ("x", "an example is")):
         with pytest.raises(DatasetError, match=said):
             explain(name, dataset=made / "zarr", store=made / "store")
-    store = copy("store")
-    shutil.rmtree(store / "runs" / "north")
+    store = Store(copy("store"))
+    manifest(store.find_runs("north")[0]).unlink()
     with pytest.raises(DatasetError, match="is not in this store"):
-        explain(find_sample(made, "north"), dataset=made / "zarr", store=store)
+        explain(find_sample(made, "north"), dataset=made / "zarr", store=store.root)
 
 
 ASK = {
@@ -259,6 +254,7 @@ ASK = {
     ],
 )
 def test_a_dataset_of_another_version_is_told_so_by_whoever_reads_it(tmp_path, ask, card, said):
+    Store(tmp_path).put(Store(tmp_path).scan(), "outputs", "0" * 16, Output(where="/d"))
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "dataset.json").write_text(json.dumps(card))
     with pytest.raises(DatasetError, match=said):
@@ -371,8 +367,8 @@ def test_a_shard_of_another_build_is_refused_though_its_own_checksums_agree(copy
 def test_a_digest_is_found_once_until_the_file_changes(copy, monkeypatch, tmp_path):
     monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "cache"))
     dataset, hashed = copy("zarr"), []
-    whole = Place.checksum
-    monkeypatch.setattr(Place, "checksum", lambda place, name: hashed.append(name) or whole(place, name))
+    whole = file_checks._compute_digest
+    monkeypatch.setattr(file_checks, "_compute_digest", lambda place, name: hashed.append(name) or whole(place, name))
 
     def hashed_shards():
         return sorted(name for name in hashed if "/c/" in name)

@@ -72,9 +72,8 @@ def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
 
 def test_what_cannot_be_compared_is_told(made):
     store, data, source = made
-    with pytest.raises(
-        UsageError, match=r"elsewhere.mcap: no run of this log in .*; expected its path or its run's name"
-    ):
+    with pytest.raises(UsageError, match=r"elsewhere.mcap: .* has no run of this log or name; expected the path"):
         find_drive(store, "elsewhere.mcap")
+    assert find_drive(store, find_drive(store, "south").name).run_id == "south"  # RUN/RECIPE
     with pytest.raises(ModelError, match="is of robot husky, model physics of jackal"):
         compute_drive_cost(PhysicsModel(robot="jackal"), source, find_drive(store, "south"), data, log="south")

@@ -10,6 +10,7 @@ from page_reading import data_of, unpacked
 from synthetic_store import add_run, driven, lanes, make_noise_facts, segments
 
 from tcpipe.formats.finding_lines import describe_finding
+from tcpipe.report.maps import StoredMaps
 from tcpipe.report.run_plots import (
     downsample_columns,
     find_finding_spans,
@@ -38,7 +39,7 @@ def page_of(tmp_path, table, **how):
     store = open_store(tmp_path / "store", create=True)
     add_run(store, "run", table, **how)
     (run,) = store.runs()
-    return run_report(store, run)
+    return run_report(run, StoredMaps(store, {}))
 
 
 def test_thinning_keeps_every_peak_and_says_how_many_there_were():

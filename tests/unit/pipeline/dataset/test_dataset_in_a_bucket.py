@@ -75,7 +75,7 @@ def test_what_lies_there_and_is_no_dataset_is_left_alone(made, bucket):
         build_dataset("s3://sets", store=made / "store", recipe=Recipe())
     assert files(bucket[0]) == {"notes.txt": b"mine"}
     shutil.copytree(made / "store", bucket[0] / "st")
-    with pytest.raises(UsageError, match=r"s3://sets/st: contains index and no dataset.json; it is not changed"):
+    with pytest.raises(UsageError, match=r"s3://sets/st: contains blobs and no dataset.json; it is not changed"):
         build_dataset("s3://sets/st", store=made / "store", recipe=Recipe())
 
 
@@ -229,11 +229,11 @@ def test_commands_look_at_a_dataset_in_a_bucket(made, bucket):
     assert b"<title>" in page.read_bytes()
 
 
-def test_a_url_without_a_card_is_told_in_one_line(bucket):
+def test_a_url_without_a_card_is_told_in_one_line(made, bucket):
     with pytest.raises(UsageError, match=r"s3://sets/gone: there is no dataset, model or cost map here"):
         tcpipe.open_dataset("s3://sets/gone")
     with pytest.raises(StoreError, match=r"s3://nosuch/ds: .*there is no such bucket"):
-        build_dataset("s3://nosuch/ds", store=bucket[0], recipe=Recipe())
+        build_dataset("s3://nosuch/ds", store=made / "store", recipe=Recipe())
 
 
 def test_names_in_a_card_do_not_lead_outside(made, bucket):

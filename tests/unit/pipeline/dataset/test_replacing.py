@@ -18,6 +18,8 @@ from tcpipe.formats.dataset_files import read_card
 from tcpipe.pipeline.dataset import writing
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
+from tcpipe.pipeline.report import report
+from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
 from tcpipe.store import open_store
 
@@ -104,6 +106,42 @@ def test_the_same_region_written_otherwise_is_the_same_option(here):
     assert build_dataset(here / "dataset", **usual(here)).status == "unchanged"
 
 
+DESKTOP_FILES = (".directory", ".DS_Store", "overview.png.aux.xml", "patches.zarr/Thumbs.db")
+OWN_FILES = ("notes.txt", "figures/a.svg")
+
+
+def test_files_of_others_are_named_and_kept(here):
+    """A file manager or a GIS leaves files in any folder that somebody looks at."""
+    out = here / "dataset"
+    report(out, patches=True)
+    (out / "figures").mkdir()
+    names = sorted((*DESKTOP_FILES, *OWN_FILES))
+    for name in names:
+        (out / name).write_text(name)
+    (out / "link").symlink_to("nowhere")
+    for status, options in (("unchanged", {}), ("done", {"seed": 5, "force": True}), ("unchanged", {"seed": 5})):
+        found = build_dataset(out, **usual(here, **options))
+        assert (found.status, found.exit_code) == (status, 0)
+        assert found.foreign_files == tuple(sorted((*names, "link")))
+        assert f"{out}: contains .DS_Store, .directory, figures/a.svg and 4 more, not of the dataset; kept" in str(
+            found
+        )
+        assert all((out / name).read_text() == name for name in names)
+        assert (out / "link").is_symlink()
+    (out / "link").unlink()
+    found = verify(out)
+    assert found.problems == tuple(f"{out / name}: is no file of this dataset" for name in sorted(OWN_FILES))
+    assert [any(name in note for note in found.notes) for name in DESKTOP_FILES] == [True] * len(DESKTOP_FILES)
+
+
+def test_a_file_of_others_that_the_new_dataset_would_replace_is_kept(here):
+    (here / "dataset" / "excluded.csv").write_text("mine")
+    (here / "ids.csv").write_text("dry-0\n")
+    with pytest.raises(DatasetError, match="csv: has the name of a file of the new dataset; rename it"):
+        build_dataset(here / "dataset", **usual(here, exclude=here / "ids.csv", reason="mud", force=True))
+    assert (here / "dataset" / "excluded.csv").read_text() == "mine"
+
+
 CAUSES = {
     "covariates": ({"covariates": "soil.csv"}, {}, ("covariates: removed soil.csv",)),
     "content of covariates": ({"covariates": "soil.csv"}, {"covariates": "wet/soil.csv"}, ("covariates: soil.csv is another table",)),
@@ -131,6 +169,15 @@ def test_diff_names_every_input_that_differs(here, name):
     assert set(found.causes) == set(causes)
     assert not found.same
     assert diff(here / "a", here / "a").same
+
+
+def test_the_record_of_inputs_is_read_as_it_was_written(here):
+    """Its digest decides whether a dataset is built again."""
+    build_dataset(here / "b", **usual(here, covariates=here / "soil.csv", map_name=["yard", "site"]))
+    for name in ("b", "dataset"):
+        card = read_card(here / name)
+        assert card.made_from.digest == card.inputs
+    assert read_card(here / "b").made_from.map_names == ("yard", "site")
 
 
 def test_diff_names_other_tags_of_a_run(here):

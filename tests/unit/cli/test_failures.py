@@ -1,0 +1,57 @@
+"""What a command that fails prints with ``--json``: a scheduler reads there whether to try again."""
+
+import errno
+import json
+import os
+import signal
+
+import pytest
+from installed_command import tcpipe
+
+from tcpipe.cli import Terminated
+from tcpipe.errors import DatasetError, MapError, RecipeError, StoreError, UsageError
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "store")
+
+
+def raised_from(error, cause):
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "transient"),
+    [
+        (UsageError("--split: no such file"), 2, False),
+        (raised_from(UsageError("store: cannot be listed"), FULL), 2, False),
+        (RecipeError("recipe fuse.foo: unknown key"), 2, False),
+        (MapError("dem.tif: has no CRS"), 1, False),
+        (DatasetError("dataset: no runs"), 1, False),
+        (ModuleNotFoundError("No module named 'lightgbm'", name="lightgbm"), 1, False),
+        (ZeroDivisionError("a bug"), 1, False),
+        (FULL, 1, True),
+        (raised_from(StoreError("store: cannot be written"), FULL), 1, True),
+        (MemoryError(), 1, True),
+        (KeyboardInterrupt(), 130, True),
+        (Terminated(signal.SIGTERM), 143, True),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_a_failure_states_whether_the_same_call_may_succeed_later(error, code, transient, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr("tcpipe.pipeline.dataset.build.run_build_dataset", fail)
+    monkeypatch.setattr("tcpipe.pipeline.maps.run_add_map", fail)
+    for command in (["build-dataset"], ["add-map", "site", "--height", "dem.tif"]):
+        done = tcpipe(*command, "--json", cwd=tmp_path)
+        answer = json.loads(done.stdout)
+        assert (done.returncode, answer["kind"], answer["exit_code"]) == (code, "failure", code)
+        assert answer["transient"] is transient
+        assert [f"tcpipe: {problem}" for problem in answer["problems"]] == done.stderr.strip().splitlines()
+
+
+def test_a_wrong_option_is_a_failure_that_does_not_pass(tmp_path):
+    done = tcpipe("ingest", "log.mcap", "--nosuch", "--json", cwd=tmp_path)
+    answer = json.loads(done.stdout)
+    assert (answer["kind"], answer["exit_code"], answer["transient"]) == ("failure", 2, False)
