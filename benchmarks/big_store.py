@@ -9,7 +9,6 @@ from pyproj import Geod, Transformer
 
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.runs import LogOrigin
-from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation.scenarios import find_scenario
 from tcpipe.simulation.site_files import write_rasters
@@ -41,7 +40,7 @@ def store_of(directory: Path, samples: int) -> Store:
     if not Path(store.root).exists():
         open_store(store.root, create=True)
         found = Store(maps)
-        with store.new_map("site", make_blob_name()) as (path, put):
+        with store.new_map("site") as (path, put):
             shutil.copytree(found.map_at(found.find_map("site"))[0], path)
             put(store.scan())
         for number in range(-(-samples // RUN_ROWS)):

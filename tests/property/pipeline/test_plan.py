@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from synthetic_store import add_run, lanes, segments
 
 from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.runs import LogOrigin, Run
 from tcpipe.pipeline import ingest as ingest_module
-from tcpipe.pipeline.calls import make_blob_name
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
 from tcpipe.pipeline.log_sources import find_damaged_log
@@ -74,7 +74,7 @@ def worker(row, worked):
         store = Store(task.store)
         state = store.scan()
         made = make_row(row, task, sha256, kind)
-        made = replace(made, run_id=name_run(state, task.source.stem, sha256), blob=make_blob_name(), tables={})
+        made = replace(made, run_id=name_run(state, task.source.stem, sha256), blob=make_unique_name(), tables={})
         known = [of for of in state.list_rows() if of.log.sha256 == sha256 and task.is_made_by(of)]
         if known and not task.force:
             return Ingested(task.source, make_result(task.source, "unchanged", known[0], sha256, same_as=None))
