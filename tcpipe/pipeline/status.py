@@ -200,15 +200,19 @@ def _find_tasks(
 def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str:
     """Return what to do now: the first problem, else the first trouble with logs, else what is to be ingested."""
     if problems:
-        more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
+        more = f" (and {len(problems) - 1} more problem{'s' * (len(problems) > 2)})" if len(problems) > 1 else ""
         return f"to do now: {format_finding(problems[0].finding)}{more}"
     for group in groups:
         if group.state in TROUBLE:
-            return (
-                f"to do now: look at {len(group.logs)} logs that are {_format_words(group.state)}, or acknowledge them"
-            )
+            verb, them = ("is", "it") if len(group.logs) == 1 else ("are", "them")
+            told = f"{_count_logs(len(group.logs))} that {verb} {_format_words(group.state)}"
+            return f"to do now: look at {told}, or acknowledge {them}"
     waiting = sum(len(group.logs) for group in groups if group.state in TO_DO)
-    return f"to do now: tcpipe ingest ({waiting} logs)" if waiting else "nothing to do"
+    return f"to do now: tcpipe ingest ({_count_logs(waiting)})" if waiting else "nothing to do"
+
+
+def _count_logs(count: int) -> str:
+    return f"{count} log{'s' * (count != 1)}"
 
 
 def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
