@@ -175,11 +175,6 @@ def _find_references(state: State, forgotten: Collection[str]) -> dict[tuple[str
     return found
 
 
-def is_replaced(output: Output) -> bool:
-    """Return whether another dataset lies where this one was."""
-    return _read_inputs(output.where) not in (None, output.inputs)
-
-
 def _read_inputs(where: str) -> str | None:
     """Return the digest of what the dataset at a path or URL is made of; None if there is none that can be read."""
     try:
