@@ -47,6 +47,16 @@ def find_incomplete_runs(state: State, run_id: str | None = None) -> Iterator[Pr
             yield Problem(finding, f"{row.run_id}/{row.recipe_id} {row.blob}", run_id=row.run_id)
 
 
+def find_incomplete_maps(state: State, name: str | None = None) -> Iterator[Problem]:
+    """Yield the maps, or the one of a name, whose folder of payload is gone."""
+    for record in state.maps.values():
+        if name in (None, record.name) and record.blob not in state.blobs:
+            finding = make_finding(
+                "map-incomplete", Subject("map", record.name), names={"file": f"blobs/{record.blob}"}
+            )
+            yield Problem(finding, f"{record.name} {record.blob}")
+
+
 def make_waiting(source: LogSource, state: str) -> Problem:
     """Return the problem that a log lies there and no call takes it in; that of other content, written since, is another."""
     finding = make_finding("log-waiting", Subject("log", source.name), names={"state": state})
@@ -96,6 +106,7 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
             found = (
                 _name_problems(name, known.values(), state)
                 or list(find_incomplete_runs(state, name))
+                or list(find_incomplete_maps(state, name))
                 or _make_missing_problem(name, state)
                 or _make_waiting_problem(name, state)
             )

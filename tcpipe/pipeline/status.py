@@ -35,7 +35,7 @@ from tcpipe.pipeline.log_queue import make_tasks
 from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan
-from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
+from tcpipe.pipeline.problems import find_incomplete_maps, find_incomplete_runs, make_missing, make_waiting
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -129,7 +129,12 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     open_calls, acknowledged = list_open_calls(state), state.acknowledged
     killed = [call for call in open_calls if call.state == "killed"]
     lately = given or next(iter(asked.values()), ((), CallOptions()))[0]
-    problems = [*state.problems, *find_incomplete_runs(state), *(call.problem for call in killed)]
+    problems = [
+        *state.problems,
+        *find_incomplete_runs(state),
+        *find_incomplete_maps(state),
+        *(call.problem for call in killed),
+    ]
     if not create and len(killed) == len(open_calls) and all(is_below(make_absolute(log), [*asked]) for log in given):
         problems += _find_waiting(steps)
     problems += [make_missing(path, state) for path in missing if path in lately]
