@@ -28,6 +28,7 @@ from tcpipe.cli.options import (
     store_option,
 )
 from tcpipe.cli.output import (
+    find_recipe_with_source,
     print_json,
     print_json_line,
     print_line,
@@ -63,8 +64,8 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
     from tcpipe.pipeline.plan import LogLine
 
-    ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
-    options = replace(options, recipe=ruling)
+    path, source = find_recipe_with_source(cast("str | None", options.recipe))
+    options = replace(options, recipe=path)
     if not as_json:
         print_line(f"recipe: {source}")
     if dry_run:
@@ -98,7 +99,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
         summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=note))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
-        print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
+        print_json_line(SummaryLine(source, made, summary.exit_code, summary.is_transient, summary.results))
     else:
         if several:
             _print_findings(summary)
