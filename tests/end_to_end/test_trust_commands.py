@@ -89,7 +89,7 @@ def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):
     done = tcpipe("overlay", run, "over.mcap", cwd=work)
     assert done.returncode == 0, done.stderr
     whole = (work / "over.mcap").read_bytes()
-    assert tcpipe("overlay", run, "over.mcap", "--json", cwd=work).returncode == 0
+    assert tcpipe("overlay", run, "over.mcap", "--store", "tcpipe-store", "--json", cwd=work).returncode == 0
     assert (work / "over.mcap").read_bytes() == whole, "it is not the same again"
     read = messages_of(work / "over.mcap", "/tcpipe/fix", "/tcpipe/segment", "/tcpipe/segments")
     segments = [message for _, message in read["/tcpipe/segment"]]

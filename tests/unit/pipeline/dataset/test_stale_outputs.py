@@ -10,7 +10,6 @@ from tcpipe.errors import RecipeError, UsageError
 from tcpipe.pipeline.calls import BUILD, record_call
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.problems import acknowledge, find_stale_outputs
-from tcpipe.store import open_store
 
 
 @pytest.fixture
