@@ -1,37 +1,24 @@
 """A store of the paper's size without logs: its simulated map, and runs whose segments meander over it."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 from pyproj import Geod, Transformer
-from tcpipe.formats.commits import Entries
-from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 
-from tcpipe import __version__
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
-from tcpipe.pipeline.calls import open_log
+from tcpipe.formats.runs import LogOrigin
 from tcpipe.pipeline.maps import add_map
-from tcpipe.recipe import Recipe
 from tcpipe.simulation.scenarios import find_scenario
 from tcpipe.simulation.site_files import write_rasters
 from tcpipe.store import Store, open_store
 from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.columns import to_floats
-from tcpipe.tables.findings import Verdict
-from tcpipe.tables.levels import (
-    DATA_MODEL_VERSION,
-    LABELLED_SEGMENTS,
-    MASKED_TRACK,
-    REJECTIONS,
-    TRACK,
-    Datum,
-    LabelledSegments,
-    MaskedTrack,
-    Track,
-    TrackInfo,
-)
+from tcpipe.tables.levels import LABELLED_SEGMENTS
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from synthetic_store import add_run
 
 RUN_ROWS = 3_300
 SMALL = 500
@@ -52,8 +39,10 @@ def store_of(directory: Path, samples: int) -> Store:
     store = Store(directory / f"store-{samples}")
     if not Path(store.root).exists():
         open_store(store.root, create=True)
-        with store.new_map("site") as path:
-            shutil.copytree(Store(maps).map_files("site")[0], path)
+        found = Store(maps)
+        with store.new_map("site") as (path, put):
+            shutil.copytree(found.map_at(found.find_map("site"))[0], path)
+            put(store.scan())
         for number in range(-(-samples // RUN_ROWS)):
             _add_run(store, number, min(RUN_ROWS, samples - number * RUN_ROWS))
     return store
@@ -78,7 +67,7 @@ def meander(bounds_m: tuple[float, float, float, float], count: int, *, seed: in
 
 
 def _add_run(store: Store, number: int, rows: int) -> None:
-    grid = open_map(store.map_files("site")[0]).grid
+    grid = open_map(store.map_at(store.find_map("site"))[0]).grid
     points = meander(grid.bounds_m, rows, seed=number)
     lon, lat = Transformer.from_crs(grid.crs, 4326, always_xy=True).transform(*points.T)
     azimuth_deg, _, chord_m = Geod(ellps="WGS84").inv(lon[:-1], lat[:-1], lon[1:], lat[1:])
@@ -111,29 +100,7 @@ def _add_run(store: Store, number: int, rows: int) -> None:
     }
     rest["geometry"] = make_lines(np.stack([lon, lat], 1)[:-1], np.stack([lon, lat], 1)[1:])
     table = LABELLED_SEGMENTS.table(**given, **rest)
-    info = TrackInfo(run_id, "husky", Datum(lon[0], lat[0], 600.0), 20.0, "smoother")
-    recipe = Recipe()
-    distance_by_reason_m = {"kept": float(to_floats(table, "arc_length_m").sum())}
-    store.write_run_json(run_id, RunJson(LogOrigin((f"{run_id}.mcap",), f"{number:08x}".ljust(64, "0"), 1)))
-    manifest = Manifest(
-        run_id=run_id,
-        recipe_id=make_recipe_id(recipe, "husky"),
-        data_model_version=DATA_MODEL_VERSION,
-        tcpipe_version=__version__,
-        ingest_key=ingest_key(recipe),
-        recipe=recipe.ingest,
-        robot="husky",
-        tags={},
-        counts=Counts(rows),
-        distance_by_reason_m=distance_by_reason_m,
-        verdict=Verdict(),
-        damage=(),
-        info=info,
+    origin = LogOrigin((f"{run_id}.mcap",), f"{number:08x}".ljust(64, "0"), 1)
+    add_run(
+        store, run_id, table, log=origin, distance_by_reason_m={"kept": float(to_floats(table, "arc_length_m").sum())}
     )
-    store.write_run(
-        manifest,
-        track=Track(TRACK.empty(), REJECTIONS.empty(), info),
-        masked=MaskedTrack(MASKED_TRACK.empty(), info),
-        labelled=LabelledSegments(table, info, distance_by_reason_m),
-    )
-    open_log(store).commit("ingested", Entries(runs=tuple(store.read_rows(run_id).values())))

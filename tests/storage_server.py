@@ -112,7 +112,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._list(self.server.root / bucket, parse_qs(parts.query))
         elif (self.server.root / bucket / name).is_file():
             self.server.fetched.extend([name] if with_body else [])
-            self._send_part((self.server.root / bucket / name).read_bytes(), with_body=with_body)
+            path = self.server.root / bucket / name
+            self._send_part(path.read_bytes(), int(path.stat().st_mtime), with_body=with_body)
         else:
             self._send(404, b'<?xml version="1.0"?>\n<Error><Code>NoSuchKey</Code></Error>', with_body=with_body)
 
@@ -123,8 +124,8 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._send(404, b"<Error><Code>NoSuchBucket</Code></Error>")
 
-    def _send_part(self, data: bytes, *, with_body: bool) -> None:
-        tag = {"ETag": f'"{zlib.crc32(data)}"'}
+    def _send_part(self, data: bytes, modified_s: int, *, with_body: bool) -> None:
+        tag = {"ETag": f'"{zlib.crc32(data)}"', "Last-Modified": formatdate(modified_s, usegmt=True)}
         if self.headers["If-Match"] not in (None, tag["ETag"]):
             self._send(412, b"<Error><Code>PreconditionFailed</Code></Error>")
             return
@@ -139,11 +140,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send(self, status: int, body: bytes, more: dict[str, str] | None = None, *, with_body: bool = True) -> None:
         self.send_response(status)
-        more = {"ETag": '"1"', **(more or {})}
+        more = {"ETag": '"1"', "Last-Modified": formatdate(1_600_000_000, usegmt=True), **(more or {})}
         for key, value in more.items():
             self.send_header(key, value)
         self.send_header("Content-Length", str(len(body)))
-        self.send_header("Last-Modified", formatdate(1_600_000_000, usegmt=True))
         self.end_headers()
         if with_body:
             cut = status in (200, 206) and self.server.fetched.cuts > 0
@@ -180,7 +180,7 @@ def _listing(bucket: Path, prefix: str, delimiter: str) -> bytes:
     names = [name for name in names if name.startswith(prefix)]
     deeper = {name for name in names if delimiter and delimiter in name[len(prefix) :]}
     contents = "".join(
-        f"<Contents><Key>{escape(name)}</Key><LastModified>{_format_time((bucket / name).stat().st_mtime)}</LastModified>"
+        f"<Contents><Key>{escape(name)}</Key><LastModified>{_format_time(int((bucket / name).stat().st_mtime))}</LastModified>"
         f"<Size>{(bucket / name).stat().st_size}</Size></Contents>"
         for name in names
         if name not in deeper

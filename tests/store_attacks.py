@@ -71,12 +71,14 @@ class World:
         """Requests until the call is killed."""
         self.actor: Actor | None = None
         self.baton = threading.Semaphore(0)
-        self.requests = 0
+        self.requests, self.writes = 0, list[int]()
+        """Of the call: how many it has made, and which of them wrote."""
 
     # ---- requests
 
-    def step(self) -> None:
+    def step(self, *, is_write: bool) -> None:
         """Stop before a request."""
+        self.writes += [self.requests] if is_write else []
         self.requests += 1
         if self.actor is not None:
             actor = self.actor
@@ -94,16 +96,16 @@ class World:
 
         def do_stepwise(self_: Place, *args: object, **how: object) -> object:
             if self_.path is not None:
-                self.step()
+                self.step(is_write=how.get("what") == "written")
             return do(self_, *args, **how)
 
         def put_stepwise(self_: Place, prefix: str, directory: Path) -> None:
             if self_.path is not None:
-                self.step()
+                self.step(is_write=True)
             put_files(self_, prefix, directory)
 
-        def ask(url: str, request: Callable[[MemoryStore], object], *_: object, **__: object) -> object:
-            self.step()
+        def ask(url: str, request: Callable[[MemoryStore], object], *_: object, **how: object) -> object:
+            self.step(is_write=how.get("what") == "written")
             return request(self.memory)
 
         monkeypatch.setattr(Place, "_do", do_stepwise)
@@ -122,8 +124,9 @@ class World:
 
     def run(self, act: Callable[[], object], *, kill_at: int | None = None) -> bool:
         """Let a call run in a process of its own; return whether it was killed, before its request ``kill_at``."""
+        documents._DECODED.clear()  # as another process: the number of requests depends on it
         self.pid = next(_PIDS)
-        self.alive, self.left, self.requests = {self.pid}, kill_at, 0
+        self.alive, self.left, self.requests, self.writes = {self.pid}, kill_at, 0, []
         try:
             act()
         except Killed:
@@ -134,11 +137,12 @@ class World:
 
     def interleave(self, acts: list[Callable[[], object]], turns: list[tuple[int, int]]) -> list[BaseException | None]:
         """Let calls run side by side: by ``turns`` (call, requests), then each to its end. Return their errors."""
+        documents._DECODED.clear()
         actors = [Actor(self, act, next(_PIDS)) for act in acts]
-        self.alive, self.requests = {actor.pid for actor in actors}, 0
+        self.alive, self.requests, self.writes = {actor.pid for actor in actors}, 0, []
         for number, most in [*turns, *((number, 10**9) for number in range(len(acts)))]:
             actor = actors[number]
-            while most > 0 and not actor.done:
+            while most >= 0 and not actor.done:  # it stops before the next one
                 self.actor, most = actor, most - 1  # noqa: PLW2901
                 actor.go.release()
                 assert self.baton.acquire(timeout=120), "calls wait for each other"

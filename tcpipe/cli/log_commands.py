@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -95,7 +94,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
 
-        note = partial(print_line, err=True) if as_json else shown.result
+        note = shown.line if as_json else shown.result
         summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=note))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None

@@ -136,6 +136,8 @@ def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Path | 
         with _CONVERTING:
             return msgspec.json.decode(text, type=cls)
     except msgspec.DecodeError as error:
+        if "surrogate" in str(error):  # the name of a file is no text: only the standard library reads it
+            return parse_typed(json.loads(text if isinstance(text, str) else bytes(text)), cls, path)
         raise StoreError(f"{path}: is not what this version writes: {_format_validation_error(str(error))}") from None
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import TypeAlias
+from typing import Any
 
 from tcpipe.formats.integrity import Checksum
 from tcpipe.tables.findings import LEFT_OUT, Finding
 
-OptionValue: TypeAlias = str | int | float | bool | Sequence[str] | Mapping[str, str] | None
-"""A value of an option of a call, as JSON; an integer stays one."""
 _UNFINISHED = ".active"
 """Ending of a ROS 1 bag that is being recorded, or was when its recorder died."""
 
@@ -101,7 +99,7 @@ class Output:
     """Digests of the parts of that: runs, maps, recipe and so on."""
     runs: tuple[tuple[str, str], ...] = ()
     """Runs and recipes of which it was made: `prune` keeps them."""
-    options: Mapping[str, OptionValue] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the last call, by which it can be planned again."""
     exit_code: int = 0
     message: str = ""
@@ -135,7 +133,7 @@ class Call:
     version: str
     works_on: tuple[str, ...] = ()
     """Logs and folders as they were given, or the output, in full."""
-    options: Mapping[str, OptionValue] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
     """Options that distinguish its work from that of another call."""
     process: Process | None = None
     begin: str = ""

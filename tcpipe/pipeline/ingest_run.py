@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 
 from tcpipe import __version__
@@ -36,7 +37,7 @@ from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store, name_run
 from tcpipe.tables.arrays import encode_rows
-from tcpipe.tables.columns import to_integers
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -248,9 +249,20 @@ def describe_recording(streams: Streams) -> Recording | None:
     for role in _IDENTIFYING:
         if role in tables:
             names = [field.name for field in tables[role].schema if field.type in (pa.float64(), pa.int64())]
-            found.update(b"".join([role.encode(), *encode_rows(tables[role].slice(0, _FIRST_ROWS), names)]))
+            found.update(b"".join([role.encode(), *encode_rows(_take_first_changes(tables[role]), names)]))
     first_ns, last_ns = min(int(each.min()) for each in stamps), max(int(each.max()) for each in stamps)
     return Recording(first_ns, last_ns, sum(table.num_rows for table in tables.values()), found.hexdigest()[:16])
+
+
+def _take_first_changes(table: pa.Table) -> pa.Table:
+    """Return the first rows with other values than the row before: each robot that rests gives the same ones."""
+    is_new = np.zeros(table.num_rows, bool)
+    is_new[0] = True
+    for field in table.schema:
+        if field.type == pa.float64():
+            values = to_floats(table, field.name)
+            is_new[1:] |= (values[1:] != values[:-1]) & ~(np.isnan(values[1:]) & np.isnan(values[:-1]))
+    return table.take(np.flatnonzero(is_new)[:_FIRST_ROWS])
 
 
 def write_tables(directory: Path, run: Run, track: Track, masked: MaskedTrack, labelled: LabelledSegments) -> None:

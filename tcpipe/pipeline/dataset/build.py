@@ -24,10 +24,11 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
+from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
-from tcpipe.formats.store_records import OptionValue, Output
+from tcpipe.formats.store_records import Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
@@ -207,7 +208,7 @@ def _build(
     return result, job.inputs
 
 
-def _describe_options(options: BuildDatasetOptions) -> dict[str, OptionValue]:
+def _describe_options(options: BuildDatasetOptions) -> dict[str, Json]:
     """Return the options of a call as JSON values, files as absolute paths, so that it can be planned again."""
     found = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name not in _NOT_RECORDED}
     for name in ("split", "keep_split", "recipe"):

@@ -11,12 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic_store import add_run, lanes, segments
-from tcpipe.formats.commit_log import read_state_here
-from tcpipe.formats.index_files import KnownLog, RunFacts
-from tcpipe.formats.run_documents import LogOrigin
 
 from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
+from tcpipe.formats.runs import LogOrigin, Run
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
@@ -26,7 +25,7 @@ from tcpipe.pipeline.plan import TO_DO, IngestResult, check_age, make_result
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import Store, open_store
+from tcpipe.store import Store, name_run, open_store
 from tcpipe.tables.findings import Subject, make_finding
 
 RECIPES = (Recipe(), replace(Recipe(), read=ReadConfig(ignore_topics=["/none"])))
@@ -34,22 +33,20 @@ KINDS = ("good", "damaged", "empty", "junk", "passing")
 
 
 @pytest.fixture(scope="module")
-def row(tmp_path_factory) -> RunFacts:
-    """The row of some run, of which others are made."""
+def row(tmp_path_factory) -> Run:
+    """The record of some run, of which others are made."""
     store = open_store(tmp_path_factory.mktemp("plan") / "store", create=True)
     add_run(store, "a", segments("a", *lanes(0.0, 0.0, 10.0)))
-    (only,) = store.state().runs.values()
-    return only
+    (only,) = store.runs()
+    return only.manifest
 
 
 def make_row(row, task, sha256, kind):
-    """What ingesting a log of this kind would commit."""
-    log = KnownLog(LogOrigin(task.source.origins, sha256), task.tags, {})
+    """What ingesting a log of this kind would write."""
+    log = LogOrigin(task.source.origins, sha256)
     key, name = ingest_key(task.recipe), f"{task.source.stem}-{sha256[:8]}"
     asked = {"robot_requested": task.robot, "message_definitions": task.definitions, "ingest_key": key}
-    made = replace(
-        row, run_id=name, recipe_id=make_recipe_id(task.recipe, row.robot), log=log, files={}, commit=0, **asked
-    )
+    made = replace(row, run_id=name, recipe_id=make_recipe_id(task.recipe, row.robot), log=log, **asked)
     subject = Subject("run", name)
     empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
     damage = (make_finding("file-cut", Subject("file", name)),)
@@ -74,14 +71,17 @@ def worker(row, worked):
             problems = (f"{task.source.name}: {kind}",)
             result = IngestResult(task.source.name, "failed", problems=problems, transient=kind == "passing")
             return Ingested(task.source, replace(result, sha256=sha256))
-        state = read_state_here(Store(task.store).place)
+        store = Store(task.store)
+        state = store.scan()
         made = make_row(row, task, sha256, kind)
-        named = state.find_run(sha256)
-        made = made if named is None else replace(made, run_id=named)
-        same = state.runs.get((made.run_id, made.recipe_id))
-        if same is not None and not task.force and task.tags.items() <= same.tags.items():
-            return Ingested(task.source, make_result(task.source, "unchanged", same, sha256, same_as=None))
-        return Ingested(task.source, make_result(task.source, "done", made, sha256, same_as=None), (made,))
+        made = replace(made, run_id=name_run(state, task.source.stem, sha256), blob=make_unique_name(), tables={})
+        known = [of for of in state.list_rows() if of.log.sha256 == sha256 and task.is_made_by(of)]
+        if known and not task.force:
+            return Ingested(task.source, make_result(task.source, "unchanged", known[0], sha256, same_as=None))
+        store.place.put(f"blobs/{made.blob}/track.parquet", b"")
+        store.put_run(state, made)
+        (facts,) = [of for of in state.list_rows() if of.blob == made.blob]
+        return Ingested(task.source, make_result(task.source, "done", facts, sha256, same_as=None))
 
     return ingest_one
 
@@ -102,8 +102,6 @@ def test_what_status_predicts_is_what_ingest_does(row, actions):
         root, worked = Path(directory), list[str]()
         logs, store = root / "logs", root / "store"
         logs.mkdir()
-        open_store(store, create=True)
-        (store / "runs" / "keep").mkdir(parents=True)
         patch.setattr(ingest_module, "ingest_one", worker(row, worked))
         for action, *rest in (("write", 0, "good", 0, False), *actions, ("ingest", RECIPES[0], {})):
             if action == "write":
@@ -125,9 +123,9 @@ def compare(logs, store, worked, **how):
         for group in find_status(IngestOptions([logs], store=store, **{"min_age_s": 600.0, **how}), create=True).groups
         for name in group.logs
     }
-    before, worked[:] = Store(store).state(), []
+    before, worked[:] = Store(store).scan(), []
     results = {result.log: result for result in ingest([logs], store=store, **how).results}
-    after = Store(store).state()
+    after = Store(store).scan()
     assert set(worked) == {name for name, standing in predicted.items() if standing in TO_DO}
     for name, standing in predicted.items():
         result = results[name]
@@ -139,4 +137,5 @@ def compare(logs, store, worked, **how):
         elif standing == "growing":
             assert result.status == "waiting"
     if not worked:
-        assert after == before, "a call with nothing to do writes nothing"
+        names = {name for (kind, _), name in after.names.items() if kind != "calls"}
+        assert names == {name for (kind, _), name in before.names.items() if kind != "calls"}, "nothing but its record"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import parse_typed, read_as, write_json
+from tcpipe.formats.json_files import parse_typed, parse_typed_json, read_as, to_compact_json, to_json, write_json
 from tcpipe.recipe.checking import describe
 
 
@@ -30,6 +30,12 @@ class Document:
     names: tuple[str, ...] = ()
     place_m: tuple[float, float] = (0.0, 0.0)
     by_role: Mapping[str, Counts] = field(default_factory=dict)
+
+
+@pytest.mark.parametrize("write", [to_json, to_compact_json])
+def test_the_name_of_a_file_that_is_no_text_is_read_again(write):
+    document = Document(Counts(1), ("/logs/a\udcff.mcap",))
+    assert parse_typed_json(write(document), Document, "it") == document
 
 
 def test_what_is_written_is_read_again(tmp_path):
