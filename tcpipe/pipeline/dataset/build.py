@@ -232,7 +232,7 @@ def find_changed_parts(store: Store, state: State, output: Output) -> str:
     """
     if not output.inputs or output.options.get("recipe") == _IN_PYTHON:
         return ""
-    options = BuildDatasetOptions(output.where, store=store.root, **output.options)  # type: ignore[arg-type]  # as recorded
+    options = BuildDatasetOptions(output.where, store=store.root, **output.options)
     try:
         recipe = merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
         parts = plan_inputs(store, read_build_options(options, recipe, output.where), state).parts
