@@ -203,6 +203,8 @@ def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str
         more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
         return f"to do now: {format_finding(problems[0].finding)}{more}"
     for group in groups:
+        if group.state == "failed_transient":
+            return f"to do now: correct the cause, then tcpipe ingest ({len(group.logs)} logs): {group.cause}"
         if group.state in TROUBLE:
             return (
                 f"to do now: look at {len(group.logs)} logs that are {_format_words(group.state)}, or acknowledge them"
