@@ -45,6 +45,11 @@ class IngestSummary:
     results: tuple[IngestResult, ...] = field(default_factory=tuple)
 
     @property
+    def is_transient(self) -> bool:
+        """Whether a log failed for a reason that may pass."""
+        return any(result.transient for result in self.results)
+
+    @property
     def exit_code(self) -> int:
         """0 nothing is wrong, or nothing that is news; 1 all failed; 3 some failed, are damaged or empty."""
         if not any(result.is_new_problem for result in self.results):
@@ -61,6 +66,8 @@ class SummaryLine:
     store: str | None
     """None where no store was made."""
     exit_code: int
+    transient: bool
+    """Whether a log failed for a reason that may pass: the same call may succeed later."""
     results: tuple[IngestResult, ...]
     kind: Literal["summary"] = "summary"
 

@@ -35,10 +35,16 @@ from tcpipe.pipeline.log_queue import make_tasks
 from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan
-from tcpipe.pipeline.problems import find_incomplete_maps, find_incomplete_runs, make_missing, make_waiting
+from tcpipe.pipeline.problems import (
+    find_incomplete_maps,
+    find_incomplete_runs,
+    find_stale_outputs,
+    make_missing,
+    make_waiting,
+)
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.store import open_store
+from tcpipe.tables.findings import Finding
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
@@ -209,28 +215,14 @@ def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str
         more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
         return f"to do now: {format_finding(problems[0].finding)}{more}"
     for group in groups:
+        if group.state == "failed_transient":
+            return f"to do now: correct the cause, then tcpipe ingest ({len(group.logs)} logs): {group.cause}"
         if group.state in TROUBLE:
             return (
                 f"to do now: look at {len(group.logs)} logs that are {_format_words(group.state)}, or acknowledge them"
             )
     waiting = sum(len(group.logs) for group in groups if group.state in TO_DO)
     return f"to do now: tcpipe ingest ({waiting} logs)" if waiting else "nothing to do"
-
-
-def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
-    """Yield the outputs whose last call failed, or that would be made of something else now."""
-    if not state.outputs:
-        return
-    from tcpipe.pipeline.dataset.build import find_changed_parts  # noqa: PLC0415  only for stores with datasets
-
-    for output in state.outputs.values():
-        subject = Subject("dataset", output.where)
-        if output.exit_code not in (0, 3):
-            names = {"message": output.message.partition("\n")[0], "at": output.at[:19]}
-            yield Problem(make_finding("output-failed", subject, names=names), f"{output.where} {output.at}")
-        elif changes := find_changed_parts(store, state, output):
-            found = make_finding("output-outdated", subject, names={"changes": changes})
-            yield Problem(found, f"{output.where} {output.inputs}")
 
 
 def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:

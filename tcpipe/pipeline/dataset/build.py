@@ -217,7 +217,7 @@ def _describe_options(options: BuildDatasetOptions) -> dict[str, Json]:
     for name in ("covariates", "exclude"):
         given = [found[name]] if isinstance(found[name], str | Path) else found[name]
         found[name] = [make_absolute(path) for path in given]
-    return {name: value for name, value in found.items() if value not in (None, (), [], {}, False)}
+    return {name: value for name, value in found.items() if value is not False and value not in (None, (), [], {})}
 
 
 _NOT_RECORDED = ("out", "store", "jobs", "dry_run", "force")
