@@ -137,7 +137,8 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     problems = [problem for problem in problems if problem.key not in acknowledged]
     groups, waiting = tuple(_iterate_groups(steps)), [step for step in steps if step.is_todo]
     current = [run.facts for run in opened.runs(state) if run.facts.ingest_key == ingest_key(ruling)]
-    by_code = group_findings((run.run_id, run.findings) for run in current)
+    worse = ((run.run_id, [each for each in run.findings if each.severity != "note"]) for run in current)
+    by_code = group_findings(worse)
     calls = list_ended_calls(state)
     size_bytes = sum(step.task.source.size_bytes for step in waiting)
     return Status(
@@ -153,7 +154,7 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
         open_calls=tuple(call for call in open_calls if call.problem.key not in acknowledged),
         history=tuple(calls[:_LATEST_CALLS]),
         runs=len(current),
-        findings={group.code: len(group.of) for group in by_code if group.severity != "note"},
+        findings={group.code: len(group.of) for group in by_code},
         exit_code=3 if problems or any(group.state in TROUBLE for group in groups) else 0,
     )
 
