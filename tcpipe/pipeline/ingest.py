@@ -96,18 +96,16 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     is_new = not is_store(opened.root)
     if is_new and options.existing_store:
         raise StoreError(f"{opened.root}: there is no store here (--existing-store); is a disk not mounted?")
-    with record_call(opened, INGEST, given, how, jobs=options.jobs) as call:
-        if is_new and options.on_note:
-            options.on_note(f"new store: {opened.root}")
-        with make_scratch_directory() as staging:
-            return _ingest_all(call, options, staging)
+    recorded = record_call(opened, INGEST, given, how, jobs=options.jobs)
+    with recorded as call, make_scratch_directory() as staging:
+        return _ingest_all(call, options, staging, is_new=is_new)
 
 
 ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
-def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path) -> IngestSummary:
+def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_new: bool) -> IngestSummary:
     ruling, shard, store = resolve_recipe(options.recipe), options.shard, call.store
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := load_profiles(ruling).robots):
@@ -135,6 +133,8 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path) -> Ing
         call.begin()
         if call.error is not None:  # before logs are read for hours
             raise call.error
+        if is_new and options.on_note:
+            options.on_note(f"new store: {store.root}")
         tell(_iterate_results(call, steps, jobs=options.jobs, cluster=options.cluster))
     summary = IngestSummary(store.root, tuple(results[index] for index in sorted(results)))
     call.is_whole = shard is None

@@ -218,11 +218,14 @@ def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str
         if group.state == "failed_transient":
             return f"to do now: correct the cause, then tcpipe ingest ({len(group.logs)} logs): {group.cause}"
         if group.state in TROUBLE:
-            return (
-                f"to do now: look at {len(group.logs)} logs that are {_format_words(group.state)}, or acknowledge them"
-            )
-    waiting = sum(len(group.logs) for group in groups if group.state in TO_DO)
-    return f"to do now: tcpipe ingest ({waiting} logs)" if waiting else "nothing to do"
+            them = "it" if len(group.logs) == 1 else "them"
+            return f"to do now: look at {_count_logs(group.logs)} ({_format_words(group.state)}), or acknowledge {them}"
+    waiting = list(chain(*(group.logs for group in groups if group.state in TO_DO)))
+    return f"to do now: tcpipe ingest ({_count_logs(waiting)})" if waiting else "nothing to do"
+
+
+def _count_logs(logs: Sequence[str]) -> str:
+    return f"{len(logs)} log{'s' * (len(logs) != 1)}"
 
 
 def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:

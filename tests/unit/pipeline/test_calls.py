@@ -140,8 +140,10 @@ def test_a_call_that_is_refused_on_a_new_store_creates_nothing(tmp_path, logs, h
         "recipe": {"recipe": tmp_path / "nosuch.toml"},
         "existing store": {"existing_store": True},
     }
+    told = []
     with pytest.raises(TcpipeError):
-        ingest(**{"logs": [logs], "store": tmp_path / "new", "recipe": Recipe(), **wrong[how]})
+        ingest(**{"logs": [logs], "store": tmp_path / "new", "recipe": Recipe(), "on_note": told.append, **wrong[how]})
+    assert told == []
     assert not (tmp_path / "new").exists()
 
 
