@@ -121,7 +121,7 @@ class State:
     def runs(self) -> dict[str, RunFacts]:
         """Runs by key, with tags and supersession; those that are superseded or pruned too."""
         if self._joined is None:
-            self._joined = _join_runs(self.facts)
+            self._joined = _join_runs(self.facts["runs"], self.facts["tags"].values())
         return self._joined
 
     @property
@@ -202,19 +202,18 @@ class State:
             self._joined = None
 
 
-def _join_runs(facts: Mapping[Kind, Mapping[str, Any]]) -> dict[str, RunFacts]:
+def _join_runs(runs: Mapping[str, RunFacts], tags: Iterable[Tags]) -> dict[str, RunFacts]:
     """Return the runs with the tags of their logs, and with the run that supersedes them.
 
     Of runs of one robot and recipe that begin with the same measurements the longest recording counts.
     """
     longest, joined = dict[Beginning, RunFacts](), dict[str, RunFacts]()
-    tags: Mapping[str, Tags] = facts["tags"]
-    tags_by_log = {each.log: each.tags for each in tags.values()}
-    for row in facts["runs"].values():
+    tags_by_log = {each.log: each.tags for each in tags}
+    for row in runs.values():
         if (beginning := _find_beginning(row)) is not None:
             other = longest.get(beginning)
             longest[beginning] = row if other is None or _rank_recording(row) > _rank_recording(other) else other
-    for key, row in facts["runs"].items():
+    for key, row in runs.items():
         beginning = _find_beginning(row)
         winner = row if beginning is None else longest[beginning]
         by = None if winner.log.sha256 == row.log.sha256 else winner.run_id

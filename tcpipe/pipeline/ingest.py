@@ -9,13 +9,14 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
 from tcpipe.execution import refuse_import_of_script, run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key
+from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.recipe_toml import load_profiles, resolve_recipe
 from tcpipe.formats.store_records import Failure, find_lineage
@@ -170,7 +171,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
             logger.warning(text, pattern, list_first(run_ids, _MOST_RUNS))
 
 
-def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[str, Any]:
+def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[str, Json]:
     """Return what the record of a call holds of its work."""
     done = [result for result in summary.results if result.status in ("done", "damaged", "empty")]
     sizes = {task.source.name: task.source.size_bytes for task in tasks}

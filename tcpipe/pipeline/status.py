@@ -179,7 +179,7 @@ def _list_asked(state: State) -> Asked:
     asked = dict[str, tuple[tuple[str, ...], CallOptions]]()
     for _, call in state.calls:
         if call.command == INGEST and call.exit_code != UsageError.exit_code:
-            how = CallOptions(**call.options)  # written by ingest
+            how = CallOptions(**call.options)  # type: ignore[arg-type]  # written by ingest
             for log in call.works_on:
                 asked.setdefault(log, (call.works_on, how))
     return asked
