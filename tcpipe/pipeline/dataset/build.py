@@ -29,7 +29,7 @@ from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
 from tcpipe.formats.store_records import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
+from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, describe_error, estimate, list_ended_calls, record_call
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
@@ -122,9 +122,8 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         now = replace(before, options=_describe_options(options), at=call.call.begin)
         try:
             result, inputs = _build(call, options, place, reported=before.reported)
-        except TcpipeError as error:
-            message = "\n".join(error.problems)
-            _record_output(call, replace(now, exit_code=error.exit_code, message=message), before)
+        except Exception as error:
+            _record_output(call, replace(now, **describe_error(error)), before)
             raise
         runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
         reported = tuple(sorted(map(_name_finding, select_problems(result.findings))))
