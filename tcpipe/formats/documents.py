@@ -56,6 +56,8 @@ _UNREAD = 16
 _UNREAD_SHARE = 50
 """The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
 
+_MANY = 1000
+"""So many records that were read at once are left out of later garbage collections."""
 _SEAL = b"sha256"
 """Key of the metadata of the index."""
 
@@ -249,13 +251,16 @@ def scan(place: Place) -> State:
     if where not in _DECODED:
         _DECODED.clear()
         _DECODED[where] = {}
-    has_collector = gc.isenabled()
+    decoded, has_collector = _DECODED[where], gc.isenabled()
+    before = len(decoded)
     gc.disable()  # the records have no cycles: to search ten thousand of them again and again takes as long as to read them
     try:
-        return _scan(place, _DECODED[where])
+        return _scan(place, decoded)
     finally:
         if has_collector:
             gc.enable()
+        if len(decoded) - before > _MANY:
+            gc.freeze()
 
 
 def _scan(place: Place, decoded: dict[str, Record]) -> State:
