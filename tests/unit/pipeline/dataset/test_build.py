@@ -6,17 +6,18 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from stored_files import map_path
 from synthetic_store import (
     add_run,
     add_world,
     box,
-    commit_run,
     lanes,
     lonlat,
     make_fixes,
     open_world,
     region_file,
     segments,
+    tag_run,
 )
 
 from tcpipe.dataset import open_dataset
@@ -203,8 +204,7 @@ def test_runs_without_a_sensor_in_common_are_asked_for_and_a_tag_is_the_answer(s
     logs, tag = command.removeprefix("tcpipe ingest ").split(" --tag ")
     key, value = tag.split("=")
     for log in logs.split():  # what ingesting a known log again does
-        store.tag_run(Path(log).stem, {key: value})
-        commit_run(store, Path(log).stem)
+        tag_run(store, Path(log).stem, {key: value})
     result = build(store, tmp_path, force=True)
     assert result.card.samples == samples
     assert select_findings(result.findings, "drives-overlap") == []
@@ -251,7 +251,7 @@ def test_a_map_that_does_not_cover_the_runs(store, tmp_path):
 @pytest.mark.parametrize("lost", ["terrain/c", "checksums.json", "height/zarr.json"])
 def test_a_map_that_lost_a_part_is_refused_and_not_taken_for_a_hole(store, tmp_path, lost):
     add(store)
-    part = store.map_files("site")[0] / lost
+    part = map_path(store.root, "site") / lost
     for path in [part] if part.is_file() else sorted(path for path in part.rglob("*") if path.is_file()):
         path.unlink()
     line = refused(store, tmp_path, MapError)
