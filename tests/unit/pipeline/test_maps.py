@@ -53,7 +53,11 @@ def refused(store, name, error=MapError, **given):
     assert read_content(store) == before
     if before:
         _, call = Store(store).scan().calls[0]
-        assert (call.command, call.exit_code, call.message) == ("add-map", error.exit_code, "\n".join(caught.value.problems))
+        assert (call.command, call.exit_code, call.message) == (
+            "add-map",
+            error.exit_code,
+            "\n".join(caught.value.problems),
+        )
     return caught.value.problems
 
 
