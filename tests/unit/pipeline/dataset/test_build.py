@@ -96,7 +96,7 @@ def test_what_is_missing_is_named(store, tmp_path):
     assert "there is no store here" in refused(Store(tmp_path / "nowhere"), tmp_path, UsageError)
     assert "no runs in the store" in refused(store, tmp_path)
     bare = open_store(tmp_path / "bare", create=True)
-    bare.put(State(), "calls", "1", Call("ingest", "2.0.0"))
+    bare.put(State(), "calls", "0000000100000000", Call(command="ingest", version="2.0.0"))
     with pytest.raises(DatasetError) as caught:
         build(bare, tmp_path)
     runs, maps = caught.value.problems
