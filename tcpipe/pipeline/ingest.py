@@ -18,14 +18,9 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
-<<<<<<< HEAD
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
-from tcpipe.formats.store_records import Failure, find_lineage
-=======
-from tcpipe.formats.recipe_toml import load_profiles, resolve_recipe
 from tcpipe.formats.runs import find_problems
 from tcpipe.formats.store_records import Failure, find_lineage, make_failure
->>>>>>> 8b41c83fe4da74d1888a2be12ff2e0bbd2c7f024
 from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_queue import Item, iterate_rounds, make_tasks
