@@ -19,14 +19,15 @@ from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
-from tcpipe.formats.store_records import Failure, find_lineage
+from tcpipe.formats.runs import find_problems
+from tcpipe.formats.store_records import Failure, find_lineage, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_queue import Item, iterate_rounds, make_tasks
 from tcpipe.pipeline.log_sources import FoundLogs, find_failure, find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
-from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
+from tcpipe.pipeline.problems import is_acknowledged
 from tcpipe.recipe import TimeWindow
 from tcpipe.store import is_store, open_store
 from tcpipe.tables.findings import select_problems
