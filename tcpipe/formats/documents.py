@@ -56,6 +56,8 @@ _UNREAD = 16
 _UNREAD_SHARE = 50
 """The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
 
+_MANY = 1000
+"""So many records that were read at once are left out of later garbage collections."""
 _SEAL = b"sha256"
 """Key of the metadata of the index."""
 
@@ -119,7 +121,7 @@ class State:
     def runs(self) -> dict[str, RunFacts]:
         """Runs by key, with tags and supersession; those that are superseded or pruned too."""
         if self._joined is None:
-            self._joined = _join_runs(self.facts)
+            self._joined = _join_runs(self.facts["runs"], self.facts["tags"].values())
         return self._joined
 
     @property
@@ -200,19 +202,18 @@ class State:
             self._joined = None
 
 
-def _join_runs(facts: Mapping[Kind, Mapping[str, Any]]) -> dict[str, RunFacts]:
+def _join_runs(runs: Mapping[str, RunFacts], tags: Iterable[Tags]) -> dict[str, RunFacts]:
     """Return the runs with the tags of their logs, and with the run that supersedes them.
 
     Of runs of one robot and recipe that begin with the same measurements the longest recording counts.
     """
     longest, joined = dict[Beginning, RunFacts](), dict[str, RunFacts]()
-    tags: Mapping[str, Tags] = facts["tags"]
-    tags_by_log = {each.log: each.tags for each in tags.values()}
-    for row in facts["runs"].values():
+    tags_by_log = {each.log: each.tags for each in tags}
+    for row in runs.values():
         if (beginning := _find_beginning(row)) is not None:
             other = longest.get(beginning)
             longest[beginning] = row if other is None or _rank_recording(row) > _rank_recording(other) else other
-    for key, row in facts["runs"].items():
+    for key, row in runs.items():
         beginning = _find_beginning(row)
         winner = row if beginning is None else longest[beginning]
         by = None if winner.log.sha256 == row.log.sha256 else winner.run_id
@@ -248,13 +249,16 @@ def scan(place: Place) -> State:
     if where not in _DECODED:
         _DECODED.clear()
         _DECODED[where] = {}
-    has_collector = gc.isenabled()
+    decoded, has_collector = _DECODED[where], gc.isenabled()
+    before = len(decoded)
     gc.disable()  # the records have no cycles: to search ten thousand of them again and again takes as long as to read them
     try:
-        return _scan(place, _DECODED[where])
+        return _scan(place, decoded)
     finally:
         if has_collector:
             gc.enable()
+        if len(decoded) - before > _MANY:
+            gc.freeze()
 
 
 def _scan(place: Place, decoded: dict[str, Record]) -> State:

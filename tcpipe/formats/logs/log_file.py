@@ -538,22 +538,22 @@ def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
         if entry.name.startswith((".", "~")) or entry.name in _FILE_SYSTEMS_OWN:
             continue
         if _is_directory(entry):
-            found.append((Path(entry.path), True))
+            found.append((directory / entry.name, True))
         elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
             continue
         elif (
             entry.name.lower().endswith(LOG_SUFFIXES)
             and (entry.is_symlink() or entry.is_file())
-            and not _is_other_binary(Path(entry.path))
+            and not (entry.name.lower().endswith(".bin") and _is_other_binary(directory / entry.name))
         ):
-            found.append((Path(entry.path), False))
+            found.append((directory / entry.name, False))
     return found
 
 
 def _is_other_binary(path: Path) -> bool:
     """Return whether a .bin is anything but a log: many programs write files of that name; one that cannot be read may be one."""
     with suppress(LogError):
-        return path.suffix.lower() == ".bin" and find_autopilot(path) is None
+        return find_autopilot(path) is None
     return False
 
 

@@ -14,7 +14,7 @@ from tcpipe.recipe import TableMapping
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
 """What a file of a table is called."""
 
-_STORE, _DATASET = {"store.json", "log"}, {"dataset.json", "samples.parquet"}
+_STORE, _DATASET = {"blobs", "calls"}, {"dataset.json", "samples.parquet"}
 """What lies in a store, and in a dataset."""
 
 Mappings = Mapping[str, TableMapping]

@@ -140,8 +140,10 @@ def test_a_call_that_is_refused_on_a_new_store_creates_nothing(tmp_path, logs, h
         "recipe": {"recipe": tmp_path / "nosuch.toml"},
         "existing store": {"existing_store": True},
     }
+    told = []
     with pytest.raises(TcpipeError):
-        ingest(**{"logs": [logs], "store": tmp_path / "new", "recipe": Recipe(), **wrong[how]})
+        ingest(**{"logs": [logs], "store": tmp_path / "new", "recipe": Recipe(), "on_note": told.append, **wrong[how]})
+    assert told == []
     assert not (tmp_path / "new").exists()
 
 
@@ -200,7 +202,7 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
 def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     (call,) = ask_status(root).open_calls
-    with pytest.raises(UsageError, match="nosuch: is no run or log with a known problem"):
+    with pytest.raises(UsageError, match="nosuch: is no run, log or dataset with a known problem"):
         acknowledge(["nosuch"], store=root)
     assert [of.finding.code for of in acknowledge([call.name], store=root).acknowledged] == ["call-killed"]
     assert (ask_status(root).exit_code, ask_status(root).open_calls) == (0, ())
