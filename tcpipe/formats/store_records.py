@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from typing import TypeAlias
 
 from tcpipe.formats.integrity import Checksum
-from tcpipe.tables.findings import LEFT_OUT, Finding
+from tcpipe.tables.findings import LEFT_OUT, Finding, Subject
 
 _UNFINISHED = ".active"
 """Ending of a ROS 1 bag that is being recorded, or was when its recorder died."""
@@ -60,6 +60,11 @@ class Problem:
     def name(self) -> str:
         """What a person calls it: the run, or the log or call."""
         return self.run_id or " + ".join(self.log) or self.finding.subject.name
+
+
+def make_failure(content: str, log: tuple[str, ...]) -> Problem:
+    """Return the problem that a log failed because of its content."""
+    return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,12 +9,12 @@ from pathlib import Path
 from tcpipe.errors import UsageError, list_first
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
-from tcpipe.formats.runs import Run, RunFacts
-from tcpipe.formats.store_records import Call, Problem
+from tcpipe.formats.runs import Run, RunFacts, find_problems
+from tcpipe.formats.store_records import Call, Problem, make_failure
 from tcpipe.pipeline.calls import ACKNOWLEDGE, BUILD, INGEST, close_call, list_open_calls, record_call
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding, Subject, make_finding, select_problems
+from tcpipe.tables.findings import Subject, make_finding
 
 _MOST_CANDIDATES = 10
 
@@ -25,17 +25,6 @@ class Acknowledged:
 
     acknowledged: tuple[Problem, ...]
     before: tuple[Problem, ...]
-
-
-def find_problems(row: RunFacts) -> tuple[Problem, ...]:
-    """Return what is wrong with a run: damage of its log, or that it has no segments."""
-    log = row.log
-    return tuple(Problem(finding, log.sha256, log.paths, row.run_id) for finding in select_problems(row.findings))
-
-
-def make_failure(content: str, log: tuple[str, ...]) -> Problem:
-    """Return the problem that a log failed because of its content."""
-    return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
 
 
 def find_incomplete_runs(state: State, run_id: str | None = None) -> Iterator[Problem]:

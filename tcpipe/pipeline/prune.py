@@ -66,8 +66,9 @@ class Pruned:
         if self.waits_for is not None:
             return clean_lines([f"{self.store}: nothing is removed: {self.waits_for}"])
         verb = "would be removed" if self.dry_run else "removed"
-        documents = f" and {self.documents} replaced documents" if self.documents else ""
-        head = f"{self.store}: {len(self.removed)}{documents} {verb}, {format_bytes(self.size_bytes)}"
+        counts = [(len(self.removed), "item"), (self.documents, "replaced document")]
+        what = " and ".join(f"{count} {name}{'s' * (count != 1)}" for count, name in counts if count)
+        head = f"{self.store}: {what} {verb}, {format_bytes(self.size_bytes)}"
         if not (self.removed or self.documents):
             head = f"{self.store}: nothing to do: there is nothing to remove"
         return clean_lines([head, *map(str, (*self.removed, *self.kept))])
