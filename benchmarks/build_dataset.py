@@ -150,7 +150,7 @@ def built(store, out):
 
 def floors_of(store, out, result, decoded):
     """Seconds that decoding, gathering and encoding take at least."""
-    path, count = store.map_files("site")[0], result.card.samples
+    path, count = store.map_at(store.find_map("site"))[0], result.card.samples
     few = min(count, 50_000)
     return {
         "decode": decode_floor(path, decoded),

@@ -19,7 +19,7 @@ from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_te
 
 Run = Callable[[], object]
 
-STORE = ("--store", f"{INPUTS}/store")
+STORE = ("--store", "store")
 LAYERS = tuple(word for name in ("height", "ortho", "terrain") for word in (f"--{name}", f"{INPUTS}/{name}.tif"))
 LOG, CUT = f"{INPUTS}/logs/tiny.mcap", f"{INPUTS}/cut.mcap"
 MODEL, DATASET = f"{INPUTS}/model", f"{INPUTS}/dataset"
@@ -41,8 +41,6 @@ class Case:
     url: str = ""
     extra_features: Run | None = None
     """What else is done at the same time where two things are; None: the same."""
-    partner: Run | None = None
-    """Another task of its array, which runs when this one is killed, and has to finish what this one began."""
     has_workers: bool = False
 
     @property
@@ -91,6 +89,11 @@ def _directory(name: str, **files: str) -> Run:
     return _as_command(write)
 
 
+def _have_store() -> None:
+    """Copy the store of the inputs, which calls write into."""
+    shutil.copytree(f"{INPUTS}/store", "store")
+
+
 _RUN = command("ingest", LOG, "--quiet")
 _BUILD = ("build-dataset", *STORE, "--split", f"{INPUTS}/region.geojson", "--quiet")
 _MAP = ("add-map", "site", *LAYERS, "--quiet")
@@ -99,15 +102,13 @@ _CLUSTER = frozenset({"cluster"})
 
 URL = f"s3://{BUCKET}/a case"
 """Where cases in a bucket write."""
-_THERE = ("--store", f"{URL}/store", "--quiet")
+_THERE = ("--store", f"{URL}/tcpipe-store", "--quiet")
 _RUN_THERE = command("ingest", LOG, *_THERE)
 _OTHER_THERE = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", *_THERE)
-_PRUNE_THERE = ("prune", "--store", f"{URL}/store")
+_PRUNE_THERE = ("prune", "--store", f"{URL}/tcpipe-store")
 _BUILD_THERE = command("build-dataset", f"{URL}/dataset", *_BUILD[1:])
 _FORCED_THERE = command("build-dataset", f"{URL}/dataset", *_BUILD[1:], "--seed", "5", "--force")
 _OTHER_RUN = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q")
-_AT_ONCE = ("--min-age", "0")
-"""What a killed prune left goes with the next one where it is a day old; here it is not."""
 _ARRAY_TASK, _OTHER_TASK = (command("ingest", f"{INPUTS}/logs", *_THERE, "--shard", f"{n}/2") for n in (1, 2))
 
 
@@ -122,17 +123,17 @@ CASES = (
     Case("ingest", _RUN, wants=_LOG),
     Case("ingest --force", command("ingest", LOG, "--force", "--quiet"), (_RUN,), _LOG),
     Case("ingest by another recipe", command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q"), (_RUN,), _LOG),
-    Case("ingest beside build-dataset", _RUN, wants=_LOG | _WORLD, extra_features=command(*_BUILD)),
+    Case("ingest beside build-dataset", _RUN, (_have_store,), wants=_LOG | _WORLD, extra_features=command(*_BUILD)),
     Case("ingest beside prune", _OTHER_RUN, (_RUN,), _LOG, extra_features=command("prune")),
-    Case("prune", command("prune", *_AT_ONCE), (_OTHER_RUN, _RUN), _LOG),
+    Case("prune", command("prune"), (_OTHER_RUN, _RUN), _LOG),
     Case("ingest into a bucket", _RUN_THERE, wants=_LOG, url=URL),
     Case("ingest --force there", command("ingest", LOG, "--force", *_THERE), (_RUN_THERE,), _LOG, URL),
     Case("ingest there beside prune", _OTHER_THERE, (_RUN_THERE,), _LOG, URL, command(*_PRUNE_THERE)),
     Case("add-map there", command(*_MAP[:-1], *_THERE), wants=_WORLD, url=URL),
-    Case("build-dataset there", _BUILD_THERE, wants=_WORLD, url=URL),
-    Case("build-dataset --force there", _FORCED_THERE, (_BUILD_THERE,), _WORLD, URL),
-    Case("prune there", command(*_PRUNE_THERE, *_AT_ONCE), (_OTHER_THERE, _RUN_THERE), _LOG, URL),
-    Case("ingest --shard 1/2 there", _ARRAY_TASK, wants=_LOG, url=URL, extra_features=_OTHER_TASK, partner=_OTHER_TASK),
+    Case("build-dataset there", _BUILD_THERE, (_have_store,), _WORLD, url=URL),
+    Case("build-dataset --force there", _FORCED_THERE, (_have_store, _BUILD_THERE), _WORLD, URL),
+    Case("prune there", command(*_PRUNE_THERE), (_OTHER_THERE, _RUN_THERE), _LOG, URL),
+    Case("ingest --shard 1/2 there", _ARRAY_TASK, wants=_LOG, url=URL, extra_features=_OTHER_TASK),
     Case("ingest on a cluster", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL),
     Case("ingest on Dask workers", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL, has_workers=True),
     Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
@@ -141,18 +142,29 @@ CASES = (
     Case("report", command("report", "tcpipe-store"), (_RUN,), _LOG),
     Case("add-map", command(*_MAP), wants=_WORLD),
     Case("add-map --force", command(*_MAP, "--force"), (command("add-map", "site", *LAYERS[:2], "-q"),), _WORLD),
-    Case("build-dataset", command(*_BUILD), wants=_WORLD),
-    Case("build-dataset over another", command(*_BUILD, "--force"), (command(*_BUILD, "--seed", "5"),), _WORLD),
-    Case("build-dataset --format parquet", command(*_BUILD, "--format", "parquet"), wants=_WORLD),
-    Case("build-dataset --jobs 2", command(*_BUILD, "--jobs", "2"), wants=_WORLD),
+    Case("build-dataset", command(*_BUILD), (_have_store,), wants=_WORLD),
+    Case(
+        "build-dataset over another",
+        command(*_BUILD, "--force"),
+        (_have_store, command(*_BUILD, "--seed", "5")),
+        _WORLD,
+    ),
+    Case("build-dataset --format parquet", command(*_BUILD, "--format", "parquet"), (_have_store,), wants=_WORLD),
+    Case("build-dataset --jobs 2", command(*_BUILD, "--jobs", "2"), (_have_store,), wants=_WORLD),
     Case("train", command("train", DATASET, "--epochs", "2", "--width", "16", "-q"), wants=_MODEL),
     Case("evaluate", command("evaluate", MODEL, DATASET, "--no-baselines", "--noise-draws", "1", "-q"), wants=_MODEL),
-    Case("cost-map", command("cost-map", MODEL, "costs", "--cell-size", "4", *STORE, "--quiet"), wants=_MODEL),
+    Case(
+        "cost-map",
+        command("cost-map", MODEL, "costs", "--cell-size", "4", *STORE, "--quiet"),
+        before=(_have_store,),
+        wants=_MODEL,
+    ),
     Case(
         "predict-path",
         command(
             "predict-path", MODEL, "--path", f"{INPUTS}/path.geojson", "--out", "path-segments.csv", *STORE, "--quiet"
         ),
+        before=(_have_store,),
         wants=_MODEL,
     ),
     Case(
@@ -160,6 +172,7 @@ CASES = (
         command(
             "plan-path", MODEL, "--from", FROM, "--to", TO, "--cell-size", "2", "--picture", "plan.png", *STORE, "-q"
         ),
+        before=(_have_store,),
         wants=_MODEL,
     ),
 )

@@ -19,12 +19,20 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import IO, TypeVar
 
 import fault_workers
+
+from tcpipe.formats.dataset_files import REPORT
+from tcpipe.formats.documents import BLOBS, scan
+from tcpipe.formats.json_files import to_compact_json
+from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.published_outputs import CARDS, find_newest
+from tcpipe.formats.stored_runs import StoredRun
+from tcpipe.store import Store
 
 T = TypeVar("T")
 
@@ -34,13 +42,13 @@ INPUTS = "in"
 LONGEST_S, LATEST_S = 600.0, 5.0
 """A call that takes longer hangs; one that is asked to end ends as fast."""
 
-STORE = "tcpipe-store"
+STORES = ("tcpipe-store", "store")
+"""What is looked at as a reader does, by `see_store`: where calls write, and a copy of the store of the inputs."""
 
 WHOLE = (
-    "dataset*", "site", "model", "costs", "tcpipe-store/maps/*/*", "tcpipe-store/runs/*/streams/*",
-    "tcpipe-store/runs/*/[0-9a-f]*/[0-9a-f]*",
+    "dataset*", "site", "model", "costs", *(f"{store}/{kind}/*" for store in STORES for kind in ("runs", "maps"))
 )  # fmt: skip
-"""Directories that appear and change as one."""
+"""What appears and changes as one: directories, and runs and maps of a store."""
 
 UNFINISHED = (
     ".tmp-*",
@@ -50,9 +58,6 @@ UNFINISHED = (
     "tmp/tcpipe-*",
 )
 """What a killed call may leave for the next one: temporaries, where a cost map and a training stand."""
-
-PASSING = ("log", "index")
-"""Directories of a store that hold times and processes: never twice the same."""
 
 _REQUEST = "fault.request"
 _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate"}
@@ -299,28 +304,58 @@ Tree = dict[str, str]
 
 
 def tree(root: Path, besides: str = INPUTS) -> Tree:
-    """Return everything below a directory but the inputs, and what is never twice the same."""
+    """Return everything below a directory but the inputs, and of stores what readers see in them."""
     found: Tree = {}
+    for store in STORES:
+        if (root / store).is_dir():
+            found |= {f"{store}/{name}": what for name, what in in_child(lambda at=root / store: see_store(at)).items()}
     for directory, names, files in os.walk(root):
         here = Path(directory).relative_to(root)
-        names[:] = [name for name in names if str(here / name) != besides and not is_passing(str(here / name))]
+        names[:] = [name for name in names if str(here / name) not in (besides, *STORES)]
         found |= {str(here / name): "directory" for name in names}
         found |= {str(here / name): hashlib.sha256((root / here / name).read_bytes()).hexdigest() for name in files}
     return found
 
 
-def is_passing(path: str) -> bool:
-    """Tell whether a path is, or lies in, what is never twice the same."""
-    return any(f"/{passing}/" in f"/{path}/" for passing in PASSING)
+def see_store(root: Path | str) -> Tree:
+    """Return what a reader sees of a store, and temporaries; calls, names of payload and times are never twice the same."""
+    state, store = scan(open_place(root)), Store(root)
+    found = {path.name: "temporary" for path in Path(root).glob(".tmp-*")}
+    for key, row in state.runs.items():
+        run = StoredRun(store.place, row, state.names["runs", key])
+        name = f"runs/{run.run_id}@{run.recipe_id}"
+        found[f"{name}/manifest"] = _hash_record(replace(run.manifest, blob=str(bool(row.blob)), streams_blob=""))
+        found |= {f"{name}/{file}": _hash_file(run.folder, file) for file in (*row.tables, REPORT) if row.blob}
+        streams = store.place.below(f"{BLOBS}/{row.streams_blob}")
+        found |= {f"{name}/{file}": _hash_file(streams, file) for file in row.streams}
+    for each in state.maps.values():
+        folder = store.place.below(f"{BLOBS}/{each.blob}")
+        found |= {f"maps/{each.name}/{file}": _hash_file(folder, file) for file in each.files}
+    others = {kind: state.facts[kind] for kind in ("failed", "tags", "seen", "acknowledged")}
+    others["outputs"] = {key: replace(each, at="") for key, each in state.facts["outputs"].items()}
+    found |= {f"{kind}/{key}": _hash_record(each) for kind, held in others.items() for key, each in held.items()}
+    return {name: what for name, what in (found | {REPORT: _hash_file(store.place, REPORT)}).items() if what}
+
+
+def see_output(url: str) -> Tree:
+    """Return what a reader sees of a dataset at a URL."""
+    card = find_newest(url, CARDS)
+    return {} if card is None else {entry.name: _hash_file(card.place, entry.name) for entry in card.place.entries()}
+
+
+def _hash_file(place: Place, name: str) -> str:
+    """Return the hash of a file; "" where there is none."""
+    data = place.read(name)
+    return "" if data is None else hashlib.sha256(data).hexdigest()
+
+
+def _hash_record(record: object) -> str:
+    return hashlib.sha256(to_compact_json(record)).hexdigest()
 
 
 def without_unfinished(found: Tree) -> Tree:
     """Leave out what waits for the next call."""
     return {path: what for path, what in found.items() if not _is_unfinished(path)}
-
-
-def _in_store(path: str) -> bool:
-    return path == STORE or path.startswith(f"{STORE}/")
 
 
 def _is_unfinished(path: str) -> bool:
@@ -339,17 +374,11 @@ def half_written(before: Tree, after: Tree, now: Tree) -> list[str]:
     bad = []
     for unit in sorted(set().union(*states)):
         old, new, found = (state.get(unit, {}) for state in states)
-        if found not in (old, new) and not _only_a_directory(found) and not _goes_unseen(unit, new, now):
+        if found not in (old, new) and not _only_a_directory(found):
             bad.append(f"{unit}: neither as before nor as after")
         if old and new and not found:
             bad.append(f"{unit}: gone")
     return bad
-
-
-def _goes_unseen(unit: str, new: Tree, now: Tree) -> bool:
-    """Whether content of a run is being removed that no manifest names any more."""
-    manifests = f"{os.path.dirname(unit)}/manifest-*.json"  # noqa: PTH120
-    return not new and fnmatch(unit, f"{STORE}/runs/*/*/*") and not any(fnmatch(path, manifests) for path in now)
 
 
 def _only_a_directory(found: Tree) -> bool:
@@ -371,8 +400,5 @@ def _unit_of(path: str) -> str:
 
 
 def different(one: Tree, other: Tree) -> list[str]:
-    """Name the paths at which two trees differ; an empty folder of a store is nothing."""
-    changed = sorted(path for path in one.keys() | other.keys() if one.get(path) != other.get(path))
-    return [
-        path for path in changed if not (_in_store(path) and {one.get(path), other.get(path)} == {None, "directory"})
-    ]
+    """Name the paths at which two trees differ."""
+    return sorted(path for path in one.keys() | other.keys() if one.get(path) != other.get(path))

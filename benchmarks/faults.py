@@ -18,7 +18,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # forked children have one thread
@@ -27,17 +26,17 @@ from fault_cases import CASES, LOG, Case, make_inputs
 from fault_children import (
     INPUTS,
     LATEST_S,
+    STORES,
     Ended,
     Fault,
     Tree,
     call,
     calls_together,
     different,
-    finish,
     half_written,
     in_child,
-    is_passing,
-    start,
+    see_output,
+    see_store,
     tree,
     without_unfinished,
 )
@@ -55,14 +54,14 @@ STRIKES = {
     "services": (),
     "together": (),
 }
-LEFT_OVER = ("left by a killed command", "belongs to a call that is running or was killed", "no commit names it")
-UNFINISHED_RUN = ": contains no finished run"
+LEFT_OVER = "left by a killed command"
+"""What `verify` says of payload that no document names: it waits for `prune`."""
 PROMISES = """
 false if: a final path is neither whole as before nor whole as after, at the moment of the fault or later; a reader sees damage then; the
-other task of an array does not finish what a killed one began; the next identical call does not
-complete, or leaves other bytes than an undisturbed one, or any temporary; a process outlives its command; a command that is asked to end
-(SIGTERM, SIGINT, SIGHUP) takes more than 5 s, exits with another code than 128 + signal, or leaves a temporary; a full disk, a gateway or
-a cluster that is gone is told in more than plain lines; a full disk leaves a temporary; verify finds a problem after the next call."""
+next identical call does not complete, or leaves other bytes than an undisturbed one, or any temporary; a process outlives its command; a
+command that is asked to end (SIGTERM, SIGINT, SIGHUP) takes more than 5 s, exits with another code than 128 + signal, or leaves a
+temporary; a full disk, a gateway or a cluster that is gone is told in more than plain lines; a full disk leaves a temporary; verify finds
+a problem after the next call."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +108,12 @@ def undisturbed(case: Case, work: Path) -> Undisturbed:
 
 def all_of(case: Case, work: Path) -> Tree:
     """Return what is in the workplace, and below ``there/`` what is in its bucket."""
-    there = {f"there/{name}": sha256(data).hexdigest() for name, data in get_objects(case.url).items()}
-    return tree(work) | {name: of for name, of in there.items() if not is_passing(name)}
+    there: Tree = {}
+    if case.url:
+        for name, see in (("tcpipe-store", see_store), ("dataset", see_output)):
+            found = in_child(lambda name=name, see=see: see(f"{case.url}/{name}"))
+            there |= {f"there/{name}/{path}": what for path, what in found.items()}
+    return tree(work) | there
 
 
 def _assert_done(case: Case, ended: Ended) -> None:
@@ -135,17 +138,11 @@ def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
     _restore(plain.state, work)
     put_objects(case.url, plain.objects)
     with _room(work, fault.room_bytes):
-        partner = start(case.partner, work) if case.partner else None
         ended = call(case.run, work, fault, steps_in=case.steps_in, strike=services.strike)
-        others = [finish(partner)] if partner else []
     services.mend()
     now = all_of(case, work)
     bad = half_written(plain.before, plain.after, now)
-    bad += [f"half visible: {line}" for line in _select_damage([*_find_problems(plain, work)])]
-    bad += [
-        f"the other task ends with {other.code}: {other.said}" for other in others if other.code != plain.ended.code
-    ]
-    bad += [f"the other task leaves other bytes: {path}" for path in different(plain.after, now) if others][:3]
+    bad += [f"half visible: {line}" for line in _find_problems(plain, work)]
     bad += ["processes outlive it"] if ended.left_running else []
     if fault.victim:
         bad += _not_plain(plain, ended)
@@ -195,29 +192,19 @@ def _of_the_next_call(plain: Undisturbed, work: Path, wanted: Tree) -> Iterator[
 def _find_problems(plain: Undisturbed, work: Path) -> Iterator[str]:
     """Yield what `verify` finds at the outputs that a reader would find now: store and dataset, on disk and in the bucket."""
     objects = get_objects(plain.case.url).keys() if plain.case.url else ()
-    for name, mark in (("store", "store.json"), ("dataset", "log/")):
+    for name, mark in (("tcpipe-store", "calls/"), ("dataset", "current.")):
         if any(of.startswith(f"{name}/{mark}") for of in objects):
             yield from in_child(lambda name=name: _verify(f"{plain.case.url}/{name}"))
-    for name, mark in (("tcpipe-store", "store.json"), ("dataset", "dataset.json")):
+    for name, mark in (*((store, "calls") for store in STORES), ("dataset", "dataset.json")):
         if (work / name / mark).exists():
             yield from in_child(lambda name=name: _verify(work / name))
-
-
-def _select_damage(lines: list[str]) -> list[str]:
-    """Return the lines of `verify` without those on what a killed call left and no reader sees."""
-    unfinished = [line.partition(UNFINISHED_RUN)[0] for line in lines if UNFINISHED_RUN in line]
-    return [
-        line
-        for line in lines
-        if not any(of in line for of in LEFT_OVER) and not any(line.startswith(run) for run in unfinished)
-    ]
 
 
 def _verify(path: str | Path) -> list[str]:
     """Return what is not as it was written at a place."""
     from tcpipe.pipeline.verify import verify
 
-    return [f"verify: {problem}" for problem in verify(path).problems]
+    return [f"verify: {problem}" for problem in verify(path).problems if LEFT_OVER not in problem]
 
 
 @contextmanager

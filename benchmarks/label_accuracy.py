@@ -22,7 +22,7 @@ import pyproj
 
 from tcpipe import ingest
 from tcpipe.formats.recipe_toml import load_recipe
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
 from tcpipe.simulation import Truth, compute_true_cost, find_scenario, read_truth, simulate
 from tcpipe.simulation.sensors import EXACT_GNSS
@@ -32,7 +32,7 @@ from tcpipe.tables.columns import to_floats, to_integers
 LABELS = {"energy_joule": "J", "power_watt": "W", "velocity_mps": "m/s", "duration_s": "s"}
 
 
-def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
+def figures(run: StoredRun, truth: Truth) -> Iterator[tuple[str, str]]:
     """Yield what each figure is called, and the figure."""
     segments, track = run.segments(), run.track().table
     start_ns = to_integers(segments, "start_ns")

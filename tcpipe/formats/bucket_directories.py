@@ -1,4 +1,4 @@
-"""Directories with a sealed card (datasets, models, cost maps) in a bucket, fetched to this machine (ADR-30)."""
+"""Directories with a sealed card (datasets, models, cost maps) in a bucket, fetched to this machine (ADR-36)."""
 
 from __future__ import annotations
 

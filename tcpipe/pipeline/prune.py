@@ -22,7 +22,6 @@ from tcpipe.formats.place import Entry
 from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
-from tcpipe.formats.store_records import Output
 from tcpipe.pipeline.calls import PRUNE, OpenCall, format_bytes, is_alive, list_open_calls, record_call
 from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
@@ -174,11 +173,6 @@ def _find_references(state: State, forgotten: Collection[str]) -> dict[tuple[str
             hint = f"; if it no longer exists: 'tcpipe prune --forget {output.where}'" if inputs is None else ""
             found |= dict.fromkeys(output.runs, f"dataset {output.where} refers to it{hint}")
     return found
-
-
-def is_replaced(output: Output) -> bool:
-    """Return whether another dataset lies where this one was."""
-    return _read_inputs(output.where) not in (None, output.inputs)
 
 
 def _read_inputs(where: str) -> str | None:

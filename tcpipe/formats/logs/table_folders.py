@@ -9,13 +9,14 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tcpipe.formats.documents import parse_name
 from tcpipe.recipe import TableMapping
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
 """What a file of a table is called."""
 
-_STORE, _DATASET = {"store.json", "log"}, {"dataset.json", "samples.parquet"}
-"""What lies in a store, and in a dataset."""
+_DATASET = {"dataset.json", "samples.parquet"}
+"""What lies in a dataset."""
 
 Mappings = Mapping[str, TableMapping]
 """The recipe's tables, by name."""
@@ -98,10 +99,17 @@ def walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
                 elif not entry.name.startswith((".", "~")):
                     folders.append(entry.name)
         folders.sort()
-        if {*names, *folders} >= _STORE or {*names} >= _DATASET:
+        if {*names} >= _DATASET or ("calls" in folders and _is_store(place)):
             continue
         yield place, folders, names
         waiting += (f"{place}/{name}" for name in reversed(folders))
+
+
+def _is_store(place: str) -> bool:
+    """Return whether documents on calls lie in a folder: each call on a store writes one before it looks for logs."""
+    with suppress(OSError):
+        return any(parse_name("calls", file.name) for file in Path(place, "calls").iterdir())
+    return False
 
 
 def is_table(name: str) -> bool:

@@ -10,7 +10,8 @@ from random_messages import ROS1, Message, random_messages, write_bag, write_mca
 
 from tcpipe.errors import LogError, UsageError
 from tcpipe.pipeline.export import export
-from tcpipe.store import open_store
+from tcpipe.pipeline.ingest_run import tag_log
+from tcpipe.store import Store
 
 TYPES = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/BatteryState", "nav_msgs/msg/Path")
 
@@ -50,7 +51,7 @@ def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, kind):
     out = tmp_path / "out"
     out.mkdir()
     if kind == "store":
-        open_store(out, create=True)
+        tag_log(Store(out), Store(out).scan(), "0" * 64, {"load": "12"})
     else:
         (out / f"{'zarr' if kind == 'map' else kind.replace(' ', '-')}.json").write_text("{}")
     before = [*out.rglob("*")]

@@ -95,9 +95,9 @@ def test_a_recording_is_one_run_wherever_it_lies(drives, tmp_path):
         assert (made.status, again.status) == ("done", "unchanged")
         assert again.run.run_id == made.run.run_id
         assert again.same_as == str(first)
-        source = store.run_json(made.run.run_id).source
-        assert source.sha256_of == ("log" if first == here else "index")
-        assert made.run.run_id == f"run-{source.sha256[:8]}"
+        (run,) = store.find_runs(made.run.run_id)
+        assert run.facts.log.sha256_of == ("log" if first == here else "index")
+        assert made.run.run_id == f"run-{run.facts.log.sha256[:8]}"
         assert (again.run.driven_m, again.run.segments) == (made.run.driven_m, made.run.segments)
     assert len(inspect(store.root, recipe=Recipe()).runs) == 1
 
