@@ -228,8 +228,8 @@ def status(
 
     Without LOG: the logs and folders that the latest calls of ingest were given. The command does not read logs.
 
-    Exit code 3: a log failed, is damaged or gave no segments, a call was killed, a log waits for more than two nights, or files of a
-    run or a commit are missing, and nobody acknowledged it (tcpipe acknowledge).
+    Exit code 3: a log failed, is damaged or gave no segments, a call was killed, a log waits for more than two nights, tables of a run
+    are missing, a document is damaged, or a dataset failed or is out of date, and nobody acknowledged it (tcpipe acknowledge).
     """
     from tcpipe.formats.finding_lines import format_finding
     from tcpipe.formats.object_storage import is_url
@@ -318,7 +318,7 @@ def audit(
 def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
     """Acknowledge problems that somebody has checked: damaged logs, runs without segments, failed logs. tcpipe then stops reporting them.
 
-    Name a killed call as status prints it; name a waiting log or a damaged commit by its path.
+    Name a killed call as status prints it; name a waiting log or a damaged document by its path.
 
     If files of a run are missing, this gives up the run: the store no longer expects it.
 
