@@ -14,9 +14,11 @@ rm -f night/*.txt
 
 exit_code=0
 run() {
-    local printed
+    local printed ended
     printed=$(tcpipe "$@" 2>&1 | tee "night/$1.txt") && return # in memory: a full disk keeps no text
-    echo "tcpipe $*: exit code $?"
+    ended=$?
+    [ $exit_code = 1 ] || echo "$printed" | grep --max-count 1 '^tcpipe: ' # the first line of the mail is the reason
+    echo "tcpipe $*: exit code $ended"
     echo "$printed"
     exit_code=1
 }

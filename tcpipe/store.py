@@ -121,7 +121,7 @@ class Store:
     @contextmanager
     def new_map(self, name: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
         """Yield where a map is to be written, and beside it a picture ``.png``, and a function that puts both into the store."""
-        with self.place.workshop() as directory, convert_run_errors(self.place.where(name), directory):
+        with self.place.workshop() as directory, convert_run_errors(self.place.where(BLOBS), directory):
 
             def put(state: State) -> None:
                 files = compute_checksums(directory)

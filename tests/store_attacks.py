@@ -71,14 +71,15 @@ class World:
         """Requests until the call is killed."""
         self.actor: Actor | None = None
         self.baton = threading.Semaphore(0)
-        self.requests, self.writes = 0, list[int]()
-        """Of the call: how many it has made, and which of them wrote."""
+        self.requests, self.writes, self.namings = 0, list[int](), list[int]()
+        """Of the call: how many it has made, which of them wrote, and which wrote a document that names payload."""
 
     # ---- requests
 
-    def step(self, *, is_write: bool) -> None:
+    def step(self, where: str, *, is_write: bool) -> None:
         """Stop before a request."""
         self.writes += [self.requests] if is_write else []
+        self.namings += [self.requests] if is_write and {"runs", "maps"} & {*where.split("/")[:-1]} else []
         self.requests += 1
         if self.actor is not None:
             actor = self.actor
@@ -94,18 +95,18 @@ class World:
         """Let each request to the store, on disk or in a bucket in memory, begin with a `step`."""
         do, put_files = Place._do, Place.put_files
 
-        def do_stepwise(self_: Place, *args: object, **how: object) -> object:
+        def do_stepwise(self_: Place, name: str, *args: object, **how: object) -> object:
             if self_.path is not None:
-                self.step(is_write=how.get("what") == "written")
-            return do(self_, *args, **how)
+                self.step(name, is_write=how.get("what") == "written")
+            return do(self_, name, *args, **how)
 
         def put_stepwise(self_: Place, prefix: str, directory: Path) -> None:
             if self_.path is not None:
-                self.step(is_write=True)
+                self.step(prefix, is_write=True)
             put_files(self_, prefix, directory)
 
         def ask(url: str, request: Callable[[MemoryStore], object], *_: object, **how: object) -> object:
-            self.step(is_write=how.get("what") == "written")
+            self.step(url, is_write=how.get("what") == "written")
             return request(self.memory)
 
         monkeypatch.setattr(Place, "_do", do_stepwise)
@@ -126,7 +127,8 @@ class World:
         """Let a call run in a process of its own; return whether it was killed, before its request ``kill_at``."""
         documents._DECODED.clear()  # as another process: the number of requests depends on it
         self.pid = next(_PIDS)
-        self.alive, self.left, self.requests, self.writes = {self.pid}, kill_at, 0, []
+        self.alive, self.left = {self.pid}, kill_at
+        self.requests, self.writes, self.namings = 0, [], []
         try:
             act()
         except Killed:
@@ -139,7 +141,8 @@ class World:
         """Let calls run side by side: by ``turns`` (call, requests), then each to its end. Return their errors."""
         documents._DECODED.clear()
         actors = [Actor(self, act, next(_PIDS)) for act in acts]
-        self.alive, self.requests, self.writes = {actor.pid for actor in actors}, 0, []
+        self.alive = {actor.pid for actor in actors}
+        self.requests, self.writes, self.namings = 0, [], []
         for number, most in [*turns, *((number, 10**9) for number in range(len(acts)))]:
             actor = actors[number]
             while most >= 0 and not actor.done:  # it stops before the next one

@@ -145,9 +145,9 @@ def _check_usable(verdict: Mapping[str, Any], damage: Iterable[Mapping[str, Any]
     return _make_check("usable", lines, warn="not usable" not in grades.values(), **grades)
 
 
-def _check_as_written(log: dg.DagsterLogManager, path: str) -> dg.AssetCheckResult:
-    """Return whether an output reads again as it was written."""
-    verified = _run_command(log, "verify", path, codes={0, 1}).result
+def _check_as_written(log: dg.DagsterLogManager, name: str) -> dg.AssetCheckResult:
+    """Return whether an output, or a run of the store, reads again as it was written."""
+    verified = _run_command(log, "verify", name, codes={0, 1}).result
     return _make_check("as_written", verified["problems"], **verified["read"])
 
 
@@ -177,9 +177,9 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
         reason = "\n".join([*result["problems"], *result["notes"]]) or result["status"]
         raise dg.Failure(reason, allow_retries=result["transient"] or result["status"] == "waiting")
     made = result["run"]
-    budget = made["energy_budget"]
+    budget, segments = made["energy_budget"], made["tables"]["segments.parquet"]
     return dg.MaterializeResult(
-        data_version=dg.DataVersion(f"{made['run_id']}-{made['recipe_id']}-{made['segments_sha256'][:16]}"),
+        data_version=dg.DataVersion(f"{made['run_id']}-{made['recipe_id']}-{segments['sha256'][:16]}"),
         metadata={
             "run": made["run_id"],
             "recipe": made["recipe_id"],
@@ -191,7 +191,7 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
             **({"energy_floor": budget["total"]} if budget else {}),
         },
         check_results=[
-            _check_as_written(context.log, f"{_read_setting('TCPIPE_STORE', 'tcpipe-store')}/runs/{made['run_id']}"),
+            _check_as_written(context.log, f"{made['run_id']}/{made['recipe_id']}"),
             _check_usable(result["verdict"], made["damage"]),
         ],
     )

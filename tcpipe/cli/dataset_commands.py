@@ -21,6 +21,7 @@ from tcpipe.cli.options import (
     store_option,
 )
 from tcpipe.cli.output import (
+    find_recipe_with_source,
     print_json,
     print_line,
     print_lines,
@@ -69,11 +70,11 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
     """
     from tcpipe.pipeline.dataset.build import run_build_dataset
 
-    ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
+    path, source = find_recipe_with_source(cast("str | None", options.recipe))
     if not as_json:
         print_line(f"recipe: {source}")
     with show_progress("build-dataset", quiet=quiet) as shown:
-        result = run_build_dataset(replace(options, recipe=ruling))
+        result = run_build_dataset(replace(options, recipe=path))
         shown.problem(*result.finding_lines(problems=True))
     if as_json:
         print_json(replace(result, recipe=source))

@@ -27,6 +27,7 @@ from tcpipe.cli.options import (
     store_option,
 )
 from tcpipe.cli.output import (
+    find_recipe_with_source,
     print_json,
     print_json_line,
     print_line,
@@ -62,8 +63,8 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
     from tcpipe.pipeline.plan import LogLine
 
-    ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
-    options = replace(options, recipe=ruling)
+    path, source = find_recipe_with_source(cast("str | None", options.recipe))
+    options = replace(options, recipe=path)
     if not as_json:
         print_line(f"recipe: {source}")
     if dry_run:
@@ -97,7 +98,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
         summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=note))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
-        print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
+        print_json_line(SummaryLine(source, made, summary.exit_code, summary.is_transient, summary.results))
     else:
         if several:
             _print_findings(summary)
@@ -228,8 +229,8 @@ def status(
 
     Without LOG: the logs and folders that the latest calls of ingest were given. The command does not read logs.
 
-    Exit code 3: a log failed, is damaged or gave no segments, a call was killed, a log waits for more than two nights, tables of a run
-    are missing, a document is damaged, or a dataset failed or is out of date, and nobody acknowledged it (tcpipe acknowledge).
+    Exit code 3: a log failed, is damaged or gave no segments, a call was killed, a log waits for more than two nights, files of a run
+    are missing, or a dataset is out of date or its last call failed, and nobody acknowledged it (tcpipe acknowledge).
     """
     from tcpipe.formats.finding_lines import format_finding
     from tcpipe.formats.object_storage import is_url
@@ -312,13 +313,13 @@ def audit(
 
 
 @click.command()
-@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL...", shell_complete=complete_runs)
+@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL|DATASET...", shell_complete=complete_runs)
 @store_option
 @json_option
 def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
-    """Acknowledge problems that somebody has checked: damaged logs, runs without segments, failed logs. tcpipe then stops reporting them.
+    """Acknowledge problems that somebody has checked: damaged or failed logs, runs without segments. tcpipe then stops reporting them.
 
-    Name a killed call as status prints it; name a waiting log or a damaged document by its path.
+    Name a killed call as status prints it; name a waiting log, a damaged document or a dataset by its path.
 
     If files of a run are missing, this gives up the run: the store no longer expects it.
 

@@ -26,12 +26,20 @@ if TYPE_CHECKING:
     from tcpipe.recipe import Recipe
 
 
-def resolve_recipe_with_source(explicit: str | None) -> tuple[Recipe, str]:
-    """Return the recipe that rules here and where it comes from, for printing."""
-    from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+def find_recipe_with_source(explicit: str | None) -> tuple[Path | None, str]:
+    """Return the file of the recipe that rules here, None for the defaults, and where the recipe comes from, for printing."""
+    from tcpipe.formats.recipe_toml import find_recipe
 
     path = find_recipe(None if explicit is None else Path(explicit), Path.cwd())
-    return load_recipe(path), "built-in defaults" if path is None else str(path)
+    return path, "built-in defaults" if path is None else str(path)
+
+
+def resolve_recipe_with_source(explicit: str | None) -> tuple[Recipe, str]:
+    """Return the recipe that rules here and where it comes from, for printing."""
+    from tcpipe.formats.recipe_toml import load_recipe
+
+    path, source = find_recipe_with_source(explicit)
+    return load_recipe(path), source
 
 
 @contextmanager

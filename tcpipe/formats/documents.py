@@ -121,7 +121,7 @@ class State:
     def runs(self) -> dict[str, RunFacts]:
         """Runs by key, with tags and supersession; those that are superseded or pruned too."""
         if self._joined is None:
-            self._joined = _join_runs(self.facts)
+            self._joined = self._join_runs()
         return self._joined
 
     @property
@@ -158,6 +158,29 @@ class State:
             Problem(make_finding("document-damaged", Subject("file", name)), name, (name,))
             for name in sorted(self.damaged)
         ]
+
+    def _join_runs(self) -> dict[str, RunFacts]:
+        """Return the runs with the tags of their logs, and with the run that supersedes them.
+
+        Of runs of one robot and recipe that begin with the same measurements the longest recording counts whose payload is there.
+        """
+        longest, joined = dict[Beginning, RunFacts](), dict[str, RunFacts]()
+        rows: Mapping[str, RunFacts] = self.facts["runs"]
+        tags: Mapping[str, Tags] = self.facts["tags"]
+        tags_by_log = {each.log: each.tags for each in tags.values()}
+        for row in rows.values():
+            if (beginning := _find_beginning(row)) is not None and self.has_payload(row):
+                other = longest.get(beginning)
+                longest[beginning] = row if other is None or _rank_recording(row) > _rank_recording(other) else other
+        for key, row in rows.items():
+            beginning = _find_beginning(row)
+            winner = row if beginning is None else longest.get(beginning, row)
+            is_superseded = winner.log.sha256 != row.log.sha256 and _rank_recording(winner) > _rank_recording(row)
+            by = winner.run_id if is_superseded else None
+            its_tags = tags_by_log.get(row.log.sha256, {})
+            is_settled = row.superseded_by == by and row.tags == its_tags
+            joined[key] = row if is_settled else replace(row, superseded_by=by, tags=its_tags)
+        return joined
 
     def list_rows(self, run_id: str | None = None) -> list[RunFacts]:
         """Return the runs by run and recipe, or those of one run: one for each recipe."""
@@ -200,28 +223,6 @@ class State:
             self.blobs |= {row.blob, row.streams_blob} - {""}
         if name.kind in ("runs", "tags"):
             self._joined = None
-
-
-def _join_runs(facts: Mapping[Kind, Mapping[str, Any]]) -> dict[str, RunFacts]:
-    """Return the runs with the tags of their logs, and with the run that supersedes them.
-
-    Of runs of one robot and recipe that begin with the same measurements the longest recording counts.
-    """
-    longest, joined = dict[Beginning, RunFacts](), dict[str, RunFacts]()
-    tags: Mapping[str, Tags] = facts["tags"]
-    tags_by_log = {each.log: each.tags for each in tags.values()}
-    for row in facts["runs"].values():
-        if (beginning := _find_beginning(row)) is not None:
-            other = longest.get(beginning)
-            longest[beginning] = row if other is None or _rank_recording(row) > _rank_recording(other) else other
-    for key, row in facts["runs"].items():
-        beginning = _find_beginning(row)
-        winner = row if beginning is None else longest[beginning]
-        by = None if winner.log.sha256 == row.log.sha256 else winner.run_id
-        its_tags = tags_by_log.get(row.log.sha256, {})
-        is_settled = row.superseded_by == by and row.tags == its_tags
-        joined[key] = row if is_settled else replace(row, superseded_by=by, tags=its_tags)
-    return joined
 
 
 Beginning: TypeAlias = tuple[str, str, int, str]

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.store_records import Problem
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, EnergyBudget, LabelFacts, PhysicsFit, StageFacts
-from tcpipe.tables.findings import Finding, StageReport, Verdict, judge, select_findings
+from tcpipe.tables.findings import Finding, StageReport, Verdict, judge, select_findings, select_problems
 from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
 
 
@@ -136,6 +137,12 @@ class RunFacts:
     def defect(self) -> Literal["damaged", "empty", ""]:
         """The defect of the run in one word."""
         return "damaged" if self.damage else "empty" if self.is_empty else ""
+
+
+def find_problems(row: RunFacts) -> tuple[Problem, ...]:
+    """Return what is wrong with a run: damage of its log, or that it has no segments."""
+    log = row.log
+    return tuple(Problem(finding, log.sha256, log.paths, row.run_id) for finding in select_problems(row.findings))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import Any
+from typing import TypeAlias
 
 from tcpipe.formats.integrity import Checksum
-from tcpipe.tables.findings import LEFT_OUT, Finding
+from tcpipe.tables.findings import LEFT_OUT, Finding, Subject
 
 _UNFINISHED = ".active"
 """Ending of a ROS 1 bag that is being recorded, or was when its recorder died."""
+
+
+Options: TypeAlias = Mapping[str, str | int | float | bool | list[str] | dict[str, str]]
+"""Options of a call as JSON values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +62,11 @@ class Problem:
         return self.run_id or " + ".join(self.log) or self.finding.subject.name
 
 
+def make_failure(content: str, log: tuple[str, ...]) -> Problem:
+    """Return the problem that a log failed because of its content."""
+    return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
+
+
 @dataclass(frozen=True, slots=True)
 class Tags:
     """The tags of a log, which hold under every recipe."""
@@ -99,7 +108,7 @@ class Output:
     """Digests of the parts of that: runs, maps, recipe and so on."""
     runs: tuple[tuple[str, str], ...] = ()
     """Runs and recipes of which it was made: `prune` keeps them."""
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Options = field(default_factory=dict)
     """Options of the last call, by which it can be planned again."""
     exit_code: int = 0
     message: str = ""
@@ -133,7 +142,7 @@ class Call:
     version: str
     works_on: tuple[str, ...] = ()
     """Logs and folders as they were given, or the output, in full."""
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Options = field(default_factory=dict)
     """Options that distinguish its work from that of another call."""
     process: Process | None = None
     begin: str = ""

@@ -175,13 +175,18 @@ def record_call(
     try:
         yield running
     except Exception as error:
-        lines = error.problems if isinstance(error, TcpipeError) else (f"{type(error).__name__}: {error}",)
-        running.result |= {"exit_code": getattr(error, "exit_code", 1), "message": "\n".join(lines)}
+        running.result |= describe_error(error)
         end()
         raise
     end()
     if running.is_whole:
         _close_killed_calls(running)
+
+
+def describe_error(error: Exception) -> dict[str, Any]:
+    """Return the exit code and the message of a call that ended by an error, as its record has them."""
+    lines = error.problems if isinstance(error, TcpipeError) else (f"{type(error).__name__}: {error}",)
+    return {"exit_code": getattr(error, "exit_code", 1), "message": "\n".join(lines)}
 
 
 def _close_killed_calls(running: RunningCall) -> None:
@@ -236,7 +241,7 @@ class Rates:
 
 
 MEASURED = {INGEST: Rates(0.2e-6, 1.1, 0.7), BUILD: Rates(180e-6, 4_300.0, 1.5)}
-"""Of drives without a camera, on one core of 2025, and of patches of three layers and 40 px (docs/how-to/nights.md)."""
+"""Of drives without a camera, on one core of 2025, and of patches of three layers and 40 px (docs/explanation/scale.md)."""
 
 
 @dataclass(frozen=True, slots=True)

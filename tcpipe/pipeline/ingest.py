@@ -5,27 +5,29 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, StoreError, UsageError, clean_line, list_first
+from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, clean_line, list_first
 from tcpipe.execution import refuse_import_of_script, run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key
+from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
-from tcpipe.formats.recipe_toml import load_profiles, resolve_recipe
-from tcpipe.formats.store_records import Failure, find_lineage
+from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
+from tcpipe.formats.runs import find_problems
+from tcpipe.formats.store_records import Failure, find_lineage, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_queue import Item, iterate_rounds, make_tasks
 from tcpipe.pipeline.log_sources import FoundLogs, find_failure, find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
-from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
+from tcpipe.pipeline.problems import is_acknowledged
 from tcpipe.recipe import TimeWindow
 from tcpipe.store import is_store, open_store
 from tcpipe.tables.findings import select_problems
@@ -45,6 +47,11 @@ class IngestSummary:
     results: tuple[IngestResult, ...] = field(default_factory=tuple)
 
     @property
+    def is_transient(self) -> bool:
+        """Whether a log failed for a reason that may pass."""
+        return any(result.transient for result in self.results)
+
+    @property
     def exit_code(self) -> int:
         """0 nothing is wrong, or nothing that is news; 1 all failed; 3 some failed, are damaged or empty."""
         if not any(result.is_new_problem for result in self.results):
@@ -61,17 +68,21 @@ class SummaryLine:
     store: str | None
     """None where no store was made."""
     exit_code: int
+    transient: bool
+    """Whether a log failed for a reason that may pass: the same call may succeed later."""
     results: tuple[IngestResult, ...]
     kind: Literal["summary"] = "summary"
 
 
 @dataclass(frozen=True, slots=True)
 class CallOptions:
-    """Options of a call of ingest by which `tcpipe status` asks again what it would find."""
+    """Options of a call of ingest: by them `tcpipe status` asks again what it would find, and other work is told from the same."""
 
     robot: str | None = None
     as_one: bool = False
     message_definitions: str | None = None
+    recipe: str | None = None
+    """Key of the recipe that ruled; None where it could not be read. `tcpipe status` asks under the one that rules then."""
 
 
 def run_ingest(options: IngestOptions) -> IngestSummary:
@@ -85,22 +96,24 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     options = replace(options, logs=list(options.logs))
     given = tuple(make_absolute(path) for path in options.logs if not is_presigned(path))  # signed URLs are not stored
     definitions = options.message_definitions and str(Path(options.message_definitions).absolute())
-    how = CallOptions(options.robot, options.as_one, definitions or None)
+    key = None
+    with suppress(TcpipeError):  # what is wrong with the recipe is an error of the call, which is recorded
+        ruling = resolve_recipe(options.recipe)
+        options, key = replace(options, recipe=ruling), ingest_key(ruling)
+    how = CallOptions(options.robot, options.as_one, definitions or None, key)
     is_new = not is_store(opened.root)
     if is_new and options.existing_store:
         raise StoreError(f"{opened.root}: there is no store here (--existing-store); is a disk not mounted?")
-    with record_call(opened, INGEST, given, how, jobs=options.jobs) as call:
-        if is_new and options.on_note:
-            options.on_note(f"new store: {opened.root}")
-        with make_scratch_directory() as staging:
-            return _ingest_all(call, options, staging)
+    recorded = record_call(opened, INGEST, given, how, jobs=options.jobs)
+    with recorded as call, make_scratch_directory() as staging:
+        return _ingest_all(call, options, staging, is_new=is_new)
 
 
 ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
-def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path) -> IngestSummary:
+def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_new: bool) -> IngestSummary:
     ruling, shard, store = resolve_recipe(options.recipe), options.shard, call.store
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := load_profiles(ruling).robots):
@@ -128,6 +141,8 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path) -> Ing
         call.begin()
         if call.error is not None:  # before logs are read for hours
             raise call.error
+        if is_new and options.on_note:
+            options.on_note(f"new store: {store.root}")
         tell(_iterate_results(call, steps, jobs=options.jobs, cluster=options.cluster))
     summary = IngestSummary(store.root, tuple(results[index] for index in sorted(results)))
     call.is_whole = shard is None
@@ -163,7 +178,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
             logger.warning(text, pattern, list_first(run_ids, _MOST_RUNS))
 
 
-def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[str, Any]:
+def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[str, Json]:
     """Return what the record of a call holds of its work."""
     done = [result for result in summary.results if result.status in ("done", "damaged", "empty")]
     sizes = {task.source.name: task.source.size_bytes for task in tasks}

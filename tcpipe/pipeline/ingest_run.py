@@ -36,7 +36,7 @@ from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_resul
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store, name_run
-from tcpipe.tables.arrays import encode_rows
+from tcpipe.tables.arrays import encode_rows, number_column
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import (
@@ -262,7 +262,7 @@ def _take_first_changes(table: pa.Table) -> pa.Table:
         if field.type == pa.float64():
             values = to_floats(table, field.name)
             is_new[1:] |= (values[1:] != values[:-1]) & ~(np.isnan(values[1:]) & np.isnan(values[:-1]))
-    return table.take(np.flatnonzero(is_new)[:_FIRST_ROWS])
+    return table.take(number_column(np.flatnonzero(is_new)[:_FIRST_ROWS]))
 
 
 def write_tables(directory: Path, run: Run, track: Track, masked: MaskedTrack, labelled: LabelledSegments) -> None:

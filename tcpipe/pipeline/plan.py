@@ -16,10 +16,9 @@ from tcpipe.errors import TcpipeError, clean_line, hide_secrets
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import Call, Failure
+from tcpipe.formats.runs import RunFacts, find_problems
+from tcpipe.formats.store_records import Call, Failure, make_failure
 from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
-from tcpipe.pipeline.problems import find_problems, make_failure
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding, Verdict, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION, RESULTS_VERSION

@@ -9,12 +9,12 @@ from pathlib import Path
 from tcpipe.errors import UsageError, list_first
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
-from tcpipe.formats.runs import Run, RunFacts
-from tcpipe.formats.store_records import Call, Problem
-from tcpipe.pipeline.calls import ACKNOWLEDGE, INGEST, close_call, list_open_calls, record_call
+from tcpipe.formats.runs import Run, RunFacts, find_problems
+from tcpipe.formats.store_records import Call, Problem, make_failure
+from tcpipe.pipeline.calls import ACKNOWLEDGE, BUILD, INGEST, close_call, list_open_calls, record_call
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding, Subject, make_finding, select_problems
+from tcpipe.tables.findings import Subject, make_finding
 
 _MOST_CANDIDATES = 10
 
@@ -27,17 +27,6 @@ class Acknowledged:
     before: tuple[Problem, ...]
 
 
-def find_problems(row: RunFacts) -> tuple[Problem, ...]:
-    """Return what is wrong with a run: damage of its log, or that it has no segments."""
-    log = row.log
-    return tuple(Problem(finding, log.sha256, log.paths, row.run_id) for finding in select_problems(row.findings))
-
-
-def make_failure(content: str, log: tuple[str, ...]) -> Problem:
-    """Return the problem that a log failed because of its content."""
-    return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
-
-
 def find_incomplete_runs(state: State, run_id: str | None = None) -> Iterator[Problem]:
     """Yield the runs, or those under one name, whose folders of payload are gone."""
     for row in state.list_rows(run_id):
@@ -45,6 +34,16 @@ def find_incomplete_runs(state: State, run_id: str | None = None) -> Iterator[Pr
             folder = row.blob if row.blob not in state.blobs else row.streams_blob
             finding = make_finding("run-incomplete", Subject("run", row.run_id), names={"file": f"blobs/{folder}"})
             yield Problem(finding, f"{row.run_id}/{row.recipe_id} {row.blob}", run_id=row.run_id)
+
+
+def find_incomplete_maps(state: State, name: str | None = None) -> Iterator[Problem]:
+    """Yield the maps, or the one of a name, whose folder of payload is gone."""
+    for record in state.maps.values():
+        if name in (None, record.name) and record.blob not in state.blobs:
+            finding = make_finding(
+                "map-incomplete", Subject("map", record.name), names={"file": f"blobs/{record.blob}"}
+            )
+            yield Problem(finding, f"{record.name} {record.blob}")
 
 
 def make_waiting(source: LogSource, state: str) -> Problem:
@@ -79,23 +78,43 @@ def find_known_problems(state: State) -> Iterator[Problem]:
     yield from state.problems
 
 
+def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
+    """Yield the outputs whose last call failed, or that would be made of something else now and no call makes."""
+    if not state.outputs:
+        return
+    from tcpipe.pipeline.dataset.build import find_changed_parts  # noqa: PLC0415  only for stores with datasets
+
+    running = [call.call for call in list_open_calls(state) if call.state != "killed" and call.call.command == BUILD]
+    for output in state.outputs.values():
+        subject = Subject("dataset", output.where)
+        if any(output.where in call.works_on for call in running):
+            continue
+        if output.exit_code not in (0, 3):
+            names = {"message": output.message.partition("\n")[0], "at": output.at[:19]}
+            yield Problem(make_finding("output-failed", subject, names=names), f"{output.where} {output.at}")
+        elif changes := find_changed_parts(store, state, output):
+            found = make_finding("output-outdated", subject, names={"changes": changes})
+            yield Problem(found, f"{output.where} {output.inputs}")
+
+
 def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Acknowledged:
-    """Acknowledge the problems of runs, logs and killed calls: they cause no exit code 3 any more, until the content is another.
+    """Acknowledge the problems of runs, logs, datasets and killed calls: they cause no exit code 3 any more, until the content is another.
 
     A run whose tables are missing is given up: it is not expected any more. A killed call counts as ended.
 
-    Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is none of a run or log with a problem, or of
-    several logs; nothing was acknowledged then.
+    Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is none of a run, log or dataset with a
+    problem, or of several logs; nothing was acknowledged then.
     """
     opened = open_store(store)
     with record_call(opened, ACKNOWLEDGE, names) as call:
         state = call.state
-        known = {problem.key: problem for problem in find_known_problems(state)}
+        known = {problem.key: problem for problem in (*find_known_problems(state), *find_stale_outputs(opened, state))}
         chosen, wrong = dict[str, Problem](), list[str]()
         for name in dict.fromkeys(names):
             found = (
                 _name_problems(name, known.values(), state)
                 or list(find_incomplete_runs(state, name))
+                or list(find_incomplete_maps(state, name))
                 or _make_missing_problem(name, state)
                 or _make_waiting_problem(name, state)
             )
@@ -169,7 +188,7 @@ def _describe_no_match(
     if state.list_rows(name):
         return f"{name}: this run has no known problem; there is nothing to acknowledge"
     listed = f"known problems: {_format_list(candidates)}" if candidates else "there are no known problems"
-    return f"{name}: is no run or log with a known problem in {root}; {listed}"
+    return f"{name}: is no run, log or dataset with a known problem in {root}; {listed}"
 
 
 def _format_list(problems: Sequence[Problem]) -> str:

@@ -22,7 +22,6 @@ from tcpipe.formats.place import Entry
 from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
-from tcpipe.formats.store_records import Output
 from tcpipe.pipeline.calls import PRUNE, OpenCall, format_bytes, is_alive, list_open_calls, record_call
 from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
@@ -67,8 +66,9 @@ class Pruned:
         if self.waits_for is not None:
             return clean_lines([f"{self.store}: nothing is removed: {self.waits_for}"])
         verb = "would be removed" if self.dry_run else "removed"
-        documents = f" and {self.documents} replaced documents" if self.documents else ""
-        head = f"{self.store}: {len(self.removed)}{documents} {verb}, {format_bytes(self.size_bytes)}"
+        counts = [(len(self.removed), "item"), (self.documents, "replaced document")]
+        what = " and ".join(f"{count} {name}{'s' * (count != 1)}" for count, name in counts if count)
+        head = f"{self.store}: {what} {verb}, {format_bytes(self.size_bytes)}"
         if not (self.removed or self.documents):
             head = f"{self.store}: nothing to do: there is nothing to remove"
         return clean_lines([head, *map(str, (*self.removed, *self.kept))])

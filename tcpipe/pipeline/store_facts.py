@@ -15,10 +15,10 @@ from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import Output
+from tcpipe.formats.runs import RunFacts, find_problems
+from tcpipe.formats.store_records import Output, make_failure
 from tcpipe.pipeline.plan import list_transient_failures
-from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
+from tcpipe.pipeline.problems import is_acknowledged
 from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
 from tcpipe.report.store_report import FailedLog, RunKey, StoredDataset, StoreFacts

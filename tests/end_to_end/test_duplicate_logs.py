@@ -16,8 +16,7 @@ from tcpipe.store import Store
 
 
 def take(store):
-    chosen = choose_runs(store, load_recipe(None), robot=None, tags={})
-    return remove_duplicates(store, chosen.runs, chosen.logs)
+    return remove_duplicates(choose_runs(store, load_recipe(None), state=store.scan(), robot=None, tags={}).runs)
 
 
 def trim(message, begin, late_ns):

@@ -117,7 +117,10 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
     ]
     (run_id,) = {run.run_id for run in Store(tmp_path / "tcpipe-store").runs() if run.run_id.startswith("cut-")}
     refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
-    assert f"nosuch: is no run or log with a known problem in tcpipe-store; known problems: {junk}, {run_id}" in refused
+    assert (
+        f"nosuch: is no run, log or dataset with a known problem in tcpipe-store; known problems: {junk}, {run_id}"
+        in refused
+    )
     done = tcpipe("acknowledge", run_id, "logs/junk.bag", cwd=tmp_path)
     assert (done.returncode, f"acknowledged: {run_id}: " in done.stdout, "[log-damaged]" in done.stdout) == (
         0,

@@ -8,6 +8,9 @@ import pytest
 from installed_command import plain_lines, tcpipe
 from synthetic_store import add_run, box, lanes, region_file, segments, small_store
 
+from tcpipe.formats.documents import make_key
+from tcpipe.formats.recipe_toml import ingest_key
+from tcpipe.formats.store_records import Output
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
 
@@ -66,17 +69,25 @@ def test_a_map_a_store_and_a_cell_are_what_planning_takes(place: Path) -> None:
     assert again["config"]["seed"] == 3
 
 
-def test_prune_keeps_and_forgets_what_it_is_told(tmp_path: Path) -> None:
+def test_prune_takes_runs_a_recipe_and_datasets_to_forget(tmp_path: Path) -> None:
     store = open_store(tmp_path / "store", create=True)
     for recipe in (replace(Recipe(), read=ReadConfig(ignore_topics=["/none"])), Recipe()):
         add_run(store, "a", segments("a", *lanes(0.0, -10.0, 10.0)), recipe=recipe)
+    add_run(store, "b", segments("b", *lanes(1.0, -10.0, 10.0)))
     (tmp_path / "ruling.toml").touch()
-    prune = ("prune", "--store", "store", "--recipe", "ruling.toml", "--min-age", "1d")
-    assert answer(*prune, "--keep", "a", cwd=tmp_path)["removed"] == []
-    planned = answer(*prune, "--dry-run", cwd=tmp_path)["removed"]
-    assert len(planned) == 1
+    older = next(run for run in store.runs() if run.facts.ingest_key != ingest_key(Recipe()))
+    moved = Output(where=str(tmp_path / "moved"), inputs="0" * 64, runs=(("a", older.recipe_id),))
+    store.put(store.scan(), "outputs", make_key(moved.where), moved)
+    prune = ("prune", "--store", "store", "--recipe", "ruling.toml")
+
+    def list_removed(*arguments: str) -> list[str]:
+        return [each["name"] for each in answer(*prune, *arguments, cwd=tmp_path)["removed"]]
+
+    assert list_removed() == [], "a dataset refers to the run of the older recipe"
     assert "gone" in plain_lines(tcpipe(*prune, "--forget", "gone", cwd=tmp_path), 2, most=1)
-    assert answer(*prune, cwd=tmp_path)["removed"] == planned
+    assert list_removed("--forget", "moved", "--dry-run") == [older.name]
+    assert list_removed("--forget", "moved") == [older.name]
+    assert [name.split("/")[0] for name in list_removed("b")] == ["b"]
 
 
 def test_robot_recipe_and_age_are_heard(place: Path, tmp_path: Path) -> None:
@@ -107,6 +118,25 @@ def test_the_store_is_named_in_the_same_way_everywhere(place: Path) -> None:
         assert len(outputs) == 1 or command[0] == "report", command
         assert {by_option.returncode, by_variable.returncode, as_before.returncode} == {0}, by_option.stderr
     twice = tcpipe("verify", "store", "--store", "store", cwd=place)
-    assert (twice.returncode, twice.stderr) == (2, "tcpipe: store: PATH and --store are given; give one of them\n")
+    said = "tcpipe: store: is a path, and --store is where a run is looked up; give one of them\n"
+    assert (twice.returncode, twice.stderr) == (2, said)
     nowhere = tcpipe("verify", cwd=place)
     assert (nowhere.returncode, nowhere.stdout) == (2, "")
+
+
+def test_a_run_is_named_with_its_store(place: Path) -> None:
+    for command in ("inspect", "verify", "report"):
+        done = tcpipe(command, "north", "--store", "store", cwd=place)
+        assert done.returncode == 0, done.stderr
+        unknown = tcpipe(command, "nobody", "--store", "store", cwd=place)
+        assert "no such run in store" in plain_lines(unknown, 2, most=1)
+
+
+def test_the_page_of_a_store_sums_over_the_runs_of_the_recipe(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.toml").write_text('[read]\nignore_topics = ["/none"]\n')
+    page = place / "store" / "report.html"
+    for recipe, counted in ((place / "none.toml", True), (tmp_path / "other.toml", False)):
+        recipe.touch()
+        done = tcpipe("report", "store", "--no-runs", "--recipe", recipe, cwd=place)
+        assert done.returncode == 0, done.stderr
+        assert ("other recipe" not in page.read_text()) is counted

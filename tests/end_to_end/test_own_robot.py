@@ -91,7 +91,11 @@ def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path)
         == 0.6
     )
     with pytest.raises(DatasetError, match="no run of robot 'scout'"):  # the default recipe's runs know no scout
-        choose_runs(Store(tmp_path / "store"), Recipe(), robot="scout", tags={})
+        choose(tmp_path / "store", Recipe(), "scout")
+
+
+def choose(store, recipe, robot):
+    return choose_runs(Store(store), recipe, state=Store(store).scan(), robot=robot, tags={})
 
 
 def test_another_voltage_range_is_another_run(drive, tmp_path):
@@ -116,12 +120,9 @@ def test_two_robots_of_a_recipe_are_not_pooled_unasked(drive, tmp_path):
     two.write_text(recipe.read_text() + "\n[robots.rover]\nmax_velocity_mps = 1.0\n")
     for robot in ("scout", "rover"):
         ingest([log, battery], store=tmp_path / "store", recipe=two, robot=robot, as_one=True)
-    store = Store(tmp_path / "store")
     with pytest.raises(DatasetError, match="runs of 2 robots \\(rover, scout\\)"):
-        choose_runs(store, load_recipe(two), robot=None, tags={})
-    assert {run.manifest.robot for run in choose_runs(store, load_recipe(two), robot="rover", tags={}).runs} == {
-        "rover"
-    }
+        choose(tmp_path / "store", load_recipe(two), None)
+    assert {run.facts.robot for run in choose(tmp_path / "store", load_recipe(two), "rover").runs} == {"rover"}
 
 
 def test_a_name_that_neither_the_recipe_nor_the_package_has(drive, tmp_path):

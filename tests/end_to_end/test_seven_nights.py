@@ -9,10 +9,12 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -25,7 +27,7 @@ from tcpipe.simulation import Faults, make_tiny, messages, simulate
 ROOT = Path(__file__).resolve().parents[2]
 PIPELINES = ROOT / "pipelines"
 _DAY_S = 86_400
-_DISK_BYTES = 64 << 20
+_DISK_BYTES, _ROOM_BYTES = 64 << 20, 128 << 10
 
 CLOCK = """# Python imports this module when it starts: tcpipe sees a clock that is ahead.
 import datetime
@@ -86,12 +88,12 @@ def data(tmp_path: Path) -> Iterator[Path]:
 
 @contextmanager
 def full_disk(data: Path) -> Iterator[str]:
-    """Fill the disk; yield what a job has to begin with where only a limit on the size of files can stand in for that."""
+    """Fill the disk but for a few documents; yield what a job has to begin with where only a limit on the size of files can stand in."""
     if not data.is_mount():
         yield "ulimit -f 16; "
         return
     filler = data / "filler"
-    filler.write_bytes(bytes(shutil.disk_usage(data).free))
+    filler.write_bytes(bytes(shutil.disk_usage(data).free - _ROOM_BYTES))
     yield ""
     filler.unlink()
 
@@ -146,10 +148,19 @@ class Crontab:
             mail = job.communicate(timeout=HANGS_S)[0]
         return mail, job.returncode
 
-    def run_by_hand(self, *arguments: str) -> None:
-        """Run a command as the user does in the morning, who works in the directory."""
+    def run_by_hand(self, *arguments: str, exit_code: int = 0) -> str:
+        """Run a command as the user does in the morning, who works in the directory; return what it printed on stdout."""
         environment = self._environment | {"CLOCK_AHEAD_S": str(self._night * _DAY_S + _DAY_S // 4)}
-        subprocess.run([COMMAND, *arguments], cwd=self.data, env=environment, capture_output=True, check=True)
+        done = subprocess.run(
+            [COMMAND, *arguments], cwd=self.data, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == exit_code, done.stderr
+        return done.stdout
+
+    def read_latest_call(self, command: str) -> dict[str, Any]:
+        """Return the record of the latest call of a command."""
+        history = json.loads(self.run_by_hand("status", "--json", exit_code=3))["history"]
+        return next(call for call in history if call["command"] == command)
 
     def change_program(self, old: str, new: str) -> None:
         """Edit nightly.sh."""
@@ -171,6 +182,20 @@ def crontab(data: Path, tmp_path: Path) -> Crontab:
     return Crontab(data, tmp_path)
 
 
+SLEEPER = """
+import os
+import time
+from pathlib import Path
+
+from tcpipe.pipeline.calls import INGEST, record_call
+from tcpipe.pipeline.ingest import CallOptions
+from tcpipe.store import open_store
+
+with record_call(open_store(os.environ["TCPIPE_STORE"]), INGEST, [str(Path("recordings").absolute())], CallOptions()):
+    print("reading third.mcap", flush=True)
+    time.sleep(3600)
+"""
+"""A call of ingest that hangs."""
 Drives = dict[str, Path]
 SILENT = ("", 0)
 
@@ -180,8 +205,8 @@ def lack_the_store(crontab: Crontab, drives: Drives) -> None:
     (crontab.data / "tcpipe.toml").write_text('[split]\nholdout = "sample"\n')
     shutil.copy(drives["first"], crontab.recordings / "first.mcap")
     mail, exit_code = crontab.run()
+    assert mail.startswith(f"tcpipe: {crontab.data}/store: there is no store here (--existing-store)")
     assert "tcpipe ingest recordings --existing-store" in mail
-    assert f"{crontab.data}/store" in mail
     assert (exit_code, (crontab.data / "store").exists()) == (1, False)
     layers = {layer: drives[layer] for layer in ("height", "terrain", "classes")}
     add_map("site", **layers, store=crontab.data / "store")
@@ -213,7 +238,10 @@ def bring_a_second_robot(crontab: Crontab, drives: Drives) -> None:
     assert "tcpipe build-dataset dataset --jobs 1 --quiet: exit code 1\n" in mail
     assert "runs of 2 robots (husky, jackal); name one with --robot" in mail
     assert ("tcpipe ingest" in mail, crontab.samples) == (False, before)
-    # When status knows outputs: assert "tcpipe status: exit code 3\n" in mail
+    assert "tcpipe status: exit code 3\n" in mail
+    assert crontab.run_by_hand("status", exit_code=3).startswith(f"to do now: {crontab.data}/dataset: the last call")
+    crontab.run_by_hand("acknowledge", "dataset")
+    assert crontab.run_by_hand("status").startswith("nothing to do")
     crontab.change_program("build-dataset dataset", "build-dataset dataset --robot husky")
 
 
@@ -226,8 +254,11 @@ def change_the_recipe(crontab: Crontab, _: Drives) -> None:
     assert "tcpipe build-dataset dataset --robot husky --jobs 1 --quiet: exit code 2\n" in mail
     assert "recipe mask.require_full_speed: yes in the dataset, no now" in mail
     assert ("tcpipe ingest" in mail, crontab.samples) == (False, before)
-    # When status knows outputs: assert "tcpipe status: exit code 3\n" in mail
+    assert "tcpipe status: exit code 3\n" in mail
+    assert crontab.read_latest_call("build-dataset")["exit_code"] == 2
+    assert crontab.run_by_hand("status", exit_code=3).startswith(f"to do now: {crontab.data}/dataset: the last call")
     crontab.run_by_hand("build-dataset", "dataset", "--robot", "husky", "--force")
+    assert crontab.run_by_hand("status").startswith("nothing to do")
 
 
 def fill_the_disk(crontab: Crontab, drives: Drives) -> None:
@@ -237,9 +268,12 @@ def fill_the_disk(crontab: Crontab, drives: Drives) -> None:
         mail, exit_code = crontab.run(limit)
     assert "tcpipe ingest recordings" in mail
     assert "third.mcap: " in mail
-    assert ("No space left on device" if crontab.data.is_mount() else "File too large") in mail
-    # When calls are recorded with their message: assert "tcpipe status: exit code 3\n" in mail
+    reason = "No space left on device" if crontab.data.is_mount() else "File too large"
+    assert reason in mail
+    assert "tcpipe status: exit code 3\nto do now: correct the cause, then tcpipe ingest (1 logs): " in mail
     assert exit_code == 1
+    call = crontab.read_latest_call("ingest")
+    assert (call["exit_code"], reason in call["message"]) == (3, True)
 
 
 def archive_a_log(crontab: Crontab, _: Drives) -> None:
@@ -252,9 +286,12 @@ def archive_a_log(crontab: Crontab, _: Drives) -> None:
 
 
 def hang(crontab: Crontab, _: Drives) -> None:
-    """The next night does not start beside one that hangs, and shows what that one printed; the night after is as any other."""
+    """The next night does not start beside one that hangs, and shows what that one printed and which call runs.
+
+    The night after is as any other.
+    """
     complete = crontab.samples
-    sleeper = crontab.add_program("tcpipe", "#!/bin/sh\necho reading third.mcap\nexec sleep 3600\n")
+    sleeper = crontab.add_program("tcpipe", f"#!{sys.executable}\n{SLEEPER}")
     with crontab.start() as hanging:
         while "reading" not in "".join(path.read_text() for path in crontab.data.glob("night/ingest.txt")):
             time.sleep(0.05)
@@ -262,6 +299,7 @@ def hang(crontab: Crontab, _: Drives) -> None:
         mail, exit_code = crontab.run()
         os.killpg(hanging.pid, signal.SIGKILL)
     assert "An earlier night still runs. It has printed:\nreading third.mcap\n" in mail
+    assert "\nrunning: ingest of " in mail
     assert exit_code == 1
     assert crontab.run() == SILENT
     assert crontab.samples == complete

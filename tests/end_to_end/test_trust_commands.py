@@ -89,7 +89,7 @@ def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):
     done = tcpipe("overlay", run, "over.mcap", cwd=work)
     assert done.returncode == 0, done.stderr
     whole = (work / "over.mcap").read_bytes()
-    assert tcpipe("overlay", run, "over.mcap", "--json", cwd=work).returncode == 0
+    assert tcpipe("overlay", run, "over.mcap", "--store", "tcpipe-store", "--json", cwd=work).returncode == 0
     assert (work / "over.mcap").read_bytes() == whole, "it is not the same again"
     read = messages_of(work / "over.mcap", "/tcpipe/fix", "/tcpipe/segment", "/tcpipe/segments")
     segments = [message for _, message in read["/tcpipe/segment"]]
@@ -225,7 +225,7 @@ def test_a_build_that_is_killed_leaves_what_the_next_one_clears_away(work):
     with subprocess.Popen(
         [COMMAND, "build-dataset", "killed", "--quiet"], cwd=work, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as building:
-        while building.poll() is None and not any(work.glob(".tmp-killed-*/killed/spool")):
+        while building.poll() is None and not any(work.glob(".tmp-killed-*/killed")):
             time.sleep(0.01)
         os.kill(building.pid, signal.SIGKILL)
     assert building.returncode == -signal.SIGKILL, "it was done before it could be killed"

@@ -119,7 +119,7 @@ def test_a_card_of_any_other_content_with_a_whole_seal_is_told_or_changes_nothin
         ({"samples": 10**18}, "10000000000000000"),
         ({"patch_px": 10**6}, "expected up to 10000000 of up to 1024 px"),
         ({"shards": [{"path": "data/x", "split": "train", "rows": -5}]}, "its shards hold -5 rows"),
-        ({"format": "csv"}, "zarr or parquet"),
+        ({"made_from": {"file_format": "csv"}}, "zarr or parquet"),
         ({"layers": {}}, "in 0 layers"),
         ({"classes": []}, "a layer terrain, but no classes"),
         ({"label": {"columns": ["power_watt", "speed"], "velocity": "ground"}}, "no column 'speed'"),
@@ -128,7 +128,8 @@ def test_a_card_of_any_other_content_with_a_whole_seal_is_told_or_changes_nothin
 def test_what_a_card_promises_has_bounds(dataset, change, said):
     directory = dataset("parquet")
     card = json.loads((directory / "dataset.json").read_text())
-    seal(directory, {**card, **change})
+    made_from = card["made_from"] | change.get("made_from", {})
+    seal(directory, {**card, **change, "made_from": made_from})
     with pytest.raises(DatasetError, match=said):
         read(directory)
 

@@ -24,13 +24,12 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
-from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
-from tcpipe.formats.store_records import Output
+from tcpipe.formats.store_records import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, estimate, list_ended_calls, record_call
+from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, describe_error, estimate, list_ended_calls, record_call
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
@@ -123,9 +122,8 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         now = replace(before, options=_describe_options(options), at=call.call.begin)
         try:
             result, inputs = _build(call, options, place, reported=before.reported)
-        except TcpipeError as error:
-            message = "\n".join(error.problems)
-            _record_output(call, replace(now, exit_code=error.exit_code, message=message), before)
+        except Exception as error:
+            _record_output(call, replace(now, **describe_error(error)), before)
             raise
         runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
         reported = tuple(sorted(map(_name_finding, select_problems(result.findings))))
@@ -208,7 +206,7 @@ def _build(
     return result, job.inputs
 
 
-def _describe_options(options: BuildDatasetOptions) -> dict[str, Json]:
+def _describe_options(options: BuildDatasetOptions) -> Options:
     """Return the options of a call as JSON values, files as absolute paths, so that it can be planned again."""
     found = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name not in _NOT_RECORDED}
     for name in ("split", "keep_split", "recipe"):
@@ -217,7 +215,7 @@ def _describe_options(options: BuildDatasetOptions) -> dict[str, Json]:
     for name in ("covariates", "exclude"):
         given = [found[name]] if isinstance(found[name], str | Path) else found[name]
         found[name] = [make_absolute(path) for path in given]
-    return {name: value for name, value in found.items() if value not in (None, (), [], {}, False)}
+    return {name: value for name, value in found.items() if value is not False and value not in (None, (), [], {})}
 
 
 _NOT_RECORDED = ("out", "store", "jobs", "dry_run", "force")
@@ -232,7 +230,7 @@ def find_changed_parts(store: Store, state: State, output: Output) -> str:
     """
     if not output.inputs or output.options.get("recipe") == _IN_PYTHON:
         return ""
-    options = BuildDatasetOptions(output.where, store=store.root, **output.options)
+    options = BuildDatasetOptions(output.where, store=store.root, **output.options)  # type: ignore[arg-type]  # as recorded
     try:
         recipe = merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
         parts = plan_inputs(store, read_build_options(options, recipe, output.where), state).parts

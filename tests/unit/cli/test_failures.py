@@ -10,6 +10,8 @@ from installed_command import tcpipe
 
 from tcpipe.cli import Terminated
 from tcpipe.errors import DatasetError, MapError, RecipeError, StoreError, UsageError
+from tcpipe.pipeline.ingest import IngestSummary
+from tcpipe.pipeline.plan import IngestResult
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "store")
 
@@ -55,3 +57,12 @@ def test_a_wrong_option_is_a_failure_that_does_not_pass(tmp_path):
     done = tcpipe("ingest", "log.mcap", "--nosuch", "--json", cwd=tmp_path)
     answer = json.loads(done.stdout)
     assert (answer["kind"], answer["exit_code"], answer["transient"]) == ("failure", 2, False)
+
+
+@pytest.mark.parametrize("causes", [(), (False,), (False, True)])
+def test_the_summary_of_ingest_states_whether_the_same_call_may_succeed_later(causes, tmp_path, monkeypatch):
+    results = tuple(IngestResult(f"{number}.mcap", "failed", transient=is_so) for number, is_so in enumerate(causes))
+    monkeypatch.setattr("tcpipe.pipeline.ingest.run_ingest", lambda _: IngestSummary(tmp_path, results))
+    (tmp_path / "log.mcap").touch()
+    summary = json.loads(tcpipe("ingest", "log.mcap", "--json", cwd=tmp_path).stdout.splitlines()[-1])
+    assert (summary["kind"], summary["transient"]) == ("summary", any(causes))

@@ -18,6 +18,7 @@ from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, TcpipeError, UsageError
+from tcpipe.formats import documents
 from tcpipe.formats.store_records import Call
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
@@ -25,7 +26,7 @@ from tcpipe.pipeline import status as status_module
 from tcpipe.pipeline.calls import close_call, identify_process, list_open_calls, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import LabelConfig, Recipe
 from tcpipe.store import open_store
 
 NIGHT_S = 86_400
@@ -140,8 +141,10 @@ def test_a_call_that_is_refused_on_a_new_store_creates_nothing(tmp_path, logs, h
         "recipe": {"recipe": tmp_path / "nosuch.toml"},
         "existing store": {"existing_store": True},
     }
+    told = []
     with pytest.raises(TcpipeError):
-        ingest(**{"logs": [logs], "store": tmp_path / "new", "recipe": Recipe(), **wrong[how]})
+        ingest(**{"logs": [logs], "store": tmp_path / "new", "recipe": Recipe(), "on_note": told.append, **wrong[how]})
+    assert told == []
     assert not (tmp_path / "new").exists()
 
 
@@ -200,7 +203,7 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
 def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     (call,) = ask_status(root).open_calls
-    with pytest.raises(UsageError, match="nosuch: is no run or log with a known problem"):
+    with pytest.raises(UsageError, match="nosuch: is no run, log or dataset with a known problem"):
         acknowledge(["nosuch"], store=root)
     assert [of.finding.code for of in acknowledge([call.name], store=root).acknowledged] == ["call-killed"]
     assert (ask_status(root).exit_code, ask_status(root).open_calls) == (0, ())
@@ -215,6 +218,35 @@ def test_a_call_that_was_done_by_another_says_by_which(root, logs, monkeypatch):
     key = open_store(root).scan().calls[0][0]
     assert (killed.exit_code, killed.message) == (1, f"its work was done by call-{key}")
     assert other.exit_code == 0
+
+
+def test_a_killed_call_is_not_closed_by_one_under_another_recipe(root, logs, monkeypatch):
+    kill(logs, root, monkeypatch)
+    ingest([logs], store=root, recipe=Recipe(label=LabelConfig(velocity="fused")))
+    assert [call.state for call in list_open_calls(open_store(root).scan())] == ["killed"]
+    assert ask_status(root).counts == {"outdated": 2}, "status asks under the recipe that rules now"
+    ingest([logs], store=root, recipe=Recipe())
+    assert list_open_calls(open_store(root).scan()) == []
+
+
+@pytest.mark.parametrize("how", ["the same work", "acknowledge"])
+def test_a_call_whose_end_is_damaged_is_closed_like_a_killed_one(root, logs, monkeypatch, how):
+    with monkeypatch.context() as patch:
+        patch.setattr(calls, "identify_process", lambda: replace(identify_process(), start="1"))
+        ingest([logs], store=root, recipe=Recipe())
+    store = open_store(root)
+    state = store.scan()
+    ((key, _),) = state.calls
+    store.place.put(state.names["calls", key], b"half of i")
+    documents._DECODED.clear()  # as another process
+    (killed,) = ask_status(root).open_calls
+    assert killed.state == "killed"
+    if how == "acknowledge":
+        acknowledge([killed.name], store=root)
+    else:
+        ingest([logs], store=root, recipe=Recipe())
+    assert list_open_calls(store.scan()) == []
+    assert (store.scan().damaged, ask_status(root).exit_code) == ([], 0)
 
 
 def test_a_call_that_ends_while_another_takes_it_for_killed_keeps_its_own_end(root, logs):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from object_gateway import in_environment
 from storage_server import object_store
-from synthetic_store import add_run, lanes, make_fixes, open_world, segments, supersede, tag_run
+from synthetic_store import add_run, add_world, lanes, make_fixes, open_world, segments, supersede, tag_run
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.formats import documents
@@ -17,7 +17,7 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_findings
 
 
@@ -162,3 +162,14 @@ def test_what_is_lost_is_made_again_from_the_log(ingested, tmp_path, part):
     prune(store=root, recipe=Recipe())
     assert verify(root).problems == ()
     assert [run.facts.tags for run in Store(root).find_runs(one)] == [{"load": "12"}]
+
+
+def test_a_map_whose_folder_is_gone_is_a_problem_until_it_is_added_again(tmp_path):
+    store = open_store(tmp_path, create=True)
+    add_run(store, "a", segments("a", *lanes(0.0, 0.0, 5.0)))
+    add_world(store)
+    shutil.rmtree(tmp_path / "blobs" / store.scan().maps["site"].blob)
+    (finding,) = (each for each in ask_status(tmp_path, tmp_path).problems if each.subject.kind == "map")
+    assert (finding.code, finding.subject.name) == ("map-incomplete", "site")
+    add_world(store)
+    assert "map-incomplete" not in [finding.code for finding in ask_status(tmp_path, tmp_path).problems]

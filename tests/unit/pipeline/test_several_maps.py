@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 from map_worlds import write_tif
 from rasterio import Affine
+from stored_files import map_path
 from synthetic_store import WORLD, add_run, lanes, segments
 
 from tcpipe.cli import cli
@@ -102,7 +103,7 @@ def test_the_card_names_the_maps_in_their_order_and_a_second_call_does_nothing(s
 @pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])
 def test_the_page_shows_all_maps_in_their_places(store, order):
     """Grey of the world at places of either map alone, in the CRS of the first; white outside both."""
-    sources = [open_map(store.map_files(name)[0]) for name in order]
+    sources = [open_map(map_path(store.root, name)) for name in order]
     picture = draw_maps(sources)
     crs = sources[0].grid.crs
     x_min, y_min, x_max, y_max = compute_joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])

@@ -79,7 +79,7 @@ def test_what_ingest_did_is_what_status_says_and_the_calls_are_remembered(first_
 def test_the_first_line_says_what_to_do_now(first_night, night, tmp_path):
     found = where(first_night)
     assert str(found).splitlines()[0] == found.to_do_now
-    assert found.to_do_now == "to do now: look at 1 logs that are partial, or acknowledge them"
+    assert found.to_do_now == "to do now: look at 1 log (partial), or acknowledge it"
     assert where(night).to_do_now == "to do now: tcpipe ingest (4 logs)"
     drive_at(tmp_path / "logs" / "only.mcap")
     os.utime(tmp_path / "logs" / "only.mcap", ns=(OLD_NS, OLD_NS))

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from object_gateway import in_environment
 from storage_server import object_store
 from stored_files import read_files as tree
-from synthetic_store import add_run, add_world, box, commit_run, lanes, region_file, segments
+from synthetic_store import add_run, add_world, box, lanes, region_file, segments, tag_run
 
 from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, StoreError, UsageError
@@ -33,8 +33,6 @@ def made(tmp_path_factory):
         add_world(store, name=name)
     for number, weather in enumerate(("dry", "wet")):
         add_run(store, weather, segments(weather, *lanes(3.0 * number, -10.0, 10.0)), tags={"weather": weather})
-        store.tag_run(weather, {"weather": weather})
-        commit_run(store, weather)
     region_file(here / "region.geojson", box(-20, -20, 2, 20))
     region_file(here / "other.geojson", box(-20, -20, 3, 20))
     (here / "soil.csv").write_text("time,moisture\n1970-01-01T00:00:00Z,0.2\n1970-01-01T00:01:00Z,0.3\n")
@@ -182,8 +180,7 @@ def test_the_record_of_inputs_is_read_as_it_was_written(here):
 
 def test_diff_names_other_tags_of_a_run(here):
     store = open_store(here / "store")
-    store.tag_run("dry", {"weather": "dry", "soil": "clay"})
-    commit_run(store, "dry")
+    tag_run(store, "dry", {"soil": "clay"})
     build_dataset(here / "b", **usual(here))
     assert diff(here / "dataset", here / "b").causes == ("tags: run dry soil none → clay",)
 
@@ -191,18 +188,14 @@ def test_diff_names_other_tags_of_a_run(here):
 def test_other_runs_and_another_map_of_the_name_are_built_in_unasked(here):
     assert build_dataset(here / "dataset", **usual(here)).status == "unchanged"
     store = open_store(here / "store")
-    add_run(store, "new", segments("new", *lanes(6.0, -10.0, 10.0)))
-    store.tag_run("new", {"weather": "dry"})
-    commit_run(store, "new")
+    add_run(store, "new", segments("new", *lanes(6.0, -10.0, 10.0)), tags={"weather": "dry"})
     assert build_dataset(here / "dataset", **usual(here)).status == "done"
     assert {run.run_id for run in read_card(here / "dataset").runs} == {"dry", "new"}
 
 
 def test_another_robot_is_refused(here):
     store = open_store(here / "store")
-    add_run(store, "big", segments("big", *lanes(6.0, -10.0, 10.0), robot="warthog"))
-    store.tag_run("big", {"weather": "dry"})
-    commit_run(store, "big")
+    add_run(store, "big", segments("big", *lanes(6.0, -10.0, 10.0), robot="warthog"), tags={"weather": "dry"})
     assert refused(here, robot="warthog") == ("--robot: husky in the dataset, warthog now",)
     assert build_dataset(here / "dataset", **usual(here, robot="husky")).status == "unchanged"
 
