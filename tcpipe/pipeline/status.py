@@ -216,7 +216,7 @@ def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str
         return f"to do now: {format_finding(problems[0].finding)}{more}"
     for group in groups:
         if group.state == "failed_transient":
-            return f"to do now: correct the cause, then tcpipe ingest ({len(group.logs)} logs): {group.cause}"
+            return f"to do now: correct the cause, then tcpipe ingest ({_count_logs(group.logs)}): {group.cause}"
         if group.state in TROUBLE:
             them = "it" if len(group.logs) == 1 else "them"
             return f"to do now: look at {_count_logs(group.logs)} ({_format_words(group.state)}), or acknowledge {them}"
