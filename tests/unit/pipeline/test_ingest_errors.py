@@ -24,7 +24,9 @@ def test_a_disk_that_fails_in_mid_write_is_told_with_the_output(tmp_path, monkey
     (result,) = ingest([log], store=store).results
     (line,) = result.problems
     assert line == f"{log}: {store}/streams/gnss.parquet: cannot be written ({os.strerror(number)})"
-    assert {path.parent.name for path in store.rglob("*") if path.is_file()} == {"calls", "seen"}, "nothing is left by halves"
+    assert {path.parent.name for path in store.rglob("*") if path.is_file()} == {"calls", "seen"}, (
+        "nothing is left by halves"
+    )
 
 
 def test_a_time_window_that_fits_no_run_is_told_with_the_runs(tmp_path, caplog):
