@@ -115,7 +115,7 @@ def _finish(logs):
         "done": 2
     }
     left = verify("s3://tests/store").problems
-    assert all("/blobs/" in line and "'tcpipe prune' removes it" in line for line in left)
+    assert all("/blobs/" in line and "'tcpipe prune' removes it" in line for line in left), left
 
 
 @pytest.mark.parametrize("verb", ["put_files", "put"])
