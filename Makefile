@@ -65,7 +65,7 @@ test-operations: .venv/installed-dev
 # Stores in a real object store: OBJECT_STORAGE is a program that starts and stops one below a directory, which `start` fills with `env`.
 OBJECT_STORAGE ?= ../shared/tools/object-storage
 test-object-storage: .venv/installed-dev
-	TCPIPE_TEST_OBJECT_STORAGE=$(abspath $(OBJECT_STORAGE)) $(BIN)/pytest -rs -k gateway tests/unit/test_store.py tests/unit/formats/test_place.py tests/unit/pipeline/test_generations.py tests/unit/pipeline/test_array_tasks.py
+	TCPIPE_TEST_OBJECT_STORAGE=$(abspath $(OBJECT_STORAGE)) $(BIN)/pytest -rs -k gateway tests/unit/test_store.py tests/unit/formats/test_place.py tests/unit/pipeline/test_array_tasks.py
 
 # Compiled while one core checks and installs: each worker of the tests would compile them for itself.
 kernels: .venv/installed-dev

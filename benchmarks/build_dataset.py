@@ -25,7 +25,7 @@ from sample_patches import gather
 
 from tcpipe.formats.dataset_files import CHUNK_ROWS, open_patches, read_card
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.pipeline.dataset import build, content
+from tcpipe.pipeline.dataset import build, content, writing
 from tcpipe.recipe import Recipe, SampleConfig
 
 LAYERS = ("ortho", "terrain", "height")
@@ -213,7 +213,7 @@ def main():
         build_one(directory, int(sys.argv[3]))
         return
     timed(content, "sample_all_segments")
-    timed(build, "write_patches")
+    timed(writing, "write_patches")
     counted()
     threading.Thread(target=watch, daemon=True).start()
     built(store_of(directory, SMALL), directory / "first")

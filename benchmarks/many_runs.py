@@ -22,13 +22,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import BLOBS, INDEX, State, make_key
 from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.logs.writing import write_mcap
 from tcpipe.formats.runs import LogOrigin, Run
 from tcpipe.formats.store_records import find_lineage
 from tcpipe.formats.stored_runs import StoredRun
-from tcpipe.pipeline.calls import INGEST, make_unique_name, record_call
+from tcpipe.pipeline.calls import INGEST, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.problems import forget_tables

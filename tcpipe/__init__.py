@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-__version__ = "2.0.0.dev1"
+__version__ = "2.0.0.dev2"
 
 _HOMES = {
     "read_log": ("tcpipe.formats.logs.log_joining", "open_single_log"),

@@ -212,7 +212,7 @@ def _find_tasks(
 def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str:
     """Return what to do now: the first problem, else the first trouble with logs, else what is to be ingested."""
     if problems:
-        more = f" (and {len(problems) - 1} more problem{'s' * (len(problems) > 2)})" if len(problems) > 1 else ""
+        more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
         return f"to do now: {format_finding(problems[0].finding)}{more}"
     for group in groups:
         if group.state == "failed_transient":
