@@ -14,7 +14,7 @@ _UNFINISHED = ".active"
 """Ending of a ROS 1 bag that is being recorded, or was when its recorder died."""
 
 
-Options: TypeAlias = Mapping[str, str | int | float | bool | list[str] | dict[str, str]]
+Options: TypeAlias = Mapping[str, str | int | float | bool | list[str] | dict[str, str] | None]
 """Options of a call as JSON values."""
 
 

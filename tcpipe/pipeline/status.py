@@ -212,11 +212,11 @@ def _find_tasks(
 def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str:
     """Return what to do now: the first problem, else the first trouble with logs, else what is to be ingested."""
     if problems:
-        more = f" (and {len(problems) - 1} more problem{'s' * (len(problems) > 2)})" if len(problems) > 1 else ""
+        more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
         return f"to do now: {format_finding(problems[0].finding)}{more}"
     for group in groups:
         if group.state == "failed_transient":
-            return f"to do now: correct the cause, then tcpipe ingest ({len(group.logs)} logs): {group.cause}"
+            return f"to do now: correct the cause, then tcpipe ingest ({_count_logs(group.logs)}): {group.cause}"
         if group.state in TROUBLE:
             them = "it" if len(group.logs) == 1 else "them"
             return f"to do now: look at {_count_logs(group.logs)} ({_format_words(group.state)}), or acknowledge {them}"

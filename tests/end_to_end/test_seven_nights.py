@@ -270,7 +270,7 @@ def fill_the_disk(crontab: Crontab, drives: Drives) -> None:
     assert "third.mcap: " in mail
     reason = "No space left on device" if crontab.data.is_mount() else "File too large"
     assert reason in mail
-    assert "tcpipe status: exit code 3\nto do now: correct the cause, then tcpipe ingest (1 logs): " in mail
+    assert "tcpipe status: exit code 3\nto do now: correct the cause, then tcpipe ingest (1 log): " in mail
     assert exit_code == 1
     call = crontab.read_latest_call("ingest")
     assert (call["exit_code"], reason in call["message"]) == (3, True)

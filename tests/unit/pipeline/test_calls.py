@@ -383,3 +383,11 @@ def test_status_without_logs_asks_each_folder_as_the_call_was_that_was_given_it(
     assert (found.counts, found.problems) == ({"done": 3}, ())
     assert ask_status(store, parts).counts == {"pending": 2}
     assert ask_status(store, logs).counts == {"outdated": 2}
+
+
+def test_options_that_are_not_given_are_read_as_they_were_written(root):
+    store = open_store(root, create=True)
+    with record_call(store, "ingest", ["/logs"], CallOptions(recipe="k")) as call:
+        call.begin()
+    ((_, found),) = open_store(root).scan().calls
+    assert CallOptions(**found.options) == CallOptions(recipe="k")

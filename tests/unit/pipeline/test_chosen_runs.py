@@ -5,16 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, commit_run, lanes, open_world, segments
-from tcpipe.formats.commits import Entries
+from synthetic_store import add_run, change_run, lanes, open_world, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.pipeline.calls import open_log
+from tcpipe.formats.place import Place
+from tcpipe.formats.recipe_toml import make_recipe_id
+from tcpipe.pipeline.calls import list_ended_calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.prune import prune
-from tcpipe.pipeline.report import report
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Remedy, Subject, select_findings
@@ -27,9 +27,7 @@ def made(tmp_path_factory):
     store = open_world(tmp_path_factory.mktemp("chosen"))
     tags = {"a": {"weather": "dry"}, "b": {"weather": "wet"}, "c": {"weather": "dry", "driver": "Eva"}}
     for number, (run_id, own) in enumerate(tags.items()):
-        add_run(store, run_id, segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0)))
-        store.tag_run(run_id, own)
-        commit_run(store, run_id)
+        add_run(store, run_id, segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0)), tags=own)
     return store
 
 
@@ -49,12 +47,6 @@ def test_a_run_needs_all_of_the_tags(store, tmp_path):
     assert runs(store, tmp_path, weather="dry", driver="Eva") == ["c"]
 
 
-def test_runs_that_may_be_missing_with_a_commit_are_said(store, tmp_path, caplog):
-    (lost := store.root / "log" / "0000000003.json").unlink()
-    assert runs(store, tmp_path)
-    assert f"{lost}: is missing or damaged, so that runs may be; see 'tcpipe status'" in caplog.messages
-
-
 def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path):
     with pytest.raises(DatasetError) as caught:
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tags={"weather": "snow"})
@@ -66,12 +58,8 @@ def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path)
 
 def make_outdated(store, *run_ids):
     """Have runs look as if an earlier version of tcpipe had made them."""
-    rows = [
-        replace(row, data_model_version="0.9", commit=0)
-        for run_id in run_ids
-        for row in store.state().find_rows(run_id)
-    ]
-    open_log(store).commit("ingested", Entries(runs=tuple(rows)))
+    for run_id in run_ids:
+        change_run(store, run_id, data_model_version="0.9")
 
 
 def test_runs_of_another_data_model_are_named(store, tmp_path):
@@ -81,19 +69,13 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     assert (left_out.subject, left_out.names) == (Subject("run", "a"), {"what": "data_model", "has": "0.9"})
     assert left_out.remedies == (Remedy("ingest", command="tcpipe ingest /logs/a.mcap"),)
     found = inspect(store.root, recipe=Recipe())
-    assert found.outdated == {"a": "0.9"}
-    with pytest.raises(
-        StoreError, match=rf"runs/a: contains no finished run of data model {DATA_MODEL_VERSION}; ingest its log again"
-    ):
-        report(store.root / "runs" / "a")
+    assert found.outdated == {f"a/{make_recipe_id(Recipe(), 'husky')}": "0.9"}
 
 
 def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
     make_outdated(store, "a", "b", "c")
-    with pytest.raises(
-        DatasetError,
-        match=rf"3 runs in the store, all of data model 0\.9, expected {DATA_MODEL_VERSION}; ingest their logs",
-    ):
+    said = rf"3 runs in the store, none that can be read \(data model 0\.9, expected {DATA_MODEL_VERSION}; 0 without tables\)"
+    with pytest.raises(DatasetError, match=f"{said}; ingest their logs again"):
         runs(store, tmp_path)
 
 
@@ -103,54 +85,52 @@ def test_a_dry_run_counts_and_estimates_and_a_build_is_remembered(store, tmp_pat
     assert "at most 60 samples: about 2 s and 258 kB (from default figures" in str(planned)
     assert not (tmp_path / "out").exists()
     made = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    (record,) = store.state().datasets.values()
-    assert record.out == str(tmp_path / "out")
+    (record,) = store.scan().outputs.values()
+    assert record.where == str(tmp_path / "out")
     assert [run_id for run_id, _ in record.runs] == ["a", "b", "c"]
     assert build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), dry_run=True).status == "unchanged"
-    before = store.state()
+    before = store.scan()
     build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    assert store.state() == before, "a call with nothing to do writes nothing"
-    assert [call.counts for call in before.calls] == [{"runs": 3, "samples": made.card.samples}]
+    after = store.scan()
+    assert {kind for (kind, _), name in after.names.items() if name not in before.names.values()} == {"calls"}
+    assert [call.counts for call in list_ended_calls(before)] == [{"runs": 3, "samples": made.card.samples}]
 
 
-def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_holds_its_runs(store, tmp_path):
+def test_a_dataset_in_the_place_of_another_releases_the_runs_of_the_other(store, tmp_path):
     out, old = tmp_path / "out", replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
     add_run(store, "a", segments("a", *lanes(np.array([0.0]), -10.0, 10.0)), recipe=old)
-    add_run(store, "a", segments("a", *lanes(np.array([0.0]), -10.0, 9.0)))
     build_dataset(out, store=store.root, recipe=old)
-    out.rename(tmp_path / "moved")
-    build_dataset(out, store=store.root, recipe=Recipe())
     (kept,) = prune(store=store.root, recipe=Recipe(), dry_run=True).kept
-    assert (
-        kept.stays
-        == f"a dataset, formerly at {out}, refers to it; if it no longer exists: 'tcpipe prune --forget {out}'"
-    )
-    shutil.rmtree(out)
-    (tmp_path / "moved").rename(out)
+    assert kept.stays == f"dataset {out} refers to it"
     build_dataset(out, store=store.root, recipe=Recipe(), force=True)
-    assert len(prune(store=store.root, recipe=Recipe(), dry_run=True).removed) == 1
+    found = prune(store=store.root, recipe=Recipe(), dry_run=True)
+    assert ([each.what for each in found.removed], found.kept) == (["old recipe"], ())
 
 
-def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_commit(
+def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_is_not_known_there(
     store, tmp_path, caplog, monkeypatch
 ):
-    place = type(store.place)
-    monkeypatch.setattr(place, "put_new", lambda _, name, __: (_ for _ in ()).throw(StoreError(f"{name}: read-only")))
-    for _ in range(2):
-        build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    assert "so the store has no record of how this call ended" in caplog.text
-    assert "so 'tcpipe prune' does not know the runs of this dataset" in caplog.text
+    put = Place.put
+
+    def refuse(place, name, data):
+        if place.root == store.root:
+            raise StoreError(f"{name}: read-only")
+        put(place, name, data)
+
+    monkeypatch.setattr(Place, "put", refuse)
+    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    assert len(open_dataset(tmp_path / "out").card.runs) == 3
+    assert "read-only; so 'tcpipe status' and 'tcpipe prune' do not know this dataset" in caplog.text
 
 
 def test_a_build_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(store, tmp_path, served):
-    """Beyond one request for each commit that no snapshot has yet."""
     store.root.rename(tmp_path / "served" / "tests" / "store")
     counts = []
     there = open_store("s3://tests/store")
     for number in range(3):
         add_run(there, f"d{number}", segments(f"d{number}", *lanes(9.0 + 3.0 * number, -10.0, 10.0)))
         build_dataset(tmp_path / "out", store=there.root, recipe=Recipe())
-        commits, served.requests = there.state().number, 0
+        served.requests = 0
         assert build_dataset(tmp_path / "out", store=there.root, recipe=Recipe()).status == "unchanged"
-        counts.append(served.requests - commits)
+        counts.append(served.requests)
     assert len(set(counts)) == 1, counts

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, commit_run, lanes, open_world, segments
+from synthetic_store import add_run, lanes, open_world, segments, tag_run
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
@@ -45,8 +45,7 @@ def store(tmp_path):
     for number, (run_id, of) in enumerate(sensors.items()):
         table = segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0), robot="generic")
         add_run(store, run_id, table, sensors=of)
-    store.tag_run("b", {"robot": "other"})
-    commit_run(store, "b")
+    tag_run(store, "b", {"robot": "other"})
     return store
 
 

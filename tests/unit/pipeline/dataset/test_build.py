@@ -148,6 +148,16 @@ def test_a_drive_in_two_logs_counts_once(store, tmp_path):
     assert [run.run_id for run in result.card.runs] == ["a"]
 
 
+def test_a_new_run_that_is_a_duplicate_is_told_by_the_call_that_finds_it(store, tmp_path):
+    add(store, start_ns=10**18, fixes={})
+    build(store, tmp_path)
+    add(store, "b", start_ns=10**18 + 300_000_000, fixes={"late_ns": 300_000_000})
+    result = build(store, tmp_path)
+    assert (result.status, twice(result)) == ("done", [("b", "a", 20, 20)])
+    again = build(store, tmp_path)
+    assert (again.status, twice(again), again.exit_code) == ("unchanged", twice(result), 0)
+
+
 @pytest.mark.parametrize(("names", "skew_ns"), [(("a", "b"), 0), (("b", "a"), 300_000_000), (("a", "b"), -900_000_000)])
 def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_path, names, skew_ns):
     """One drive of 40 m; its second recording has the last 20 m of the first one and 10 m more."""
@@ -259,6 +269,15 @@ def test_a_map_that_lost_a_part_is_refused_and_not_taken_for_a_hole(store, tmp_p
     line = refused(store, tmp_path, MapError)
     assert "map site: changed since it was written" in line
     assert "add the map again" in line
+
+
+def test_a_map_is_verified_when_something_is_built(store, tmp_path):
+    add(store)
+    build(store, tmp_path)
+    (map_path(store.root, "site") / "checksums.json").unlink()
+    assert build(store, tmp_path).status == "unchanged"
+    add(store, "b", (3.0,))
+    assert "map site: changed since it was written" in refused(store, tmp_path, MapError)
 
 
 def test_metres_off_the_map_are_in_the_ledger(store, tmp_path):
