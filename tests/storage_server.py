@@ -19,8 +19,6 @@ FORBIDDEN, SKEWED = "forbidden", "skewed"
 _DENIALS = {FORBIDDEN: "AccessDenied", SKEWED: "RequestTimeTooSkewed"}
 
 READ_ONLY = "read-only"
-OVERWRITING = "overwriting"
-"""A bucket that takes no notice of put-if-absent."""
 
 
 class Fetched(list[str]):
@@ -70,18 +68,16 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(403, b"<Error><Code>AccessDenied</Code></Error>")
             return
         with self.server.writing:
-            allowed = not path.exists() or bucket == OVERWRITING or self.headers["If-None-Match"] != "*"
-            if allowed:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                new = path.with_name(f".{threading.get_ident()}")
-                new.write_bytes(data)
-                new.rename(path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            new = path.with_name(f".{threading.get_ident()}")
+            new.write_bytes(data)
+            new.rename(path)
         if self.server.fetched.lost:
             self.server.fetched.lost -= 1
             self.close_connection = True
             self.connection.shutdown(socket.SHUT_RDWR)
             return
-        self._send(*((200, b"") if allowed else (412, b"<Error><Code>PreconditionFailed</Code></Error>")))
+        self._send(200, b"")
 
     def do_DELETE(self) -> None:
         self.server.fetched.requests += 1

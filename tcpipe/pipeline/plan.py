@@ -69,7 +69,7 @@ class IngestResult:
     log: str
     status: Status
     run: RunFacts | None = None
-    """What the log of the store has of its run; None of a log that waits, or failed."""
+    """What the store has of its run; None of a log that waits, or failed."""
     verdict: Verdict | None = None
     """Of the run."""
     causes: tuple[Finding, ...] = ()

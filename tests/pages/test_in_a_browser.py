@@ -386,7 +386,7 @@ def run_page(tmp_path_factory):
         facts=make_noise_facts(),
         findings=list_findings(),
     )
-    return Path(report(store.runs()[0].where)[0].path)
+    return Path(report("driven", store=store.root)[0].path)
 
 
 @pytest.fixture(params=[LOOKS[0], LOOKS[3]], ids=by_look)

@@ -18,7 +18,7 @@ from tcpipe.store import open_store
 
 TEXTS = {
     "name", "robot", "cluster", "map_name", "tags", "sample_id", "scenario", "names", "topics", "crs",
-    "start", "goal", "holdout", "strays", "shard", "min_age_s", "keep", "forget", "drives",
+    "start", "goal", "holdout", "strays", "shard", "min_age_s", "forget", "drives",
     "adapt", "budget_joule", "layers", "predictor", "reason", "run", "runs",
 }  # fmt: skip
 """Parameters of commands that are text and no path."""
