@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -94,8 +95,11 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
 
-        note = shown.line if as_json else shown.result
-        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=note))
+        def on_note(text: str) -> None:
+            with suppress(OSError):  # nobody listening is no reason to stop
+                (shown.line if as_json else shown.result)(text)
+
+        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=on_note))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.is_transient, summary.results))

@@ -24,6 +24,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
@@ -243,7 +244,7 @@ def find_changed_parts(store: Store, state: State, output: Output) -> str:
 
 def _record_output(call: RunningCall, output: Output, before: Output) -> None:
     """Write what an output is made of and how the last call for it ended; nothing if that is known."""
-    if replace(output, at="") == replace(before, at=""):
+    if to_plain(replace(output, at="")) == to_plain(replace(before, at="")):
         return
     try:
         call.store.put(call.state, "outputs", make_key(output.where), output)
