@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -95,11 +95,8 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
 
-        def on_note(text: str) -> None:
-            with suppress(OSError):  # nobody listening is no reason to stop
-                (shown.line if as_json else shown.result)(text)
-
-        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=on_note))
+        note = partial(shown.note, as_json=as_json)
+        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result, on_note=note))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.is_transient, summary.results))

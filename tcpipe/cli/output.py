@@ -123,6 +123,11 @@ class Progress:
         else:
             print_line(text)
 
+    def note(self, text: str, *, as_json: bool) -> None:
+        """Print a line that is no result, beside JSON on stderr; a reader that is gone is no reason to stop."""
+        with suppress(OSError):
+            (self.line if as_json else self.result)(text)
+
     def _print(self, text: str) -> None:
         with suppress(OSError):  # nobody listening is no reason to stop
             if self._bars is not None:
