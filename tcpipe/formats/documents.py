@@ -21,6 +21,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import logging
+import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -52,6 +53,7 @@ RECORDS: Mapping[Kind, type[Record]] = {
     "outputs": Output,
 }  # fmt: skip
 _HEX = 16
+_NAME = re.compile(rf"([0-9a-f]{{{_HEX}}})\.([0-9]{{1,9}})\.([0-9a-f]{{{_HEX}}})\.json")
 _UNREAD = 16
 _UNREAD_SHARE = 50
 """The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
@@ -79,11 +81,8 @@ class Name(NamedTuple):
 
 def parse_name(kind: Kind, file: str) -> Name | None:
     """Return the parts of a name in the folder of a kind; None for a file that is no document."""
-    parts = file.split(".")
-    is_document = (
-        len(parts) == 4 and parts[3] == "json" and parts[1].isdecimal() and len(parts[0]) == len(parts[2]) == _HEX
-    )
-    return Name(kind, parts[0], int(parts[1]), parts[2]) if is_document else None
+    found = _NAME.fullmatch(file)
+    return Name(kind, found[1], int(found[2]), found[3]) if found else None
 
 
 def make_key(*parts: str | None) -> str:
@@ -284,7 +283,8 @@ def _scan(place: Place, decoded: dict[str, Record]) -> State:
                 state.facts[name.kind][name.key], state.names[key] = decoded[str(name)], str(name)
                 state.beaten += map(str, others)
             else:
-                state.damaged.append(str(name))
+                is_there = place.size(str(name)) is not None  # else a prune has removed it since it was listed
+                state.damaged += [str(name)] if is_there else []
                 damaged |= {key: others} if others else {}
         turn = damaged
     state.read = len(fresh)

@@ -163,9 +163,6 @@ def record_call(
         process=identify_process(), begin=datetime.now(UTC).isoformat(timespec="milliseconds"), jobs=jobs,
     )  # fmt: skip
     running = RunningCall(store, State(), f"{turn:08x}{secrets.token_hex(4)}", call)
-    if is_store(store.root):
-        running.begin()
-    running.state = store.scan()
 
     def end() -> None:
         took = {"wall_s": round(time.monotonic() - begin_s, 3), "cpu_s": round(_read_cpu_s() - cpu_s, 3)}
@@ -173,6 +170,9 @@ def record_call(
             running.put(replace(call, **{"exit_code": 0, **took, **running.result}))
 
     try:
+        if is_store(store.root):
+            running.begin()
+        running.state = store.scan()
         yield running
     except Exception as error:
         running.result |= describe_error(error)

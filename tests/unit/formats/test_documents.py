@@ -393,3 +393,20 @@ def test_a_store_in_a_bucket_whose_index_is_there_is_scanned_by_listings_and_one
         assert scan_anew(place).read == 0
         counts.append((served[before:], served.requests))
     assert counts == [(["store/index.parquet"], len(KINDS) + 2)] * 2, "a listing of each kind, and of the payload"
+
+
+def test_a_file_whose_name_has_other_letters_than_hexadecimal_digits_is_no_document(tmp_path):
+    place = Place(tmp_path)
+    place.put(f"calls/{'z' * 16}.1.{'z' * 16}.json", b"{}")
+    place.put(f"calls/{'0' * 16}.٣.{'0' * 16}.json", b"{}")
+    assert scan(place).is_new
+    assert len(list(documents.find_strange_files(place))) == 2
+
+
+def test_a_document_that_is_removed_while_a_store_is_scanned_is_not_damaged(tmp_path, monkeypatch):
+    place = Place(tmp_path)
+    put_document(place, scan(place), "tags", "0" * 16, Tags("log", {"a": "b"}))
+    documents._DECODED.clear()
+    monkeypatch.setattr(Place, "read", lambda self, name: self.delete(name))
+    found = scan(place)
+    assert (found.damaged, found.facts["tags"]) == ([], {})
