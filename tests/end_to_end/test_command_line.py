@@ -412,11 +412,11 @@ def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
     shutil.copytree(store, tmp_path / "tcpipe-store")
     site = sites[0]
     commands = [
+        ["init"],
         ["add-map", "site", *(str(x) for name in ("height", "ortho") for x in (f"--{name}", site.rasters[name]))],
         ["build-dataset", "--holdout", "sample"],
         ["report", "tcpipe-store", "--no-runs"],
         ["report", "tcpipe-store"],
-        ["init"],
         ["simulate", "site", "--scenario", "tiny", "--quiet"],
     ]
     for command in commands:

@@ -187,11 +187,13 @@ import os
 import time
 from pathlib import Path
 
+from tcpipe.formats.recipe_toml import ingest_key, load_recipe
 from tcpipe.pipeline.calls import INGEST, record_call
 from tcpipe.pipeline.ingest import CallOptions
 from tcpipe.store import open_store
 
-with record_call(open_store(os.environ["TCPIPE_STORE"]), INGEST, [str(Path("recordings").absolute())], CallOptions()):
+options = CallOptions(recipe=ingest_key(load_recipe(Path("tcpipe.toml"))))
+with record_call(open_store(os.environ["TCPIPE_STORE"]), INGEST, [str(Path("recordings").absolute())], options):
     print("reading third.mcap", flush=True)
     time.sleep(3600)
 """
