@@ -34,7 +34,7 @@ from tcpipe.formats.documents import (
 )
 from tcpipe.formats.documents import parse_name as parse_document_name
 from tcpipe.formats.integrity import CHECKSUMS, compute_checksums
-from tcpipe.formats.json_files import convert_record, parse_typed_json, to_compact_json
+from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.runs import Run, RunFacts, strip_repeated
@@ -63,14 +63,13 @@ class Store:
         """Return what its documents say now."""
         return scan(self.place)
 
-    def put(self, state: State, kind: Kind, key: str, record: Record, *, facts: RunFacts | None = None) -> None:
+    def put(self, state: State, kind: Kind, key: str, record: Record) -> None:
         """Write a document, which counts from now on for its kind and key, and add it to the state."""
-        put_document(self.place, state, kind, key, record, facts=facts)
+        put_document(self.place, state, kind, key, record)
 
     def put_run(self, state: State, run: Run) -> None:
         """Write the manifest of a run."""
-        facts = convert_record(run, RunFacts)
-        self.put(state, "runs", make_run_key(run.log.sha256, run.recipe_id), strip_repeated(run), facts=facts)
+        self.put(state, "runs", make_run_key(run.log.sha256, run.recipe_id), strip_repeated(run))
 
     def put_blob(self, directory: Path) -> str:
         """Put the files of a directory in the workshop of this place into a new folder of payload, and return its name."""

@@ -370,19 +370,18 @@ def _seal(rows: Mapping[str, bytes]) -> bytes:
     return found.hexdigest().encode()
 
 
-def put_document(
-    place: Place, state: State, kind: Kind, key: str, record: Record, *, facts: RunFacts | None = None
-) -> str:
-    """Write the record that counts from now on for a kind and key, add it to the state, and return the name of its document.
+def put_document(place: Place, state: State, kind: Kind, key: str, record: Record) -> str:
+    """Write the record that counts from now on for a kind and key, and return the name of its document.
 
-    ``facts`` is the part of the record that `scan` returns, if it is not the record itself.
+    The state, and later scans of this process, have it as it is read from the document.
     """
     data = to_json(record).encode()
     name = Name(kind, key, state.highest.get((kind, key), 0) + 1, _hash_bytes(data))
     place.put(str(name), data)
-    state.add(name, record if facts is None else facts)
+    facts: Record = parse_typed_json(data, RECORDS[kind], place.where(str(name)))
+    state.add(name, facts)
     if (decoded := _DECODED.get(place.where())) is not None:
-        decoded[str(name)] = record if facts is None else facts
+        decoded[str(name)] = facts
     return str(name)
 
 
