@@ -124,18 +124,25 @@ def _link(file: Path, link: Path) -> None:
         os.link(file, link)
 
 
+MEASURE = """
+import resource, subprocess, sys
+code = subprocess.run([sys.executable, "-m", "tcpipe", *sys.argv[1:]], check=False).returncode
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, code)
+"""
+"""Runs a command from a small process: the memory of the process that starts a command counts as its own."""
+
+
 def run_command(what: str, *words: str | Path, cwd: Path, codes: tuple[int, ...] = (0,)) -> tuple[float, float]:
     """Run a whole command and print its wall time, CPU time and memory; return the CPU time [s] and the memory [MB]."""
     begin = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tcpipe", *map(str, words)], cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURE, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=True
     )
-    said = process.stdout.read() if process.stdout else b""
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    cpu_s, memory_mb, wall_s = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, time.perf_counter() - begin
+    wall_s, *said = time.perf_counter() - begin, *done.stdout.splitlines()
+    cpu_s, memory_mb, code = map(float, said[-1].split())
     print(f"{what:<24} {wall_s:6.2f} s wall, {cpu_s:6.2f} s CPU, {memory_mb:5.0f} MB", flush=True)
-    assert process.returncode in codes, said.decode()
+    assert code in codes, done.stdout + done.stderr
     return cpu_s, memory_mb
 
 
@@ -147,7 +154,7 @@ def measure(what: str, directory: Path, logs: Path, root: Path) -> list[str]:
         "status": ["status", root],
         "ingest": ["ingest", logs, *store, "--quiet"],
         "new": ["ingest", logs, new, *store, "--quiet"],
-        "build-dataset": ["build-dataset", directory / f"dataset-{root.name}", *store],
+        "build-dataset": ["build-dataset", directory / f"dataset-{root.name}", *store, "--robot", "husky"],
     }
     figures = []
     for how in ("first", "warm", "warm", "cold"):
