@@ -15,10 +15,12 @@ from tcpipe.tables.findings import select_findings
 
 @pytest.fixture(scope="module")
 def runs(chromium, tmp_path_factory):  # without a browser nothing is ingested
-    here = tmp_path_factory.mktemp("faulty")
-    ingest(write_logs(here), store=here / "store")
-    report(here / "store")
-    return {run.run_id.rpartition("-")[0]: run for run in open_store(here / "store").runs()}
+    here, found = tmp_path_factory.mktemp("faulty"), {}
+    for log in write_logs(here):  # in a store of its own: of logs that begin in the same way the longest counts
+        ingest([log], store=here / log.stem)
+        report(here / log.stem)
+        found |= {run.run_id.rpartition("-")[0]: run for run in open_store(here / log.stem).runs()}
+    return found
 
 
 def test_there_are_twenty_faults(runs):
@@ -31,7 +33,7 @@ def test_the_first_screen_names_the_fault_and_its_remedy(chromium, runs, name):
     run = runs[name]
     found = select_findings(run.manifest.info.report.findings, CODES[name])
     remedies = list_remedies(found)
-    with quiet_page(chromium, Path(run.where) / "report.html", (1400, "light")) as tab:
+    with quiet_page(chromium, Path(run.folder.where("report.html")), (1400, "light")) as tab:
         line = tab.locator(".verdict li", has_text=f"[{CODES[name]}]")
         box, said = line.bounding_box(), " ".join(line.inner_text().split())
         assert 0.0 < box["y"] < box["y"] + box["height"] < 900.0
