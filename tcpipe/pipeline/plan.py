@@ -248,10 +248,10 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:  # noqa: PLR0
         cause = _remove_name("".join(failed.problems[:1]), task)
         state: LogState = "quarantined" if is_acknowledged else "failed_permanent"
         return Step(task, state, cause, failure=failed, findings=failed.findings)
+    if source.name in known.passing:  # it was old enough then
+        return Step(task, "failed_transient", _remove_name(known.passing[source.name], task))
     if check_age(task, now_ns):
         return Step(task, "growing", has_failed=_describe_content(task) in known.failures)
-    if source.name in known.passing:
-        return Step(task, "failed_transient", _remove_name(known.passing[source.name], task))
     if current is not None:
         return Step(
             task, *(("outdated", "its tags change") if is_there else ("pending", "the files of its run are missing"))
