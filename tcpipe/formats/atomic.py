@@ -47,7 +47,7 @@ _RENAME_EXCHANGE = 2
 
 
 def make_unique_name() -> str:
-    """Return 16 random hexadecimal digits: the name of a folder that nobody else writes to."""
+    """Return 16 random hexadecimal digits, for the name of a new folder."""
     return uuid.uuid4().hex[:16]
 
 

@@ -210,7 +210,7 @@ class DatasetCard:
     inputs: str
     """Digest of ``made_from``: the same inputs make the same dataset."""
     made_from: DatasetInputs
-    """Of a dataset without coordinates: without runs, maps, region and files."""
+    """The inputs; a dataset without coordinates omits runs, maps, region and files."""
     name: str
     description: str
     licence: str = ""

@@ -42,7 +42,7 @@ class DatasetInputs:
     runs: Mapping[str, RunInputs] = field(default_factory=dict)
     """By id."""
     robots: tuple[str, ...]
-    """Of the runs."""
+    """The robots that recorded the runs."""
     tags: Mapping[str, str] = field(default_factory=dict)
     """Tags that a run had to have."""
     maps: Mapping[str, str] = field(default_factory=dict)

@@ -59,7 +59,7 @@ _UNREAD_SHARE = 50
 """The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
 
 _MANY = 1000
-"""So many records that were read at once are left out of later garbage collections."""
+"""Number of records read at once above which they are excluded from later garbage collections."""
 _SEAL = b"sha256"
 """Key of the metadata of the index."""
 
@@ -97,7 +97,7 @@ def make_run_key(sha256: str, recipe_id: str) -> str:
 
 @dataclass(slots=True)
 class State:
-    """What the documents of a store say: by kind and key the record that counts, and the names of what does not count."""
+    """The current record of each kind and key in a store, and the names of the documents that are not current."""
 
     facts: dict[Kind, dict[str, Any]] = field(default_factory=lambda: {kind: {} for kind in KINDS})
     names: dict[tuple[Kind, str], str] = field(default_factory=dict)
@@ -191,7 +191,7 @@ class State:
         return row.blob in self.blobs and (not row.streams or row.streams_blob in self.blobs)
 
     def find_run_id(self, sha256: str) -> str | None:
-        """Return the run of a content; None where there is none."""
+        """Return the id of the run whose log has this sha256, or None."""
         return min((row.run_id for row in self.runs.values() if row.log.sha256 == sha256), default=None)
 
     def find_seen(self, log: tuple[str, ...]) -> LogSnapshot | None:

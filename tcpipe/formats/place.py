@@ -53,7 +53,7 @@ class Place:
 
     root: Path | str
     staging: Path | None = None
-    """Of a directory: folder of the same file system for temporaries; None: ``root``."""
+    """Folder for temporary files on the same file system as ``root``; None means ``root`` itself."""
 
     @property
     def path(self) -> Path | None:
@@ -193,7 +193,7 @@ class Place:
         raise StoreError(f"{find_wrong_checksum(self.where(name), found, checksum)}{ALL_CHANGES.format(self.where())}")
 
     def delete(self, name: str) -> None:
-        """Remove a file, or a folder with all files in it; nothing happens if there is none."""
+        """Remove a file, or a folder with all its files; do nothing if it does not exist."""
 
         def remove_objects(store: ObjectStore, key: str) -> None:
             below = [meta["path"] for batch in store.list(key or None) for meta in batch]

@@ -24,7 +24,7 @@ class LogOrigin:
     sha256: str
     size_bytes: int = 0
     sha256_of: Literal["log", "index"] = "log"
-    """What was hashed: of a log in object storage, of which only a part was fetched, the sizes and indexes of its files."""
+    """Data that was hashed: the whole log, or, if only part of it was downloaded, the sizes and indexes of its files."""
     outline: str = field(default="", metadata=LEFT_OUT)
     """Hash of the size and index of the log, by which it is known where not all of it is at hand; "" where it has none."""
 
@@ -93,9 +93,9 @@ class RunFacts:
     distance_by_reason_m: Mapping[str, float]
     """Distance breakdown [m], by entry."""
     findings: tuple[Finding, ...]
-    """Of all stages."""
+    """Findings of all stages."""
     damage: tuple[Finding, ...] = ()
-    """Of the log."""
+    """Findings about damage to the log."""
     energy_budget: EnergyBudget | None = None
     idle_watt: float | None = None
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class RunFacts:
     streams: Mapping[str, Checksum]
     """``streams/<role>.parquet`` in that folder."""
     tags: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Of its log, by the documents on tags: no part of the manifest."""
+    """Tags of its log, read from the records of tags; not written to the manifest."""
     superseded_by: str | None = field(default=None, metadata=LEFT_OUT)
     """The run with a longer recording: found when a store is scanned, no part of the manifest."""
 

@@ -36,7 +36,7 @@ class Failure:
     log: tuple[str, ...]
     problems: tuple[str, ...]
     version: str
-    """Of the program that failed."""
+    """Version of tcpipe that failed."""
     findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
 
 
@@ -52,13 +52,13 @@ class Problem:
 
     @property
     def key(self) -> str:
-        """What identifies it: code, content, and the subject where that is not the content itself."""
+        """Identifier: the code, the content, and the subject if the content does not determine it."""
         subject = self.finding.subject
         return f"{self.finding.code} {self.content} {'' if subject.kind in ('log', 'run', 'call') else subject.name}"
 
     @property
     def name(self) -> str:
-        """What a person calls it: the run, or the log or call."""
+        """Name for display: the run id, or else the log or call."""
         return self.run_id or " + ".join(self.log) or self.finding.subject.name
 
 
@@ -103,7 +103,7 @@ class Output:
     where: str
     """Its path or URL in full."""
     inputs: str = ""
-    """Digest of what the dataset that lies there was made of; "" where no call has made one."""
+    """Digest of the inputs of the dataset at this place; "" if none has been built."""
     parts: Mapping[str, str] = field(default_factory=dict)
     """Digests of the parts of that: runs, maps, recipe and so on."""
     runs: tuple[tuple[str, str], ...] = ()
@@ -120,7 +120,7 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """What distinguishes a process from any other; "" where the system does not say."""
+    """Identity of a process; a field is "" if the system does not provide it."""
 
     host: str
     machine: str
@@ -155,13 +155,13 @@ class Call:
     jobs: int = 1
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    """Of its process and its workers, also those of a cluster."""
+    """CPU time of the process and its workers, including workers on a cluster [s]."""
     failed: Mapping[str, str] = field(default_factory=dict)
     """By log, why it failed for a reason that may pass."""
     done_bytes: int = 0
     """Size of the logs that came in [byte]."""
     written_bytes: int = 0
-    """What was written for them, or the size of the dataset [byte]."""
+    """Size of the runs that were written, or of the dataset [byte]."""
 
     @property
     def end(self) -> str:

@@ -16,7 +16,7 @@ TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
 """What a file of a table is called."""
 
 _DATASET = {"dataset.json", "samples.parquet"}
-"""What lies in a dataset."""
+"""Files that identify a folder as a dataset."""
 
 Mappings = Mapping[str, TableMapping]
 """The recipe's tables, by name."""
@@ -106,7 +106,7 @@ def walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
 
 
 def _is_store(place: str) -> bool:
-    """Return whether documents on calls lie in a folder: each call on a store writes one before it looks for logs."""
+    """Return whether a folder contains records of calls; each call on a store writes one before it searches for logs."""
     with suppress(OSError):
         return any(parse_name("calls", file.name) for file in Path(place, "calls").iterdir())
     return False

@@ -149,14 +149,14 @@ def _plan(state: State, store: Store, options: BuildDatasetOptions, place: Path 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """What a call has to do."""
+    """The inputs and planned work of one call."""
 
     marks: BuildOptions
     inputs: Inputs
     left_out: tuple[Finding, ...]
     """On excluded runs."""
     known: DatasetCard | None
-    """The card of the dataset that lies there."""
+    """Card of the existing dataset at the output, or None."""
     is_made: bool
     """Whether that is what would be made now."""
 

@@ -62,7 +62,7 @@ class Inputs:
     maps: MapPlaces
     made_from: DatasetInputs
     digest: str
-    """Of ``made_from``."""
+    """Digest of ``made_from``."""
     again: Mapping[str, NDArray[np.bool_]]
     """By run: segments that another run has too."""
     chosen: SelectedRuns
