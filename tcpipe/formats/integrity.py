@@ -48,6 +48,11 @@ class Checksums:
     checksums: Mapping[str, Checksum]
 
 
+def compute_short_digest(data: bytes) -> str:
+    """Return the first 16 hexadecimal digits of the sha256, which a file carries in its name so that a reader can check it."""
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
 def write_sealed(path: Path, value: object) -> None:
     """Write a JSON object with a seal, whole or not at all."""
     write_json(path, seal_document(value))
