@@ -33,6 +33,7 @@ import pyarrow as pa
 from tcpipe import __version__
 from tcpipe.errors import StoreError
 from tcpipe.formats.cache import fetch_cached, is_cached
+from tcpipe.formats.integrity import compute_short_digest
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
@@ -52,8 +53,7 @@ RECORDS: Mapping[Kind, type[Record]] = {
     "calls": Call, "runs": RunFacts, "failed": Failure, "tags": Tags, "seen": LogSnapshot, "acknowledged": Problem, "maps": StoredMap,
     "outputs": Output,
 }  # fmt: skip
-_HEX = 16
-_NAME = re.compile(rf"([0-9a-f]{{{_HEX}}})\.([0-9]{{1,9}})\.([0-9a-f]{{{_HEX}}})\.json")
+_NAME = re.compile(r"([0-9a-f]{16})\.([0-9]{1,9})\.([0-9a-f]{16})\.json")
 _UNREAD = 16
 _UNREAD_SHARE = 50
 """The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
@@ -87,7 +87,7 @@ def parse_name(kind: Kind, file: str) -> Name | None:
 
 def make_key(*parts: str | None) -> str:
     """Return the key of a document about something."""
-    return _hash_bytes(to_compact_json(parts))
+    return compute_short_digest(to_compact_json(parts))
 
 
 def make_run_key(sha256: str, recipe_id: str) -> str:
@@ -324,11 +324,7 @@ def _read_document(place: Place, name: Name) -> bytes | None:
     except StoreError as error:
         logger.debug("%s", error)
         return None
-    return data if data is not None and _hash_bytes(data) == name.digest else None
-
-
-def _hash_bytes(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:_HEX]
+    return data if data is not None and compute_short_digest(data) == name.digest else None
 
 
 def _read_index(place: Place) -> dict[str, bytes]:
@@ -376,7 +372,7 @@ def put_document(place: Place, state: State, kind: Kind, key: str, record: Recor
     The state, and later scans of this process, have it as it is read from the document.
     """
     data = to_json(record).encode()
-    name = Name(kind, key, state.highest.get((kind, key), 0) + 1, _hash_bytes(data))
+    name = Name(kind, key, state.highest.get((kind, key), 0) + 1, compute_short_digest(data))
     place.put(str(name), data)
     facts: Record = parse_typed_json(data, RECORDS[kind], place.where(str(name)))
     state.add(name, facts)

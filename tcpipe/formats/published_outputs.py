@@ -11,7 +11,6 @@ begin with the digest in their name are no pointer. Files at a URL without a poi
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from typing import NamedTuple
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory, make_unique_name
-from tcpipe.formats.integrity import Checksum, Checksums
+from tcpipe.formats.integrity import Checksum, Checksums, compute_short_digest
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_json
 from tcpipe.formats.object_storage import is_bucket
 from tcpipe.formats.place import Entry, Place, open_place
@@ -112,7 +111,7 @@ def write_output(url: str, card: str) -> Iterator[Path]:
         place.put_files(folder, directory)
     data = to_json({"folder": folder, "card": card}).encode()
     numbers = (int(found[1]) for name in place.list() if (found := _POINTER.fullmatch(name)))
-    place.put(f"current.{max(numbers, default=0) + 1}.{_hash(data)}.json", data)
+    place.put(f"current.{max(numbers, default=0) + 1}.{compute_short_digest(data)}.json", data)
     entries = place.entries()
     pointers = list(_iterate_pointers(place, [entry.name for entry in entries]))
     place.map(place.delete, _find_expired(entries, pointers))
@@ -147,7 +146,7 @@ def _iterate_pointers(place: Place, names: Iterable[str]) -> Iterator[_Pointer]:
     found = [match for name in names if (match := _POINTER.fullmatch(name))]
     for match in sorted(found, key=lambda match: (-int(match[1]), match[2])):
         data = place.read(match[0])
-        if data is not None and _hash(data) == match[2]:
+        if data is not None and compute_short_digest(data) == match[2]:
             yield replace(parse_typed_json(data, _Pointer, place.where(match[0])), name=match[0])
 
 
@@ -164,7 +163,3 @@ def _find_expired(entries: Sequence[Entry], pointers: Sequence[_Pointer]) -> lis
             of = found[1] if name.startswith(BUILDS) else name
             ages[of] = max(modified_ns, ages.get(of, 0))
     return [name for name, modified_ns in ages.items() if modified_ns < earliest and name not in in_use]
-
-
-def _hash(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:16]
