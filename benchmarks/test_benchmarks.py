@@ -67,7 +67,7 @@ SMALLEST = {
     "label_accuracy": Smallest("--scenario tiny", rf"odometer +[+-]?{NUMBER}%"),
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
     "map_shift": Smallest("--sites 1", r"alone[\s\S]*shared"),
-    "many_runs": Smallest("{out} 3", rf"prune --dry-run, again +{NUMBER} s wall"),
+    "many_runs": Smallest("{out} 3", rf"build-dataset, cold +{NUMBER} s wall"),
     "own_layers": Smallest("{out} --drives 6", rf"noise +: E +{NUMBER} J, T {NUMBER} s on"),
     "path_coverage": Smallest("--train 2 --metres 60 --further 1 --models 1", rf"energy +1 m: +{NUMBER} %"),
     "peers": Smallest(
