@@ -210,7 +210,8 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
-    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, and what the model stated (`make_residuals`).
+    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, and the stated errors (`make_residuals`).
+    Without columns of power the errors are those of velocity and duration.
     """
     held = _Held.collect(residuals)
     if held is None:
@@ -226,6 +227,7 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
             common_share=_find_common_share(residuals, name),
         )
         for name, values in predicted.items()
+        if held.has_power or name in ("velocity", "duration")
     }
 
 
@@ -243,7 +245,13 @@ _STATED = "power_predicted_std_watt", "velocity_predicted_std_mps", "power_veloc
 
 
 def make_residuals(labels: Floats, mean: Floats, covariance: Floats) -> dict[str, Floats]:
-    """Return columns of labels and predictions of power and velocity, shape (N, 2); of covariances, (N, 2, 2), where they are not 0."""
+    """Return columns of labels and predictions of power and velocity, shape (N, 2); of covariances, (N, 2, 2), where they are not 0.
+
+    Of velocity alone the shapes are (N, 1) and (N, 1, 1).
+    """
+    if labels.shape[1] == 1:
+        of_velocity = {_STATED[1]: np.sqrt(covariance[:, 0, 0])} if covariance.any() else {}
+        return {"velocity_mps": labels[:, 0], "velocity_predicted_mps": mean[:, 0]} | of_velocity
     columns = {
         "power_watt": labels[:, 0], "velocity_mps": labels[:, 1],
         "power_predicted_watt": mean[:, 0], "velocity_predicted_mps": mean[:, 1],
@@ -291,13 +299,19 @@ class _Held:
     is_one_fold: bool
     stated: Mapping[str, Floats]
     """Standard deviations by the model; 0 where it states none."""
+    has_power: bool
+    """Whether power is known; else it is 0."""
 
     @classmethod
     def collect(cls, residuals: Residuals) -> _Held | None:
         names = ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
-        if not set(names) <= residuals.keys():
+        has_power = names[0] in residuals
+        if not set(names) - residuals.keys() <= (set() if has_power else {names[0], names[2]}):
             return None
-        power, velocity, predicted_power, predicted_velocity = (residuals[name].astype(np.float64) for name in names)
+        nothing = np.zeros(len(residuals["velocity_mps"]))
+        power, velocity, predicted_power, predicted_velocity = (
+            residuals.get(name, nothing).astype(np.float64) for name in names
+        )
         usable = np.isfinite(power + predicted_power) & (velocity > 0.0) & (predicted_velocity > 0.0)
         if np.count_nonzero(usable) < FEWEST:
             return None
@@ -317,11 +331,12 @@ class _Held:
         fold = residuals["fold"][rows].astype(np.int64) if "fold" in residuals else np.zeros(rows.size, np.int64)
         is_one_fold = "fold" in residuals and np.unique(fold).size == 1
         covariance = np.zeros((rows.size, 2, 2))
-        if set(_STATED) <= residuals.keys():
-            of_power, of_velocity, both = (residuals[name][rows].astype(np.float64) for name in _STATED)
+        if _STATED[1] in residuals:
+            of_power, of_velocity, both = (residuals.get(name, nothing)[rows].astype(np.float64) for name in _STATED)
             covariance = np.array([[of_power**2, both], [both, of_velocity**2]]).transpose(2, 0, 1)
         mean = np.column_stack([predicted["power"], predicted["velocity"]])
-        return cls(true, predicted, class_id, of_run, way_m, fold, is_one_fold, propagate_stated(mean, covariance))
+        stated = propagate_stated(mean, covariance)
+        return cls(true, predicted, class_id, of_run, way_m, fold, is_one_fold, stated, has_power)
 
 
 def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:

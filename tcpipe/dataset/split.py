@@ -30,6 +30,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.bits import Quality, flag_name
+from tcpipe.tables.levels import LABELS
 from tcpipe.terrain.layers import LAYERS
 
 if TYPE_CHECKING:
@@ -90,10 +91,10 @@ class Split:
 
     def __repr__(self) -> str:
         """Name the split, its size and its channels."""
-        return f"Split({self.name!r}: {len(self)} samples of {', '.join(self.channels)})"
+        return f"Split({self.name!r}: {len(self)} samples of {', '.join(self.channels) or 'labels, without patches'})"
 
     def __getitem__(self, index: int) -> tuple[Floats, Floats]:
-        """Return the patch, shape (px, px, channels) in [0, 1], and the labels, shape (2,), of one sample."""
+        """Return the patch, shape (px, px, channels) in [0, 1], and the labels, shape (labels,), of one sample."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)} in split {self.name}")
         patches, labels = self.batch([index])
@@ -130,22 +131,24 @@ class Split:
         return self._columns.table().take(pa.array(self.view.at))
 
     @property
-    def label_columns(self) -> tuple[str, str]:
-        """Columns of samples.parquet that train: the power of its energy, and the velocity that the card says."""
-        return self.energy.power, self._card.label.columns[1]
+    def label_columns(self) -> tuple[str, ...]:
+        """Columns of samples.parquet that train: the power of its energy, and the velocity of the card; without energy, velocity alone."""
+        velocity = self._card.label.columns[1]
+        return (self.energy.power, velocity) if self._card.labels["energy"] else (velocity,)
 
     @cached_property
     def labels(self) -> Floats:
-        """Power [W] and velocity [m/s], float32, shape (N, 2): its `label_columns`."""
+        """Power [W] and velocity [m/s], or velocity alone, float32, shape (N, labels): its `label_columns`."""
         return np.column_stack([self.column(name) for name in self.label_columns]).astype(np.float32)
 
     @cached_property
     def weights(self) -> Floats:
-        """Inverse variance of each label over its mean, float32, shape (N, 2); 0 where the variance is unknown.
+        """Inverse variance of each label over its mean, float32, shape (N, labels); 0 if the variance is unknown.
 
-        What all labels of a run share is no part of it: no weights average that out.
+        The part that all labels of a run share is excluded: no weights average it out.
         """
-        std = np.column_stack([self.own_std(name) for name in (self.energy.power_std, "velocity_std_mps")])
+        names = (self.energy.power_std, "velocity_std_mps")[-len(self.label_columns) :]
+        std = np.column_stack([self.own_std(name) for name in names])
         return np.column_stack([_compute_inverse_variance_weights(column) for column in std.T]).astype(np.float32)
 
     @cached_property
@@ -168,7 +171,7 @@ class Split:
         return self.view.stored.gather(self.view.at[indices], self.view.form.layers)
 
     def batch(self, indices: ArrayLike) -> tuple[Floats, Floats]:
-        """Return patches, shape (B, px, px, channels), and labels, shape (B, 2), of the samples ``indices``."""
+        """Return patches, shape (B, px, px, channels), and labels, shape (B, labels), of the samples ``indices``."""
         at = np.asarray(indices, dtype=np.int64)
         at = np.where(at < 0, at + len(self), at)
         patches = self.patches[at] if "patches" in self.__dict__ else self._form_tensor(at)
@@ -268,6 +271,7 @@ class Split:
         """
         if size < 1:
             raise DatasetError(f"batches of {size} samples: expected 1 or more")
+        self._require_patches()
         columns = tuple((name, self.column(name)) for name in features)
         textual = [name for name, column in columns if column.dtype.kind not in "biuf"]
         if textual:
@@ -292,7 +296,14 @@ class Split:
 
         return TorchBatches(self.batches(size, **rules))
 
+    def _require_patches(self) -> None:
+        if not self.channels:
+            raise DatasetError(
+                f"{self._columns.directory}: has no patches; take its samples and labels, or add a map (tcpipe add-map) and build it again"
+            )
+
     def _form_tensor(self, indices: Ints) -> Floats:
+        self._require_patches()
         layers = self.view.form.layers
         if self.view.stored.fit(layers):
             return self.view.form.form(self.view.stored.in_memory(layers), self.view.at[indices])
@@ -333,6 +344,11 @@ class Dataset(Mapping[str, Split]):
         """Return the number of splits."""
         return len(self._splits)
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels that its samples have: some of energy, time, slip, vibration."""
+        return tuple(name for name in LABELS if self.card.labels[name])
+
     def select(self, ids: str | Path | Iterable[str]) -> Split:
         """Return samples of any split, in the order given, as `Split.select` does."""
         return self._every.select(ids)
@@ -366,13 +382,13 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
             f"{directory}: samples.parquet has {len(split)} rows, its card says {card.samples}; build it again"
         )
     column = read_samples(directory, [energy.power]).column(energy.power)
-    if card.samples and column.null_count == len(column):
+    if card.samples and label != "total" and column.null_count == len(column):
         raise DatasetError(
             f"{directory}: no sample has {energy.power}: the robot was never stationary for long; take the label total"
         )
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
-    form = make_tensor_layout(asked, files.layers, files.patch_px)
+    form = make_tensor_layout(asked, files.layers, files.patch_px) if files.layers else TensorLayout((), {}, 0)
     places = find_places_in_files(card, split)
 
     def make_split(name: str, rows: Ints) -> Split:

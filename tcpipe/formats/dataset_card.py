@@ -14,9 +14,13 @@ from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
 from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import LEFT_OUT, Finding, Verdict, judge_by_code
+from tcpipe.tables.levels import LABELS
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe dataset"
+
+LOCAL = "local"
+"""Plane of runs without GNSS: each in its own frame, side by side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +236,10 @@ class DatasetCard:
     classes: tuple[TerrainClass, ...]
     label: LabelColumns
     energy_budget: EnergyBudget | None = None
+    labels: Mapping[str, int]
+    """Samples that have each label (`tcpipe.tables.levels.LABELS`); 0: the label is absent."""
+    plane: str = field(default="", metadata={"json": ("",)})
+    """Without a map: CRS of the plane in which footprints and regions are compared; `LOCAL` where runs have no GNSS."""
     split: SplitResult
     distance_by_reason_m: Mapping[str, float]
     """Distance breakdown of the runs [m]."""
@@ -263,6 +271,16 @@ class DatasetCard:
     def recipe(self) -> Recipe:
         """The recipe that it was built with."""
         return self.made_from.recipe
+
+    @property
+    def absent_labels(self) -> tuple[str, ...]:
+        """Labels that no sample has, or that were not asked for."""
+        return tuple(name for name in LABELS if not self.labels[name])
+
+    @property
+    def plane_crs(self) -> str:
+        """CRS of the plane in which footprints and regions are compared: that of the first map, if there is one; or `LOCAL`."""
+        return self.maps[0].crs if self.maps else self.plane
 
     @property
     def format(self) -> str:

@@ -405,14 +405,16 @@ def is_shard(name: str) -> bool:
 def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | None = None) -> PatchFiles:
     """Return where the patches of a dataset lie, here or ``fetched``.
 
-    Shards are held against the card: on this machine at once, in a bucket each before it is first read.
-    A digest is found once and remembered, so that to open the dataset again costs a look at each file.
+    Shards are compared with the card: on this machine at once, in a bucket each before it is first read.
+    A digest is computed once and remembered. A dataset without patches has no layers.
     """
     px, samples = card.patch_px, card.samples
     layers = sort_layers(read_layers(card.layers, card.classes, directory / CARD))
+    if not layers:
+        return PatchFiles(directory, {}, px, np.array([0, samples]))
     known = card.format in get_args(FileFormat)
     uneven = any(layer.bands and (not layer.own_px or px % layer.own_px) for layer in layers.values())
-    if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES) or uneven:
+    if not (known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES) or uneven:
         raise DatasetError(
             f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: expected up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"

@@ -48,7 +48,7 @@ class DatasetInputs:
     maps: Mapping[str, str] = field(default_factory=dict)
     """By name: sha256 over the map's files."""
     map_names: tuple[str, ...] = ()
-    """In order of priority where maps overlap."""
+    """In order of priority where maps overlap; none: a dataset without patches."""
     region: Mapping[str, str] | None = None
     """By kind of polygon: the sha256 of its coordinates."""
     covariates: Mapping[str, str] = field(default_factory=dict)
@@ -58,6 +58,10 @@ class DatasetInputs:
     kept_split: str | None = None
     """The sha256 of the splits of the earlier dataset, which its samples keep."""
     file_format: str
+    labels: tuple[str, ...] = ()
+    """Labels that every sample needs; none: the default."""
+    without_patches: bool = False
+    """Whether patches were declined; without a map there are none in any case."""
     without_coordinates: bool
 
     @property

@@ -68,25 +68,30 @@ def _iterate_lines(card: DatasetCard) -> Iterator[str]:
     """Yield the lines of what a reader wants to know."""
     splits = ", ".join(f"{count} {split}" for split, count in card.splits.items())
     side = f"{card.patch_px} × {card.patch_px} pixels of {card.patch_m:g} m × {card.patch_m:g} m"
+    beside = f", beside a patch of the ground under it: {side}" if card.layers else ""
+    labels = ", ".join(name for name in card.labels if name not in card.absent_labels)
+    without = ", ".join(card.absent_labels)
     yield from (f"# {_escape_markdown(card.name)}", "")
     if card.description:
         yield from (_escape_markdown(card.description), "")
     yield (
         f"{card.samples} samples ({splits}) of what driving a metre of ground costs a robot "
-        f"({', '.join(map(_escape_markdown, card.robots)) or 'none'}): power, velocity, duration and energy, "
-        f"each with its standard deviation, beside a patch of the ground under it: {side}."
+        f"({', '.join(map(_escape_markdown, card.robots)) or 'none'}): {labels}, each with its standard deviation{beside}."
     )
+    if without:
+        yield f"It has no label {without}."
     if card.without_coordinates:
         text = "Positions are metres from an origin that is not published; times begin with the first sample."
         yield from ("", text)
-    else:
+    elif card.maps:
         yield from ("", f"![the maps from above]({OVERVIEW})")
     yield from ("", "## Labels, over train alone", "")
     yield from ("| label | mean | standard deviation | least | most |", "|---|---|---|---|---|")
     for name, statistics in card.label_statistics_of_train.items():
         figures = (statistics.mean, statistics.std, statistics.min, statistics.max)
         yield f"| `{name}` | " + " | ".join("–" if value is None else f"{value:.4g}" for value in figures) + " |"
-    yield from ("", "## Layers of a patch", "", "| layer | stored as | unit |", "|---|---|---|")
+    if card.layers:
+        yield from ("", "## Layers of a patch", "", "| layer | stored as | unit |", "|---|---|---|")
     for name, layer in list(card.layers.items())[:_SHOWN_LAYERS]:
         yield f"| {_escape_markdown(name)} | {layer['dtype']} | {_escape_markdown(str(layer.get('units', '')))} |"
     yield from (
@@ -119,7 +124,8 @@ def _describe_reading(card: DatasetCard) -> Iterator[str]:
             "from datasets import load_dataset",
             'load_dataset("PATH")             # the patches with their samples, by split',
         )
-    yield from ("import tcpipe", 'tcpipe.open_dataset("PATH")["train"].patches  # float32 (N, px, px, layers), decoded')
+    what = "patches  # float32 (N, px, px, layers), decoded" if card.layers else "samples  # a table, one row a sample"
+    yield from ("import tcpipe", f'tcpipe.open_dataset("PATH")["train"].{what}')
 
 
 def _format_splits(card: DatasetCard) -> str:

@@ -71,7 +71,10 @@ def compare_baselines(
         class_ids = read_extra_features(part.split).class_id
         for name, (samples, predictor, residuals) in fitted.items():
             there = replace(samples, split=part.split.with_channels(*samples.inputs.channels))
-            theirs = Predicted.centre(residuals, predict_samples(predictor, there), class_ids, ours.card.chord_m)
+            found_there = predict_samples(predictor, there)
+            if samples.inputs.is_time_alone:
+                found_there = found_there.add_unknown_power()
+            theirs = Predicted.centre(residuals, found_there, class_ids, ours.card.chord_m)
             found += compare_with_baseline(name, split, part, said[split], theirs, block_m=block_m, seed=seed)
     return found, lacking
 
@@ -215,8 +218,10 @@ def make_energy_table(
 ) -> tuple[dict[str, dict[str, Errors]], list[BaselineResult]]:
     """Return errors of E by predictor and split, and the results of the networks beside it (table IV).
 
-    They are of the samples whose class has a network of its own; of all samples where ``trained`` is None.
+    They are of the samples whose class has a network of its own; of all samples where ``trained`` is None. Nothing without energy.
     """
+    if ours.card.inputs.is_time_alone:
+        return {}, []
     networks: dict[str, dict[int, Model]] = {}
     if trained is not None:
         networks[ALL_LAYERS_PER_CLASS] = _train_by_class(ours, trained, "class", Variant())

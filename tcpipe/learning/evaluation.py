@@ -325,11 +325,14 @@ def find_weaknesses(found: Evaluation) -> Iterator[Finding]:
 
 def _find_large_errors(part: SplitErrors, subject: Subject) -> Iterator[Finding]:
     for name, quantity in _QUANTITIES.items():
+        if quantity not in part.errors:
+            continue
         error = (part.errors[quantity][ALL].mape_percent or 0.0) / 100.0
         if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
             yield make_finding(f"{name}-far-off", subject, error_fraction=error)
-    overall = (part.errors["E"][ALL].mape_percent or 0.0) / 100.0
-    for class_name, scores in part.errors["E"].items():
+    energy = part.errors.get("E", {ALL: compute_errors(np.empty(0), np.empty(0))})
+    overall = (energy[ALL].mape_percent or 0.0) / 100.0
+    for class_name, scores in energy.items():
         error, names = (scores.mape_percent or 0.0) / 100.0, {"split": subject.name}
         is_counted = class_name != ALL and scores.mape_count >= read_threshold("class-far-off", "min_sample_count")
         if is_counted and error > read_threshold("class-far-off", "min_error_ratio") * overall > 0.0:
@@ -359,4 +362,5 @@ def _find_coverage(part: SplitErrors, subject: Subject) -> Iterator[Finding]:
         yield make_finding("no-intervals", subject)
         return
     for name, quantity in _QUANTITIES.items():
-        yield from find_miscalibration(part.coverage[quantity], name, subject)
+        if quantity in part.coverage:
+            yield from find_miscalibration(part.coverage[quantity], name, subject)

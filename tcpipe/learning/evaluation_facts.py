@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias, get_args
 
 from tcpipe.cost.coverage import Coverage
 from tcpipe.dataset.energies import EnergyName
@@ -13,7 +13,7 @@ from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import Training
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import ABSENT, Floor
-from tcpipe.tables.findings import Finding, Verdict
+from tcpipe.tables.findings import PREDICTED, Affected, Finding, Verdict
 
 KIND = "tcpipe evaluation"
 
@@ -155,6 +155,17 @@ class Evaluation:
     """How well each label repeats itself where ground was driven twice; None where none was."""
     findings: tuple[Finding, ...] = ()
     verdict: Verdict = field(default_factory=Verdict)
+
+    @property
+    def costs(self) -> tuple[Literal["E", "T"], ...]:
+        """Return which of energy and time were evaluated."""
+        known = {quantity for part in self.splits.values() for quantity in part.errors}
+        return tuple(quantity for quantity in get_args(Literal["E", "T"]) if quantity in known)
+
+    @property
+    def judged(self) -> tuple[Affected, ...]:
+        """Return what the verdict is about."""
+        return PREDICTED if "E" in self.costs else ("time",)
 
     @property
     def ordered_splits(self) -> list[str]:

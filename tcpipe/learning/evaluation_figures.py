@@ -17,7 +17,8 @@ from tcpipe.learning.metrics import QUANTITIES, UNITS
 from tcpipe.learning.predictions import (
     LEVELS,
     compute_calibration,
-    compute_errors_joule,
+    compute_cost_errors,
+    find_main_cost,
     find_worst_rows,
     make_column_name,
 )
@@ -102,7 +103,9 @@ def make_page_data(samples: EvaluatedSamples) -> Json:
             for number in np.unique(class_id)
         ],
         "quantities": [
-            {"key": q, "called": _CALLED[q], "unit": UNITS[q], "digits": _DIGITS[q]} for q in reversed(QUANTITIES)
+            {"key": q, "called": _CALLED[q], "unit": UNITS[q], "digits": _DIGITS[q]}
+            for q in reversed(QUANTITIES)
+            if table.column(make_column_name(q)).null_count < table.num_rows
         ],
         "patches": samples.patches,
     }
@@ -110,7 +113,7 @@ def make_page_data(samples: EvaluatedSamples) -> Json:
 
 WORST = Section(
     "Worst segments",
-    f"The {_WORST} samples of each split with the largest errors of E, largest first; click for details.\n"
+    f"The {_WORST} samples of each split with the largest errors of E, or of T without energy, largest first; click for details.\n"
     "Travel is to the right. Look for a common cause: a wrong class in the map, a step missing in the heights, a label with a large σ.",
     controls="gallery.html",
 )
@@ -156,14 +159,14 @@ def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any
 
 
 def make_slope_section(table: pa.Table) -> Section:
-    """Return the RMSE of E by split, class and range of slope, as a heat map."""
-    part = table.filter(pc.is_valid(table.column("slope_rad")))
-    off = compute_errors_joule(part)
+    """Return the RMSE of E, or of T without energy, by split, class and range of slope, as a heat map."""
+    part, quantity = table.filter(pc.is_valid(table.column("slope_rad"))), find_main_cost(table)
+    off = compute_cost_errors(part, quantity)
     ranges = np.searchsorted(np.radians(_SLOPE_EDGES_DEG), to_floats(part, "slope_rad"), side="right")
-    energy, low, high = (
-        to_floats(part, make_column_name("E", kind)) for kind in ("", "predicted_low", "predicted_high")
+    label, low, high = (
+        to_floats(part, make_column_name(quantity, kind)) for kind in ("", "predicted_low", "predicted_high")
     )
-    is_outside = (energy < low) | (energy > high)
+    is_outside = (label < low) | (label > high)
     splits, classes = (to_texts(part.column(name)) for name in ("split", "terrain_name"))
     lines = list(dict.fromkeys(zip(splits.tolist(), classes.tolist(), strict=True)))
     columns = np.unique(ranges).tolist()
@@ -187,7 +190,7 @@ def make_slope_section(table: pa.Table) -> Section:
         return Shaded(text, rmse[cell] / most, alarm=is_doubtful)
 
     text = (
-        "RMSE of E [J], in brackets the number of segments; darker is worse. * and a dashed border: "
+        f"RMSE of {quantity} [{UNITS[quantity]}], in brackets the number of segments; darker is worse. * and a dashed border: "
         f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them."
     )
     header = ["split", "class", *(_SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]

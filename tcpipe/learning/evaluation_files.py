@@ -32,7 +32,6 @@ from tcpipe.learning.models import load_model, read_model_card
 from tcpipe.learning.own_models import load_own_kind
 from tcpipe.learning.predictions import check_fit, collect_runs
 from tcpipe.learning.training import compute_dataset_checksum
-from tcpipe.tables.findings import PREDICTED
 
 SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
 
@@ -52,7 +51,9 @@ class EvaluationResult:
         for split, part in self.values.splits.items():
             figures = (
                 f"{quantity} {error.mape_percent or float('nan'):.2f} % ({error.mape_count})"
-                for quantity, error in ((quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES)
+                for quantity, error in (
+                    (quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES if quantity in part.errors
+                )
             )
             lines.append(f"{split}: {part.samples} samples, MAPE (of so many labels) {', '.join(figures)}")
             lines += [
@@ -62,7 +63,7 @@ class EvaluationResult:
             ]
             lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
-        lines += [f"verdict: {line}" for line in list_verdict(self.values.verdict, PREDICTED)]
+        lines += [f"verdict: {line}" for line in list_verdict(self.values.verdict, self.values.judged)]
         lines += format_findings(self.values.findings)
         return clean_lines((*lines, f"open {self.path}/{PAGE}"))
 

@@ -25,7 +25,7 @@ from tcpipe.learning.metrics import ALL, LEAST, UNITS, Errors
 from tcpipe.learning.predictor import find_kind
 from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.report.plots import draw_ratios
-from tcpipe.tables.findings import PREDICTED, judge_again
+from tcpipe.tables.findings import judge_again
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """Lower bounds of errors, and their names on the page."""
@@ -67,9 +67,9 @@ def render_evaluation_page(
                 f"MAPE of {quantity}, {name}",
             )
             for name in found.ordered_splits
-            for quantity in ("E", "T")
+            for quantity in found.costs
         ],
-        verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=PREDICTED),
+        verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=found.judged),
         warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
         script="evaluation.js" if has_samples else "",
@@ -103,7 +103,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
     by_cell = {(row.baseline, row.split, row.quantity): row for row in (*found.baselines, *found.networks)}
     names = list(dict.fromkeys(row.baseline for row in found.baselines))
     rows: list[tuple[str, ...]] = []
-    for quantity in ("E", "T"):
+    for quantity in found.costs:
         own = (found.splits[split].errors[quantity][ALL] for split in splits)
         rows.append((quantity, "the model", *(_format_figure(error, "rmse", quantity) for error in own)))
         for name in names:
@@ -127,7 +127,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
                 if row_quantity == quantity
             ],
         )
-        for quantity in ("E", "T")
+        for quantity in found.costs
     ]
     return Section(title, text, plots=plots, parts=[table])
 
@@ -181,7 +181,7 @@ def _make_class_sections(found: Evaluation) -> list[Section]:
         if split not in found.splits:
             continue
         part = found.splits[split]
-        rows = [row for quantity in "ET" for row in _iterate_class_rows(found, split, quantity)]
+        rows = [row for quantity in found.costs for row in _iterate_class_rows(found, split, quantity)]
         header = ("", "", *(f"{name} ({part.classes[name]})" for name in part.class_order), f"all ({part.samples})")
         sections.append(Section(f"Table {number}: {_CALLED[split]}", _TEXT[split], header=header, rows=rows))
     return sections
@@ -230,7 +230,9 @@ _TEXT = {
 def _make_other_sections(found: Evaluation) -> list[Section]:
     """Return tables III to V: other inputs, other networks, the expected time."""
     ablation = {
-        "+".join(row.layers): {split: row.on(split)["E"] for split in found.ordered_splits} for row in found.ablation
+        "+".join(row.layers): {split: row.on(split)["E"] for split in found.ordered_splits}
+        for row in found.ablation
+        if "E" in found.costs
     }
     noise = f"Layers not named are replaced by noise ({found.config.noise_draws} draws)."
     networks = (

@@ -97,8 +97,9 @@ class Model:
         return estimate_correlation(self.residuals)
 
     def ask(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
-        """Return what the predictor says of patches in [0, 1], shape (N, px, px, depth), and the covariances that it states.
+        """Return the predictions of patches in [0, 1], shape (N, px, px, depth), and the covariances that the predictor states.
 
+        A model of time alone gives power and velocity, too: its power is NaN.
         ``features`` are those of the N segments (`tcpipe.dataset.extra_features.read_extra_features` of a split).
         Physics needs them; other models take what they were trained with, and their usual values where it is not given.
         """
@@ -115,7 +116,7 @@ class Model:
         if "velocity_mps" in names:
             column = names.index("velocity_mps")
             said.mean[:, column] = np.maximum(said.mean[:, column], LEAST_VELOCITY_MPS)
-        return said
+        return said.add_unknown_power() if inputs.is_time_alone else said
 
     def predict(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
         """Return power [W] and velocity [m/s] of patches as `ask`, with the covariances of their errors on new ground.
@@ -128,7 +129,7 @@ class Model:
         class_id = np.zeros(len(patches), np.int64) if features is None else features.class_id
         stated = np.sqrt(np.diagonal(said.covariance, axis1=1, axis2=2)).T
         std = np.stack([
-            errors[name].compute_std(value, class_id, stated_std)
+            errors[name].compute_std(value, class_id, stated_std) if name in errors else np.full(len(value), np.nan)
             for name, value, stated_std in zip(("power", "velocity"), said.mean.T, stated, strict=True)
         ])  # fmt: skip
         covariance = std.T[:, :, None] * std.T[:, None, :]

@@ -223,7 +223,7 @@ def compute_learning_rate(config: FitConfig, progress: TrainingProgress) -> floa
 def _train_epoch(trainer: Trainer, fit: Samples, progress: TrainingProgress, times: TrainingTimes) -> float:
     """Train on every sample once; return the mean loss."""
     inputs, config, scale = fit.inputs, fit.config, np.array(fit.inputs.scale, np.float32)
-    energy = len(inputs.outputs) == 1
+    energy = inputs.outputs == (fit.split.energy.energy,)
     rules: dict[str, Any] = {"features": inputs.outputs} if energy else {"weights": config.inverse_variance_weights}
     if inputs.extra_features:
         rules["features"] = COLUMNS

@@ -107,6 +107,8 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
     labels : power [W] and velocity [m/s], finite, shape (N, 2).
     idle_watt : what the robot was seen to draw while it stood; None where it was not.
     """
+    if labels.shape[1] < 2:
+        raise ModelError("a model of physics needs the label energy, which the dataset does not have")
     names = np.where(extra_features.class_id > 0, extra_features.class_id.astype(np.str_), ALL)
     power, velocity = labels.T
     metres = FitSamples(power, velocity, np.tan(extra_features.slope_rad), extra_features.turn_radpm * velocity, names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -55,19 +55,20 @@ class Measured:
 
 def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     """Return what was measured, with the names of classes by id; samples without a label are left out."""
-    energy = split.energy
-    with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column(energy.energy).astype(np.float64))
+    energy, *power_column, velocity_column = split.energy, *split.label_columns
+    columns = {"v": (velocity_column, "velocity_std_mps"), "T": ("duration_s", "duration_std_s")}
+    if power_column:
+        columns = {"w": (energy.power, energy.power_std), **columns, "E": (energy.energy, energy.energy_std)}
+    with_label = np.all([np.isfinite(split.column(name).astype(np.float64)) for name, _ in columns.values()], axis=0)
     chosen = split.take(with_label)
-    labels = chosen.labels.astype(np.float64)
-    std = {"w": energy.power_std, "v": "velocity_std_mps", "T": "duration_std_s", "E": energy.energy_std}
-    deviations = {cost: chosen.column(name).astype(np.float64) for cost, name in std.items()}
-    own_deviations = {cost: chosen.own_std(name) for cost, name in std.items()}
-    plain = {name: chosen.column(name).astype(np.float64) for name in ("duration_s", energy.energy, "terrain_class")}
-    class_ids = np.nan_to_num(plain["terrain_class"], nan=_UNKNOWN[0]).astype(np.int64)
+    deviations = {cost: chosen.column(std).astype(np.float64) for cost, (_, std) in columns.items()}
+    own_deviations = {cost: chosen.own_std(std) for cost, (_, std) in columns.items()}
+    labels = dict(zip(split.label_columns, chosen.labels.T.astype(np.float64), strict=True))
+    class_ids = np.nan_to_num(chosen.column("terrain_class").astype(np.float64), nan=_UNKNOWN[0]).astype(np.int64)
     known = dict([_UNKNOWN, *names.items()])
     return Measured(
         chosen,
-        {"w": labels[:, 0], "v": labels[:, 1], "T": plain["duration_s"], "E": plain[energy.energy]},
+        {cost: labels.get(name, chosen.column(name).astype(np.float64)) for cost, (name, _) in columns.items()},
         deviations,
         own_deviations,
         class_ids,
@@ -90,7 +91,8 @@ class Predicted:
         """Return costs of predictions by the predictor's own held-out samples; of energy alone, as of a power at 1 m/s."""
         is_energy = said.mean.shape[1] == 1
         power, velocity = said.mean[:, 0], np.ones(len(said.mean))
-        names = ("E",) if is_energy else QUANTITIES
+        is_time = "velocity_mps" in residuals and "power_watt" not in residuals
+        names = ("E",) if is_energy else ("v", "T") if is_time else QUANTITIES
         if is_energy:
             residuals, chord_m = _convert_energy_residuals(residuals), 1.0
         else:
@@ -112,7 +114,7 @@ class Predicted:
 
 
 def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)) -> Predicted:
-    """Return what a model says of w, v, T, E of every sample; of E alone where it predicts nothing else.
+    """Return the predicted w, v, T, E of every sample; v and T of a model of time alone, E of a model of energy alone.
 
     It is centred by class, or as one where it is not shown the classes. Channels that ``noise`` names are replaced by noise of this seed,
     uniform in [0, 1], each pixel on its own (section V-C).
@@ -120,7 +122,8 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
     rng, layout = np.random.default_rng(list(seed)), model.card.layout
     replaced = [place for place, plane in enumerate(layout.planes) if plane.partition("[")[0] in noise]
     chosen, features = split.with_layout(layout), read_extra_features(split)
-    parts = [Prediction.without_covariance(np.empty((0, len(model.card.inputs.outputs))))]
+    width = 2 if model.card.inputs.is_time_alone else len(model.card.inputs.outputs)
+    parts = [Prediction.without_covariance(np.empty((0, width)))]
     for first in range(0, len(chosen), layout.batch_rows):
         rows = np.arange(first, min(first + layout.batch_rows, len(chosen)))
         patches = chosen.batch(rows)[0].copy()
@@ -184,9 +187,10 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
-    if len(card.inputs.outputs) != len(dataset_card.label.columns):
+    expected = dataset_card.label.columns if dataset_card.labels["energy"] else dataset_card.label.columns[1:]
+    if len(card.inputs.outputs) != len(expected) or card.inputs.is_time_alone != (len(expected) == 1):
         problems.append(
-            f"it predicts only {', '.join(card.inputs.outputs)}, expected {' and '.join(dataset_card.label.columns)}"
+            f"it predicts {', '.join(card.inputs.outputs)}, expected {' and '.join(expected)}, the labels of the dataset"
         )
     absent = [name for name in card.layout.layers if name not in dataset_card.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
@@ -286,10 +290,11 @@ def make_predictions_table(
         }
         values = {
             make_column_name(q, part): columns
-            for q in QUANTITIES
+            for q in found.costs
             for part, columns in zip(_PARTS, _iterate_parts(found, said[name], spreads[name], q), strict=True)
         }
-        arrays = [pa.array((keys | values)[field.name], field.type, from_pandas=True) for field in schema]
+        nothing = pa.nulls(len(found.split))
+        arrays = [pa.array((keys | values).get(field.name, nothing), field.type, from_pandas=True) for field in schema]
         parts.append(pa.Table.from_arrays(arrays, schema=schema))
     return pa.concat_tables(parts)
 
@@ -303,14 +308,19 @@ def _iterate_parts(
     yield from (spread.std, spread.low, spread.high)
 
 
-def compute_errors_joule(table: pa.Table) -> Array:
-    """Return predicted less measured E, shape (N,)."""
-    return to_floats(table, make_column_name("E", "predicted")) - to_floats(table, make_column_name("E"))
+def find_main_cost(table: pa.Table) -> Literal["E", "T"]:
+    """Return the cost that a page is about: E, or T if no energy was predicted."""
+    return "E" if np.isfinite(to_floats(table, make_column_name("E", "predicted"))).any() else "T"
+
+
+def compute_cost_errors(table: pa.Table, quantity: str) -> Array:
+    """Return predicted less measured values of a quantity, shape (N,)."""
+    return to_floats(table, make_column_name(quantity, "predicted")) - to_floats(table, make_column_name(quantity))
 
 
 def find_worst_rows(table: pa.Table, count: int) -> NDArray[np.int64]:
-    """Return the rows of the ``count`` samples of each split whose E is furthest off, the furthest first, split by split."""
-    off, split = np.abs(compute_errors_joule(table)), to_texts(table.column("split"))
+    """Return the rows of the ``count`` samples of each split with the largest errors of the main cost, largest first, split by split."""
+    off, split = np.abs(compute_cost_errors(table, find_main_cost(table))), to_texts(table.column("split"))
     found = [np.empty(0, np.int64)]
     for name in dict.fromkeys(split.tolist()):
         rows = np.flatnonzero((split == name) & np.isfinite(off))

@@ -56,9 +56,14 @@ class Inputs:
     extra_features: tuple[ExtraFeature, ...]
     """Features besides slope and class that are known, with their distribution over the training samples."""
     outputs: tuple[str, ...]
-    """Columns: power and velocity, or energy alone."""
+    """Columns: power and velocity, velocity alone (a dataset without power), or energy alone (a baseline)."""
     scale: tuple[float, ...]
     """Largest label of each output in train."""
+
+    @property
+    def is_time_alone(self) -> bool:
+        """Whether it predicts velocity and so time, but no power."""
+        return len(self.outputs) == 1 and self.outputs[0].endswith("velocity_mps")
 
     @property
     def depth(self) -> int:
@@ -84,6 +89,12 @@ class Prediction:
     def concatenate(cls, parts: Sequence[Prediction]) -> Prediction:
         """Return predictions one after another."""
         return cls(np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts]))
+
+    def add_unknown_power(self) -> Prediction:
+        """Return predictions of velocity alone as predictions of power and velocity; the power is NaN."""
+        mean, covariance = np.full((len(self.mean), 2), np.nan), np.zeros((len(self.mean), 2, 2))
+        mean[:, 1], covariance[:, 1, 1] = self.mean[:, 0], self.covariance[:, 0, 0]
+        return Prediction(mean, covariance)
 
     def take(self, rows: NDArray[np.bool_]) -> Prediction:
         """Return some of them."""

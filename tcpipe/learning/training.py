@@ -176,6 +176,11 @@ def train(
     own = None if predictor is None else load_own_kind(predictor)
     rules = rules if own is None else replace(rules, model=own.model, predictor=own.digest)
     data = open_dataset(dataset, label=rules.label)
+    if not data.card.layers:
+        raise DatasetError(
+            f"{data.path}: has no patches, which a model is trained on; add a map (tcpipe add-map) and build it again, "
+            "or train your own model on its samples.parquet"
+        )
     other = replace(other, channels=other.channels or rules.layers)
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
@@ -293,7 +298,7 @@ def make_samples(
                 "train without --inverse-variance-weights"
             )
     extra_features: tuple[ExtraFeature, ...] = ()  # a network of energy alone takes none
-    if kind.features or (kind.features is None and rules.extra_features and len(outputs) > 1):
+    if kind.features or (kind.features is None and rules.extra_features and not variant.energy_only):
         extra_features = _find_extra_features(used, kind.features, data)
     inputs = Inputs(
         channels=train.channels, patch_px=data.card.patch_px, planes=train.view.form.planes, patch_m=data.card.patch_m,
@@ -418,10 +423,11 @@ def _make_residuals_table(samples: Samples, held_out: Prediction) -> pa.Table:
     """Return labels and predictions of what was held out, one row a sample."""
     is_held, outputs = find_held_out(held_out), samples.inputs.outputs
     held, said, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]
+    is_energy = outputs == (held.energy.energy,)
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class", "fold")}
-    if len(outputs) > 1:
+    if not is_energy:
         columns |= make_residuals(labels, said.mean, said.covariance)
-        # what the labels have in common is in no residual
+        # the common error of all labels is in no residual
         columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}
         columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
     else:

@@ -298,6 +298,8 @@ _CAUSES: dict[str, Describe] = {
     "exclusions": _describe_exclusion,
     "kept_split": _describe_file("kept split", "one"),
     "file_format": _describe_change("format"),
+    "labels": _describe_change("labels"),
+    "without_patches": _describe_change("without patches"),
     "without_coordinates": _describe_change("without coordinates"),
 }
 """By field of `DatasetInputs`: what to say of a change."""

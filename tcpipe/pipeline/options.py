@@ -200,6 +200,16 @@ class BuildDatasetOptions:
             (), Range(1, 1_000_000), "N"
         ),
     )  # fmt: skip
+    labels: str | Sequence[str] = option(
+        (),
+        Option(
+            "Labels that every sample needs, with commas: energy, time, slip, vibration (default: energy if a run has power, else time).",
+            metavar="LIST"
+        ),
+    )  # fmt: skip
+    without_patches: bool = option(
+        False, Option("Write samples without patches; also without a map (default if the store has none).")
+    )
     without_coordinates: bool = option(
         False,
         Option("For publication: metres from an unstated origin, and no longitude, latitude, CRS, times or names."),

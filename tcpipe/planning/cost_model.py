@@ -36,9 +36,14 @@ from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, list_layers
 Floats = NDArray[np.float64]
 
 
-def check_model(model: Model, source: MapReader) -> None:
-    """Raise `ModelError` if a map cannot give the model what it was trained on; all differences at once."""
+def check_model(model: Model, source: MapReader, *, needs_energy: bool = True) -> None:
+    """Raise `ModelError` if a map cannot give the model what it was trained on, or the model lacks energy; all problems at once."""
     problems = []
+    if needs_energy and model.card.inputs.is_time_alone:
+        problems.append(
+            f"{model.name}: predicts time alone, because its dataset has no label energy; expected a model of energy "
+            "(only predict-path takes this one)"
+        )
     needed = model.card.layout.layers
     there = list_layers(source, model.card.inputs.patch_m, model.card.inputs.patch_px)
     if missing := [layer for layer in needed if layer not in there]:
@@ -258,7 +263,8 @@ def predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], tu
                 f"{model.name}: gives {said.mean.shape[1]} numbers a patch, expected two: power and velocity; train it on both labels"
             )
         out.mean[rows], out.covariance[rows] = said.mean, said.covariance
-    out.mean[~(np.isfinite(out.mean).all(axis=1) & (out.mean[:, 1] > 0.0))] = np.nan
+    needed = out.mean[:, 1:] if model.card.inputs.is_time_alone else out.mean
+    out.mean[~(np.isfinite(needed).all(axis=1) & (out.mean[:, 1] > 0.0))] = np.nan
     return out
 
 

@@ -54,7 +54,8 @@ class PathTotals:
     path_segments: int
     path_segments_without_cost: int
     duration_s: float
-    energy_joule: float
+    energy_joule: float | None
+    """None for a model of time alone."""
     turn_rad: float = 0.0
     """How far it turns, both ways counted."""
     turn_energy_joule: float | None = None
@@ -74,6 +75,13 @@ class PathTotals:
     """By reason; a path segment may have several."""
     complete: bool
     """Whether all path segments have a cost."""
+
+    @property
+    def known_energy_joule(self) -> float:
+        """Return the energy; `ModelError` for a model of time alone."""
+        if self.energy_joule is None:
+            raise ModelError(f"{self.model}: predicts time alone, expected a model of energy")
+        return self.energy_joule
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +139,7 @@ def compute_path_cost(
 
     Raises `PathError` where the path is too short, or nowhere on the map; `ModelError` where the map lacks what the model needs.
     """
-    check_model(model, source)
+    check_model(model, source, needs_energy=False)
     segments = _cut_into_segments(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
     frames = segments.frames(model.card.chord_m)
     if not count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)).any():
@@ -193,7 +201,7 @@ def _sum_costs(  # noqa: PLR0917
         raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
     if errors is not None:
         begin_m, rise_m = ELSEWHERE_M + np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
-        for name, predicted in found.items():
+        for name, predicted in [(name, found[name]) for name in found if name in errors]:
             std = segments.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
             there = Metres(predicted.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std)
             found[name] = (
@@ -221,7 +229,8 @@ def _sum_costs(  # noqa: PLR0917
         reason_names=[" ".join(flag_names(int(value), Reason)) for value in said.reasons],
     )
     without_cost = int(table.column("duration_s").null_count)
-    sums = None if errors is None else {name: adapted.total for name, adapted in found.items()}
+    sums = None if errors is None else {name: adapted.total for name, adapted in found.items() if name in errors}
+    is_time_alone = model.card.inputs.is_time_alone
     totals = PathTotals(
         model=model.name,
         map=source.name,
@@ -232,14 +241,14 @@ def _sum_costs(  # noqa: PLR0917
         path_segments=table.num_rows,
         path_segments_without_cost=without_cost,
         duration_s=float(np.nansum(time.value)),
-        energy_joule=float(np.nansum(joule.value)),
+        energy_joule=None if is_time_alone else float(np.nansum(joule.value)),
         turn_rad=float(turn_rad.sum()),
-        turn_energy_joule=None if turning is None else float(np.nansum(turn_joule)),
+        turn_energy_joule=None if turning is None or is_time_alone else float(np.nansum(turn_joule)),
         duration_interval_s=sums["duration"].interval if sums else None,
-        energy_interval_joule=sums["energy"].interval if sums else None,
-        energy_common_std_joule=sums["energy"].common_std if sums else None,
-        held_out_samples=errors["energy"].samples if errors else 0,
-        held_out_runs=errors["energy"].runs if errors else 0,
+        energy_interval_joule=sums["energy"].interval if sums and "energy" in sums else None,
+        energy_common_std_joule=sums["energy"].common_std if sums and "energy" in sums else None,
+        held_out_samples=errors["duration"].samples if errors else 0,
+        held_out_runs=errors["duration"].runs if errors else 0,
         reasons=count_reasons(said.reasons),
         complete=not without_cost,
     )

@@ -95,7 +95,9 @@ class PathResult(PathTotals):
 def format_cost(totals: PathTotals) -> str:
     """Return length, time and energy with their intervals, as one line."""
     duration = _format_quantity(totals.duration_s, totals.duration_interval_s, "s")
-    energy = _format_quantity(totals.energy_joule, totals.energy_interval_joule, "J")
+    energy = "no energy"
+    if totals.energy_joule is not None:
+        energy = _format_quantity(totals.energy_joule, totals.energy_interval_joule, "J")
     part = (
         ""
         if totals.complete
@@ -129,7 +131,7 @@ def find_doubts(totals: PathTotals, path: Subject) -> Iterator[Finding]:
         "energy": (totals.energy_joule, totals.energy_interval_joule),
     }
     for quantity, (value, ends) in of_both.items():
-        if ends is not None and ends[1] - ends[0] > abs(value):
+        if ends is not None and value is not None and ends[1] - ends[0] > abs(value):
             yield make_finding("interval-wide", path, names={"quantity": quantity})
     if totals.held_out_runs == 1 and totals.duration_interval_s is not None:
         yield make_finding("one-held-out-run", path, sample_count=totals.held_out_samples)
@@ -338,7 +340,7 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
 
 def _add_up(model: Model, there: Plan, back: Plan | None, budget_joule: float | None) -> PlanSum:
     """Return what a path and the way back take, with the turn between them, and the probability that a budget suffices."""
-    energy, complete = there.totals.energy_joule, there.totals.complete
+    energy, complete = there.totals.known_energy_joule, there.totals.complete
     errors = None if there.cost.errors is None else there.cost.errors["energy"]
     if back is not None:
         turning = find_added_turning(model)
@@ -346,7 +348,7 @@ def _add_up(model: Model, there: Plan, back: Plan | None, budget_joule: float | 
         turn_rad = wrap_to_pi(np.arctan2(*first[0, ::-1]) - np.arctan2(*last[-1, ::-1]))
         class_id = to_integers(there.cost.path_segments, "terrain_class")[-1:].astype(np.uint8)
         turn = 0.0 if turning is None else float(turning.energy_joule(np.array([turn_rad]), np.zeros(1), class_id)[0])
-        energy, complete = energy + turn + back.totals.energy_joule, complete and back.totals.complete
+        energy, complete = energy + turn + back.totals.known_energy_joule, complete and back.totals.complete
         if errors is not None and back.cost.errors is not None:
             errors = replace(errors, middle=errors.middle + turn) + back.cost.errors["energy"]
     has_answer = errors is not None and budget_joule is not None and complete

@@ -191,7 +191,7 @@ def _draw_title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
     axes.set_title(f"Least {plan.totals.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
     totals, parts = plan.totals, []
     texts = {
-        "energy_joule": f"{totals.energy_joule / 1000.0:.2f} kJ",
+        "energy_joule": f"{totals.known_energy_joule / 1000.0:.2f} kJ",
         "duration_s": f"{totals.duration_s:.0f} s",
         "length_m": f"{totals.length_m:.0f} m",
     }

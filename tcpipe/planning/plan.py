@@ -158,7 +158,7 @@ def _judge(cost: PathCost, objective: Objective, risk: float | None) -> float:
     quantity = "energy" if objective == "energy" else "duration"
     if risk is not None and cost.errors is not None:
         return cost.errors[quantity].compute_quantile(risk)
-    return cost.totals.energy_joule if objective == "energy" else cost.totals.duration_s
+    return cost.totals.known_energy_joule if objective == "energy" else cost.totals.duration_s
 
 
 @dataclass(frozen=True, slots=True)

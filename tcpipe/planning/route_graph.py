@@ -124,7 +124,7 @@ def write_route_graph(
             without_cost.append(edge.edge_id)
             continue
         unreliable += bool(cost.totals.reasons)
-        gaining += cost.totals.energy_joule < 0.0
+        gaining += cost.totals.known_energy_joule < 0.0
         done.append((edge, edge.add_metadata(_list_numbers(cost))))
     if not done:
         raise PathError(f"{where}: no edge has a cost on map {source.name}; check the frame of the graph and --origin")

@@ -11,6 +11,7 @@ page.start(async () => {
   const kinds = {
     split: ["split"], class: ["terrain class"], quality: ["quality"], run: ["run"],
     power: ["power w", "W", 0], velocity: ["velocity v", "m/s", 3], duration: ["time T", "s", 3], energy: ["energy E", "J", 0],
+    slip: ["slip", "", 3], vibration: ["vibration", "m/s²", 2],
     slope: ["slope along travel", "°", 1], turn: ["turn", "°", 1], power_std: ["σ of w", "W", 1],
     apart: ["way to the nearest train metre", "m", 2],
   };
@@ -47,7 +48,7 @@ page.start(async () => {
   const numeric = Object.keys(kinds).filter((name) => kinds[name].length > 1);
   fillKinds("colour", Object.keys(kinds));
   fillKinds("across", ["slope", "velocity", "turn"]);
-  fillKinds("up", ["power", "energy", "velocity"]);
+  fillKinds("up", ["power", "energy", "velocity", "slip", "vibration"]);
   fillKinds("quantity", numeric);
   page.chooseGround(facts.ground);
   const leaks = page.model("leaks");
@@ -61,10 +62,14 @@ page.start(async () => {
   const plotted = () => ({ across: Float64Array.from(c[at("across").value]), up: Float64Array.from(c[at("up").value]) });
   source.data = { x: c.x, y: c.y, fill: coloured("split"), ...plotted() };
   at("colour").onchange = () => { source.data = { ...source.data, fill: coloured(at("colour").value) }; };
-  at("across").onchange = at("up").onchange = () => {
-    source.data = { ...source.data, ...plotted() };
+  const labelAxes = () => {
     brush.below[0].axis_label = label(at("across").value);
     brush.left[0].axis_label = label(at("up").value);
+  };
+  labelAxes();
+  at("across").onchange = at("up").onchange = () => {
+    source.data = { ...source.data, ...plotted() };
+    labelAxes();
     drawHere();
   };
 
@@ -181,8 +186,8 @@ page.start(async () => {
   }
   const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${facts.count} patches; 'tcpipe report --patches' puts all beside it.` : "";
   const labelsOf = (i) => [
-    ...["power", "velocity", "duration", "energy"].map((name) => [kinds[name][0], withStd(i, name)]),
-    ["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")],
+    ...there(["power", "velocity", "duration", "energy", "slip", "vibration"]).map((name) => [kinds[name][0], withStd(i, name)]),
+    ...there(["slope"]).map((name) => [name, digits(c.slope[i], name)]), ["turn", digits(c.turn[i], "turn")],
     ["ground", className(i)],
   ];
   function originOf(i) {
@@ -207,7 +212,7 @@ page.start(async () => {
       const mean = (name) => page.mean(selected.map((k) => c[name][k]).filter(Number.isFinite));
       const by = facts.splits.map((s, k) => [s.name, selected.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
       left.append(make("b", `${selected.length} selected`), pairs([
-        ...["power", "velocity", "energy", "slope"].map((name) => [`mean ${kinds[name][0]}`, digits(mean(name), name)]),
+        ...there(["power", "velocity", "energy", "slope"]).map((name) => [`mean ${kinds[name][0]}`, digits(mean(name), name)]),
         ["splits", by.map(([name, count]) => `${name} ${count}`).join(", ")],
         ["flagged", `${selected.filter((j) => c.quality[j] & facts.flags).length}`]]), make("p", `Number ${selected.indexOf(current) + 1} of them:`));
     }
@@ -229,9 +234,11 @@ page.start(async () => {
   let first = 0;
   const orders = {
     "order of the dataset": null,
-    "σ of w": (i) => c.power_std[i],
-    "w, largest first": (i) => c.power[i],
-    "w, smallest first": (i) => -c.power[i],
+    ...(there(["power"]).length && {
+      "σ of w": (i) => c.power_std[i],
+      "w, largest first": (i) => c.power[i],
+      "w, smallest first": (i) => -c.power[i],
+    }),
   };
   fillSelect(at("sort"), Object.keys(orders));
   page.fillLayers(at("layer"), sheets?.layers ?? []);
@@ -247,7 +254,7 @@ page.start(async () => {
       const picture = pictureOf(i);
       const layer = picture?.[0].layers.find((one) => one.name === at("layer").value);
       button.append(picture ? page.patch(picture[0], layer, picture[1], 92) : make("span", "not in this page", { className: "patch" }));
-      button.append(`${className(i)} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${splitName(i)}`);
+      button.append([className(i), ...there(["slope", "power"]).map((name) => digits(c[name][i], name)), splitName(i)].join(", "));
       button.onclick = () => {
         if (selected.length > 1) focus(i);
         else pick([i]);

@@ -15,7 +15,7 @@ from pyproj import Transformer
 from scipy.spatial import cKDTree
 
 from tcpipe.errors import DatasetError, StoreError, UsageError
-from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings, judge_dataset
+from tcpipe.formats.dataset_card import LOCAL, DatasetCard, group_dataset_findings, judge_dataset
 from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_columns
 from tcpipe.formats.documents import BLOBS
 from tcpipe.formats.finding_lines import format_group, group_findings
@@ -45,6 +45,7 @@ from tcpipe.report.page import (
 )
 from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
+from tcpipe.stages.sample import separate_frames
 from tcpipe.store import Store, is_store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
@@ -89,7 +90,7 @@ def render_dataset_report(
     plots, lost = draw_dataset_map(directory, card, shown.xy_m)
     quality = samples.column("quality").to_numpy()
     try:
-        patches = make_patches_data(directory, card, samples, len(shown.xy_m))
+        patches = make_patches_data(directory, card, samples, len(shown.xy_m)) if card.layers else None
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
@@ -147,6 +148,7 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
         Number(f"{len(card.runs)}", "runs"),
         Number(f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
         Number(f"{100 * card.flagged_samples.share:.1f} %", "flagged samples"),
+        *(Number("none", name) for name in card.absent_labels),
     ]
 
 
@@ -290,7 +292,8 @@ def _make_provenance_section(card: DatasetCard) -> Section:
         ("inputs", card.inputs),
         ("recipe of ingest", ", ".join(sorted({run.recipe_id for run in card.runs}))),
         ("split", f"held out by {rules.holdout}, test fraction {rules.test_fraction:g}, seed {rules.seed}"),
-        ("patches", f"{card.patch_m:g} m, {card.patch_px} px: {', '.join(card.layers)}"),
+        ("patches", f"{card.patch_m:g} m, {card.patch_px} px: {', '.join(card.layers)}" if card.layers else "none"),
+        ("labels", ", ".join(f"{name} of {count}" for name, count in card.labels.items())),
         *(
             (
                 f"map {grid.name}",
@@ -351,11 +354,22 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
 
 def _read_middles_m(card: DatasetCard, table: pa.Table) -> Floats:
     if card.without_coordinates:
-        ends = [np.column_stack([to_floats(table, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")]
-        return 0.5 * (ends[0] + ends[1])
-    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
+        start_m, end_m = _read_ends_m(table)
+        return 0.5 * (start_m + end_m)
+    if card.plane_crs == LOCAL:
+        starts_ns = np.array(find_first_starts_ns(card, table))
+        frame = np.argsort(np.argsort(starts_ns, kind="stable"))[
+            _find_indices(table, "run_id", [run.run_id for run in card.runs])
+        ]
+        start_m, end_m = separate_frames(frame, _read_ends_m(table))
+        return 0.5 * (start_m + end_m)
+    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.plane_crs, always_xy=True)
     middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
     return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
+
+
+def _read_ends_m(table: pa.Table) -> list[Floats]:
+    return [np.column_stack([to_floats(table, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")]
 
 
 def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray[np.int32]:

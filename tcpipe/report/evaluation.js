@@ -78,9 +78,10 @@ page.start(async () => {
   show([]);
 
   if (facts.patches) {
+    const main = facts.quantities[0], cost = (value) => page.quantity(value, main.unit, main.digits);  // E, or T without energy
     page.gallery(facts.patches, (i) => ({
       kind: classOf(i).name, split: splitOf(i).name,
-      words: `${classOf(i).name} ${page.quantity(c.slope[i], "°", 1)}, ${page.quantity(c.E[i], "J", 0)}, predicted ${page.quantity(c["E predicted"][i], "J", 0)}, ${splitOf(i).name}`,
+      words: `${classOf(i).name} ${page.quantity(c.slope[i], "°", 1)}, ${cost(c[main.key][i])}, predicted ${cost(c[`${main.key} predicted`][i])}, ${splitOf(i).name}`,
     }), (i) => {
       at("split").value = "";
       draw();

@@ -20,6 +20,8 @@ LABELS = {
     "velocity": ("velocity_mps", "velocity_std_mps", 4),
     "duration": ("duration_s", "duration_std_s", 4),
     "energy": ("energy_joule", "energy_std_joule", 1),
+    "slip": ("slip_fraction", "slip_std_fraction", 4),
+    "vibration": ("vibration_mps2", "vibration_std_mps2", 3),
 }
 """Column, column of the standard deviation and decimals of each label on a page."""
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from tcpipe.errors import TcpipeError, clean_line
-from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_card import LOCAL, DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.store_records import StoredMap
@@ -43,12 +43,14 @@ def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[
     """Return the map of the samples at ``xy_m``, (N, 2), and the plot beside it, and which parts of the map are lost."""
     if card.maps:
         bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
+    elif len(xy_m):
+        bounds = (*xy_m.min(axis=0).tolist(), *xy_m.max(axis=0).tolist())
     else:
-        bounds = (0.0, 0.0, *xy_m.max(axis=0, initial=1.0).tolist())
+        bounds = (0.0, 0.0, 1.0, 1.0)
     tools = "box_select,lasso_select"
     plot = make_map_plot(
         alt=f"Map of {len(xy_m)} points, coloured by the quantity chosen above; the tables below list the counts.",
-        axes=("easting [m]", "northing [m]"),
+        axes=("x [m]", "y [m]") if card.plane_crs == LOCAL else ("easting [m]", "northing [m]"),
         height_px=110 + 330 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
         tools=f"pan,wheel_zoom,{tools},reset,save",
     )
@@ -144,7 +146,7 @@ def _project_rings(card: DatasetCard) -> list[Floats]:
     """Return every ring of every polygon of the region in the map's plane [m], each of shape (M, 2)."""
     if card.split.region is None:
         return []
-    to_map, rings = Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True), []
+    to_map, rings = Transformer.from_crs("EPSG:4326", card.plane_crs, always_xy=True), []
     for geometry in card.split.region.values():
         polygons = (geometry.coordinates,) if geometry.type == "Polygon" else geometry.coordinates
         rings += [np.array(ring, dtype=float)[:, :2] for polygon in polygons for ring in polygon]

@@ -11,7 +11,8 @@ page.start(async () => {
   const panels = [];
   const range = model("gates").x_range;
   const names = { w: ["power w", "power", "W", 1], v: ["velocity v", "velocity", "m/s", 4], T: ["time T", "duration", "s", 4], E: ["energy E", "energy", "J", 1],
-    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 3], sigma: ["σ of position", "position_std", "m", 3] };
+    slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 3], sigma: ["σ of position", "position_std", "m", 3],
+    slip: ["slip", "slip", "", 3], vibration: ["vibration", "vibration", "m/s²", 2] };
   const ofTrack = { w: "power", v: "speed", sigma: "position_std" };  // columns that colour the whole track, segments or not
   const there = Object.keys(names).filter((key) => s[names[key][1]]?.some(Number.isFinite));
   const finite = Number.isFinite;
@@ -176,7 +177,7 @@ page.start(async () => {
     const y = Float64Array.from(s[name]), std = s[`${name}_std`];
     const off = (sign) => y.map((value, i) => value + sign * (std && finite(std[i]) ? std[i] : 0));
     model("labels").data_source.data = { t: s.start.map((t, i) => (t + s.end[i]) / 2), y, low: off(-1), high: off(1), colour: flagged };
-    model("label plot").left[0].axis_label = `${at("label").value} [${unit}]${std ? ", ± σ" : ""}`;
+    model("label plot").left[0].axis_label = `${at("label").value}${unit && ` [${unit}]`}${std ? ", ± σ" : ""}`;
   }
   const local = facts.findings.filter(([start, end]) => end - start < 0.9 * (facts.last_s - facts.first_s));  // others hold everywhere
   const found = local.flatMap(([start, end, colour]) => pathOf(after(track.t, start - 1), after(track.t, end + 1)).map((path) => [path, colour]));

@@ -59,7 +59,7 @@ def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: T
         **_compute_turns(cut, rows, imu, info),
         **{name: interpolate(stamp_ns, to_floats(rows, name), middle_ns) for name in ("roll_rad", "pitch_rad")},
         **_compute_slip(cut, rows, cost),
-        "vibration_mps2": _compute_vibration(imu, *spans),
+        **_compute_vibration(imu, *spans),
     }
 
 
@@ -110,18 +110,16 @@ def _compute_slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
     return {"slip_fraction": 1.0 - ratio, "slip_std_fraction": np.abs(ratio) * relative}
 
 
-def _compute_vibration(
-    imu: pa.Table | None, start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    unknown = np.full(len(start_ns), np.nan)
-    if imu is None:
-        return unknown
-    force = np.column_stack([to_floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
-    is_known = np.isfinite(force).all(axis=1)
-    low, high = _GRAVITY_BAND_MPS2
-    if not is_known.any() or not low <= float(np.median(np.linalg.norm(force[is_known], axis=1))) <= high:
-        return unknown
-    return compute_vibration_mps2(to_integers(imu, "stamp_ns")[is_known], force[is_known], start_ns, end_ns)
+def _compute_vibration(imu: pa.Table | None, start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> Arrays:
+    """Return the vibration and its standard deviation; NaN without an IMU that measures the specific force with gravity."""
+    found = np.full(len(start_ns), np.nan), np.full(len(start_ns), np.nan)
+    if imu is not None:
+        force = np.column_stack([to_floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
+        is_known = np.isfinite(force).all(axis=1)
+        low, high = _GRAVITY_BAND_MPS2
+        if is_known.any() and low <= float(np.median(np.linalg.norm(force[is_known], axis=1))) <= high:
+            found = compute_vibration_mps2(to_integers(imu, "stamp_ns")[is_known], force[is_known], start_ns, end_ns)
+    return dict(zip(("vibration_mps2", "vibration_std_mps2"), found, strict=True))
 
 
 Flags = dict[Quality, NDArray[np.bool_]]

@@ -107,6 +107,66 @@ def sample_segments(
     )
 
 
+def place_segments(segments: pa.Table, place: Projection | NDArray[np.integer], config: SampleConfig) -> Sampled:
+    """Return the footprints of all segments, without patches.
+
+    Parameters
+    ----------
+    segments : L5 of any runs.
+    place : the projection from the segments' longitudes and latitudes to the plane of the footprints; or, of runs in local frames, the
+        number of each segment's run, shape (M,): they are placed side by side in that order (`separate_frames`).
+    """
+    count = segments.num_rows
+    if isinstance(place, Projection):
+        start, end = (place.forward(read_lonlat_deg(segments, name)) for name in _ENDS)
+    else:
+        ends = [np.stack([to_floats(segments, f"{name}_{axis}_m") for axis in "xy"], axis=1) for name in _ENDS]
+        start, end = separate_frames(place, ends)
+    corners = compute_footprints(make_patch_frames(start, end, to_floats(segments, "chord_m")), config.patch_m)
+    unknown, nothing = np.full(count, np.nan), np.zeros(count, np.uint8)
+    numbers = (
+        "height_min_m",
+        "slope_rad",
+        "cross_slope_rad",
+        "valid_fraction",
+        "height_clipped_fraction",
+        "terrain_purity",
+    )
+    return Sampled(
+        kept=np.arange(count),
+        map_index=nothing,
+        patches=Patches(
+            {}, **dict.fromkeys(numbers, unknown), terrain_class=nothing, profile_m=np.full((count, 3), np.nan)
+        ),
+        position_std_m=to_floats(segments, "position_std_m"),
+        footprint_xy_m=corners,
+        footprint_lonlat_deg=place.inverse(corners)
+        if isinstance(place, Projection)
+        else np.full(corners.shape, np.nan),
+        lost_by=np.zeros(count, np.uint32),
+        findings=(),
+    )
+
+
+_ENDS = ("start", "end")
+_FRAME_STEP_M = 100.0
+"""Local frames are moved by multiples of it: blocks of the split stay whole if they are of 1, 2, 5, 10, 20, 25 or 50 m."""
+
+
+def separate_frames(frame: NDArray[np.integer], ends_xy_m: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """Return points of local frames in one plane [m], each shape (N, 2): a later frame begins behind the earlier ones along x.
+
+    ``frame`` is the number of each point's frame, shape (N,).
+    """
+    low, high = (np.full(int(frame.max(initial=-1)) + 1, sign * np.inf) for sign in (1.0, -1.0))
+    for points in ends_xy_m:
+        np.minimum.at(low, frame, points[:, 0])
+        np.maximum.at(high, frame, points[:, 0])
+    first, last = np.floor(low / _FRAME_STEP_M), np.floor(high / _FRAME_STEP_M)
+    steps = np.cumsum(last - first + 2.0) - (last - first + 2.0) - first
+    return [points + np.stack([_FRAME_STEP_M * steps[frame], np.zeros(len(frame))], axis=1) for points in ends_xy_m]
+
+
 def _find_losses(
     patches: Patches, corners: NDArray[np.float64], source: MapReader, config: SampleConfig
 ) -> NDArray[np.uint32]:

@@ -93,3 +93,7 @@ class Loss(IntFlag):
     """Another run of the dataset has the same section of the same drive."""
     EXCLUDED = 1 << 26
     """A list of samples to exclude (``--exclude``) names it."""
+    NO_LABEL = 1 << 27
+    """A segment without a label that was asked for (``--labels``), but for the energy: that is `NO_POWER`."""
+    NO_POSITION = 1 << 28
+    """A segment without longitude and latitude, in a dataset without patches whose other runs have them."""

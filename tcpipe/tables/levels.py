@@ -24,7 +24,7 @@ DATA_MODEL_VERSION = "4.0"
 
 TABLES_VERSION = "4.0"  # in which a table last changed
 
-RESULTS_VERSION = 1
+RESULTS_VERSION = 2
 """Raised when the same log and recipe give other values in a table: runs of an earlier one are ingested again."""
 
 
@@ -311,6 +311,12 @@ MOTION_COLUMNS = tuple(
             f"root mean square of the specific force between 3 and 20 Hz, three axes together; {_GAPS}",
             "sensor",
         ),
+        (
+            "vibration_std_mps2",
+            "m/s2",
+            "standard deviation of vibration_mps2 by the short time of a segment; it excludes the noise of the IMU",
+            "sensor",
+        ),
     )
 )
 """How the robot moves over a segment."""
@@ -377,6 +383,14 @@ LABELLED_SEGMENTS = TableSchema(
     ),
 )
 
+LABELS: Mapping[str, str] = {
+    "energy": "energy_joule",
+    "time": "duration_s",
+    "slip": "slip_fraction",
+    "vibration": "vibration_mps2",
+}
+"""Column of each label that a dataset can be asked for."""
+
 PLACED_SEGMENTS = LABELLED_SEGMENTS.select_columns(
     *(f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")),
     *("run_id", "chord_m", "arc_length_m", "position_std_m"),
@@ -397,7 +411,9 @@ SAMPLES = TableSchema(
             "fold of spatial cross-validation, blocks kept whole; null unless train or test",
             nullable=True,
         ),
-        Column("map", pa.string(), "", "name of the map the patch was sampled from"),
+        Column(
+            "map", pa.string(), "", "name of the map the patch was sampled from; null without patches", nullable=True
+        ),
         *_SEGMENT_COLUMNS,
         *MOTION_COLUMNS,
         *_LABEL_COLUMNS,
@@ -410,19 +426,27 @@ SAMPLES = TableSchema(
         ),
         Column("terrain_name", pa.string(), "", "name of that class; null without a terrain layer", nullable=True),
         _make_nullable("terrain_purity", "1", "share of the chord on that class; null without a terrain layer"),
-        Column(
-            "slope_rad", _F64, "rad", "slope of a plane fitted to the patch's heights, positive uphill along travel"
+        *(
+            _make_nullable(name, unit, f"{doc}; null without patches", frame)
+            for name, unit, doc, frame in (
+                (
+                    "slope_rad",
+                    "rad",
+                    "slope of a plane fitted to the patch's heights, positive uphill along travel",
+                    "",
+                ),
+                ("cross_slope_rad", "rad", "cross slope, positive when the left side is higher", ""),
+                ("valid_fraction", "1", "share of the patch's pixels with data in every layer", ""),
+                ("height_min_m", "m", "smallest height in the patch; the height layer is above it", "map"),
+                (
+                    "height_clipped_fraction",
+                    "1",
+                    "share of pixels more than 1 m above the smallest, clipped in the tensor",
+                    "",
+                ),
+            )
         ),
-        Column("cross_slope_rad", _F64, "rad", "cross slope, positive when the left side is higher"),
-        Column("valid_fraction", _F64, "1", "share of the patch's pixels with data in every layer"),
-        Column("height_min_m", _F64, "m", "smallest height in the patch; the height layer is above it", "map"),
-        Column(
-            "height_clipped_fraction",
-            _F64,
-            "1",
-            "share of pixels more than 1 m above the smallest, clipped in the tensor",
-        ),
-        _make_geometry("Point in the centre of the patch", "WGS 84"),
+        _make_geometry("Point in the centre of the footprint; null in a local frame", "WGS 84"),
     ),
 )
 

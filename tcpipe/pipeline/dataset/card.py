@@ -39,13 +39,17 @@ from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, Verdict, make_finding, read_threshold
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELS
+from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.layers import LAYERS, Layer
 
 VELOCITY_COLUMN = {"ground": "velocity_mps", "fused": "fused_velocity_mps"}
 """Column of samples.parquet that each choice of ``label.velocity`` trains on."""
 
-_DESCRIBED = ("power_watt", "velocity_mps", "fused_velocity_mps", "duration_s", "energy_joule")
+_DESCRIBED = (
+    *("power_watt", "velocity_mps", "fused_velocity_mps", "duration_s", "energy_joule", "slip_fraction"),
+    "vibration_mps2",
+)
 
 CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *_DESCRIBED)
 """Columns of samples.parquet that the card is made from."""
@@ -55,12 +59,15 @@ def measure_repeatability(
     samples: pa.Table, xy_m: NDArray[np.float64], *, velocity_column: str, chord_m: float
 ) -> dict[str, Floor | None]:
     """Return how well each label repeats itself; ``samples`` has `REPEATABILITY_COLUMNS`, ``xy_m`` are their centres [m], shape (N, 2)."""
-    slope_rad = to_floats(samples, "slope_rad")
+    slope_rad = np.nan_to_num(to_floats(samples, "slope_rad"))  # unknown without patches
     terrain = samples.column("terrain_class").fill_null(0).to_numpy()
     repeated = find_repeated_pairs(xy_m, to_floats(samples, "course_rad"), terrain, chord_m=chord_m)
     found = dict[str, Floor | None]()
     for name in ("power_watt", velocity_column, "duration_s", "energy_joule"):  # one after another: each takes memory
         values = to_floats(samples, name)
+        if not np.isfinite(values).all():
+            found[name] = None
+            continue
         residual = compute_slope_residuals(values, terrain, slope_rad)
         found[name] = estimate_repeatability(values, residual, repeated, xy_m, chord_m=chord_m)
     return found
@@ -82,7 +89,8 @@ def make_dataset_card(
     shards: Sequence[Shard],
 ) -> DatasetCard:
     """Return the card without checksums; ``samples`` has `CARD_COLUMNS` and `PHYSICS_COLUMNS`."""
-    recipe, about, classes = options.recipe, options.recipe.dataset, content.sources[0].classes
+    recipe, about = options.recipe, options.recipe.dataset
+    classes = content.sources[0].classes if content.sources else PAPER_CLASSES
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
     card = DatasetCard(
@@ -104,15 +112,11 @@ def make_dataset_card(
         patch_m=recipe.sample.patch_m,
         patch_px=recipe.sample.patch_px,
         layers={name: describe_layer(layer) for name, layer in layers.items()},
-        tensor={
-            "channels": tuple(name for name in LAYERS if name in layers),
-            "ortho": "O / 255",
-            "terrain": f"(C - 1) / ({classes.count} - 1)",
-            "height": "min((H - min H) / 1 m, 1)",
-            **{name: _describe_formula(layer) for name, layer in layers.items() if name not in LAYERS},
-        },
+        tensor=_describe_tensor(layers, classes) if layers else {},
         classes=classes.classes if has_terrain else (),
         label=_label(recipe, inputs),
+        labels=_count_labels(samples, options.labels),
+        plane="" if content.sources else content.plane,
         energy_budget=pool_budgets(run.energy_budget for run in inputs.sources),
         split=content.split,
         distance_by_reason_m=content.distance_by_reason_m,
@@ -137,6 +141,25 @@ def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
     includes = tuple(sorted({load for power in powers if power is not None for load in power.includes}))
     velocity = recipe.label.velocity
     return LabelColumns(("power_watt", VELOCITY_COLUMN[velocity]), velocity, includes)
+
+
+def _count_labels(samples: pa.Table, asked: Sequence[str]) -> dict[str, int]:
+    """Return the number of samples with each label; a label that was not asked for is absent, unless the default was taken."""
+    return {
+        name: int(np.isfinite(to_floats(samples, column)).sum()) if name in (asked or LABELS) else 0
+        for name, column in LABELS.items()
+    }
+
+
+def _describe_tensor(layers: Mapping[str, Layer], classes: ClassTable) -> dict[str, str | tuple[str, ...]]:
+    """Return the channels of the tensor, and the formula of each layer."""
+    return {
+        "channels": tuple(name for name in LAYERS if name in layers),
+        "ortho": "O / 255",
+        "terrain": f"(C - 1) / ({classes.count} - 1)",
+        "height": "min((H - min H) / 1 m, 1)",
+        **{name: _describe_formula(layer) for name, layer in layers.items() if name not in LAYERS},
+    }
 
 
 def _describe_formula(layer: Layer) -> str:
@@ -177,7 +200,8 @@ def _compute_statistics(samples: pa.Table) -> dict[str, LabelStatistics]:
     train = pc.equal(samples.column("split"), "train")
     found = {}
     for name in _DESCRIBED:
-        values = samples.column(name).filter(train).to_numpy()
+        values = to_floats(samples.filter(train), name)
+        values = values[np.isfinite(values)]
         figures = (
             [float(compute()) for compute in (values.mean, values.std, values.min, values.max)]
             if len(values)
@@ -226,6 +250,8 @@ def count_flagged(quality: pa.ChunkedArray) -> FlaggedSamples:
 def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
     """Yield findings on samples: too few, flagged ones, empty splits, leakage, no repetitions."""
     dataset = Subject("dataset", card.name)
+    if card.absent_labels and not card.made_from.labels:
+        yield make_finding("labels-absent", dataset, names={"labels": ", ".join(card.absent_labels)})
     if card.samples < read_threshold("few-samples", "min_sample_count"):
         yield make_finding("few-samples", dataset, sample_count=card.samples)
     yield from _find_flagged(card, dataset)

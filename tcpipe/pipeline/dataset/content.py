@@ -6,10 +6,9 @@ Columns of the samples beyond their schema: the tags of their runs, and covariat
 from __future__ import annotations
 
 import logging
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
+from pyproj import CRS
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import (
+    LOCAL,
     Covariate,
     Exclusion,
     MapRegistration,
@@ -42,104 +43,33 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import (
     ROWS_PER_GROUP,
     add_geo_metadata,
-    map_table,
     move_to_file,
     take_rows,
-    write_pieces,
 )
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.formats.zarr_arrays import Compression
-from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.options import BuildOptions
+from tcpipe.pipeline.dataset.pooling import list_needs, move_losses, pool_segments
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
-from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded
+from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded, number_runs
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
-from tcpipe.stages.sample import Sampled, sum_losses
+from tcpipe.stages.sample import Sampled, place_segments, sum_losses
 from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
-from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
-from tcpipe.terrain.projection import compute_area, parse_crs
+from tcpipe.tables.levels import SAMPLES
+from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, parse_crs
+from tcpipe.terrain.tiles import find_map_projection
 
 logger = logging.getLogger("tcpipe")
-
-
-def _pool_segments(
-    runs: Sequence[StoredRun], directory: Path, *, again: Mapping[str, NDArray[np.bool_]]
-) -> tuple[pa.Table, dict[str, float], list[Finding]]:
-    """Return the segments that can become samples, mapped from a file in ``directory``, and metres by reason, which sum to the odometers.
-
-    ``again`` marks, by run, the segments that another run has too, in the order of the run's file. `DatasetError` tells what the runs
-    lack where no segment can become a sample.
-    """
-    names = dict.fromkeys(name for run in runs for name in run.manifest.distance_by_reason_m)
-    distance_by_reason_m = {
-        name: math.fsum(run.manifest.distance_by_reason_m.get(name, 0.0) for run in runs) for name in names
-    }
-    path, lacks = directory / "segments.arrow", dict[str, list[str]]()
-    lost = {loss: list[float]() for loss in (Loss.NO_POWER, Loss.OUTSIDE_MAP, Loss.RECORDED_TWICE)}
-    write_pieces(path, LABELLED_SEGMENTS.arrow(), _iterate_usable(runs, again, lacks, lost))
-    segments = map_table(path)
-    if segments.num_rows == 0:
-        powered, located = (any(name not in lack for lack in lacks.values()) for name in ("power", "gnss"))
-        missing = "power where there is GNSS" if powered and located else "GNSS" if powered else "power"
-        raise DatasetError(
-            f"{len(runs)} runs, {sum(run.facts.segments for run in runs)} segments, but none with {missing}; ingest runs that have it"
-        )
-    findings = [
-        make_finding(
-            "run-without-samples", Subject("run", run.run_id), names={"lacks": " and ".join(lacks[run.run_id])}
-        )
-        for run in runs
-        if run.facts.segments and lacks[run.run_id]
-    ]
-    return (
-        segments,
-        _move_losses(distance_by_reason_m, {loss: math.fsum(metres) for loss, metres in lost.items()}),
-        findings,
-    )
-
-
-def _iterate_usable(
-    runs: Sequence[StoredRun],
-    again: Mapping[str, NDArray[np.bool_]],
-    lacks: dict[str, list[str]],
-    lost: Mapping[Loss, list[float]],
-) -> Iterator[pa.Table]:
-    """Yield each run's segments that can become samples; add what no segment of it has to ``lacks``, and lost metres to ``lost``."""
-    for run in runs:
-        segments = run.segments()
-        powered: NDArray[np.bool_] = np.isfinite(to_floats(segments, "power_watt"))
-        ends = [f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")]
-        located = np.isfinite([to_floats(segments, end) for end in ends]).all(axis=0)
-        arc_m = to_floats(segments, "arc_length_m")
-        usable = powered & located
-        twice = usable & again.get(run.run_id, np.zeros(len(usable), np.bool_))
-        for loss, rows in zip(lost, (~powered, powered & ~located, twice), strict=True):
-            lost[loss].append(float(arc_m[rows].sum()))
-        lacks[run.run_id] = [name for name, has in (("power", powered), ("gnss", located)) if not has.any()]
-        usable &= ~twice
-        yield segments if usable.all() else segments.filter(pa.array(usable))
-
-
-def _move_losses(distance_by_reason_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
-    """Return the breakdown with metres moved from kept to losses [m]; its sum stays the odometer."""
-    moved = dict(distance_by_reason_m)
-    for loss, metres in lost_m.items():
-        name = flag_name(loss)
-        moved[name] = moved.get(name, 0.0) + float(metres)
-    total = math.fsum(float(metres) for metres in lost_m.values())
-    left = moved.get(KEPT, 0.0) - total
-    moved[KEPT] = left if left > 1e-9 * total else 0.0  # nothing left but rounding
-    return moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +144,9 @@ class SampleTable:
             sample_id=segments.column("segment_id"),
             split=assigned.split.tolist(),
             fold=pa.array(assigned.fold, pa.int8(), mask=assigned.fold == NO_FOLD),
-            map=[self.map_names[index] for index in self.sampled.map_index[at]],
+            map=[self.map_names[index] for index in self.sampled.map_index[at]]
+            if self.map_names
+            else pa.nulls(len(at)),
             **columns,
         )
         added = take_rows(self.added, rows_of_segments)
@@ -243,6 +175,8 @@ class Content:
     samples: SampleTable
     spool: Spool
     sources: tuple[MapFile, ...]
+    plane: str
+    """CRS of the footprints, or `LOCAL`."""
     split: SplitResult
     distance_by_reason_m: Mapping[str, float]
     registrations: Sequence[tuple[MapRegistration, ...]]
@@ -261,23 +195,34 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
     Raises `DatasetError`, `MapError`: no segment, none on the map, or none inside the region.
     """
     recipe = options.recipe
-    segments, distance_by_reason_m, unusable = _pool_segments(inputs.runs, directory, again=inputs.again)
+    needs = list_needs(inputs.runs, options.labels, has_patches=bool(inputs.map_records))
+    segments, distance_by_reason_m, unusable = pool_segments(inputs.runs, directory, needs, again=inputs.again)
     logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
     ranks = _rank_segments(segments, seed=recipe.split.seed)
     sources = tuple(open_map(*arguments) for arguments in inputs.maps())
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     shifts = [list_shifts(registrations) for registrations, _ in registered]
-    sampled, slot, spool = sample_all_segments(
-        segments,
-        ranks,
-        inputs.maps,
-        recipe.sample,
-        gnss_crs=recipe.read.gnss_crs,
-        shifts=shifts,
-        jobs=jobs,
-        directory=directory,
-    )
-    lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
+    projection = _choose_plane(segments, sources)
+    if sources:
+        sampled, slot, spool = sample_all_segments(
+            segments,
+            ranks,
+            inputs.maps,
+            recipe.sample,
+            gnss_crs=recipe.read.gnss_crs,
+            shifts=shifts,
+            jobs=jobs,
+            directory=directory,
+        )
+    else:
+        place = (
+            number_runs(segments)[0]
+            if projection is None
+            else replace(projection, source=parse_crs(recipe.read.gnss_crs, where="gnss_crs"))
+        )
+        sampled = place_segments(segments, place, recipe.sample)
+        slot, spool = np.zeros(segments.num_rows, np.int64), Spool(directory, {}, recipe.sample.patch_px)
+    lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by) if sources else {}
     if len(sampled.kept) == 0:
         _, found = find_removed_by_ground(inputs.runs, segments, sampled.kept, sources, recipe, shifts=shifts)
         raise DatasetError(
@@ -290,7 +235,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
     assigned, result = draw_splits(
         segments,
         sampled,
-        sources[0].grid,
+        projection,
         options.regions,
         recipe,
         excluded=excluded.mask,
@@ -306,7 +251,9 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
-    flags, contradictions = find_contradictions(inputs.runs, segments, sampled, inputs.map_names, recipe.sample)
+    flags, contradictions = np.zeros(len(sampled.kept), np.uint32), list[Finding]()
+    if sources:
+        flags, contradictions = find_contradictions(inputs.runs, segments, sampled, inputs.map_names, recipe.sample)
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
     kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
@@ -314,16 +261,20 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
         segments, sampled.kept[order], inputs.sources, options.covariates, recipe.covariates, layers=tuple(spool.layers)
     )
     robots = [run.robot for run in inputs.sources]
-    narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m)
-    class_names, has_terrain = sources[0].classes.names(), "terrain" in spool.layers
+    narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m) if sources else []
+    class_names = (sources[0].classes if sources else PAPER_CLASSES).names()
+    has_terrain = "terrain" in spool.layers
+    if projection is None:
+        incomplete = [*incomplete, make_finding("local-frames", Subject("dataset", recipe.dataset.name))]
     more = inputs.map_names, class_names, order, flags, added
     found = (*inputs.findings, *unusable, *shifted, *sampled.findings, *contradictions)
     return Content(
         samples=SampleTable(segments, sampled, slot, has_terrain, assigned, *more),
         spool=spool,
         sources=sources,
+        plane=LOCAL if projection is None else format_crs(projection.target),
         split=result,
-        distance_by_reason_m=_move_losses(distance_by_reason_m, {**lost_m, **unused_m}),
+        distance_by_reason_m=move_losses(distance_by_reason_m, {**lost_m, **unused_m}),
         registrations=[registrations for registrations, _ in registered],
         covariates=covariates,
         exclusions=excluded.lists,
@@ -331,6 +282,21 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
         removal=removal,
         findings=(*found, *excluded.findings, *narrow, *biased, *incomplete),
     )
+
+
+def _choose_plane(segments: pa.Table, sources: Sequence[MapFile]) -> Projection | None:
+    """Return the projection from WGS 84 to the plane of the footprints: the first map's, or the UTM zone of the first segment.
+
+    None: the runs have no positions on Earth.
+    """
+    if sources:
+        return find_map_projection(sources[0], "EPSG:4326")
+    lonlat_deg = read_lonlat_deg(segments, "start")
+    if not np.isfinite(lonlat_deg).all():
+        return None
+    wgs84 = CRS.from_epsg(4326)
+    area_deg = (*lonlat_deg.min(axis=0).tolist(), *lonlat_deg.max(axis=0).tolist())
+    return Projection(wgs84, find_utm_crs(wgs84, tuple(lonlat_deg[0].tolist())), area_deg)
 
 
 def _rank_segments(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
@@ -388,8 +354,10 @@ def write_patches(
     *,
     compression: Compression,
 ) -> list[Shard]:
-    """Write the layers, shard by shard; return the shards if the format has any."""
+    """Write the layers, shard by shard; return the shards if the format has any. Without patches, Parquet shards have samples alone."""
     samples, spool = content.samples, content.spool
+    if not spool.layers and file_format == "zarr":
+        return []
     pixels = Pixels(spool.layers, spool.patch_px, samples.slot[samples.patch], spool.read)
     if file_format == "parquet":
         split = samples.assigned.select(samples.patch).split

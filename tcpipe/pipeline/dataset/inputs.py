@@ -84,7 +84,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
     except DatasetError as error:
         problems += error.problems
     try:
-        records = choose_maps(store, state, options.map_names)
+        records = choose_maps(store, state, options)
     except DatasetError as error:
         problems += error.problems
     if problems:
@@ -93,6 +93,9 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
     once = remove_duplicates(chosen.runs)
     maps = partial(_find_maps, store, records)
     findings = (*chosen.findings, *once.findings)
+    if not records and not options.without_patches:
+        remedy = Remedy("add_map", command="tcpipe add-map NAME --height FILE")
+        findings += (make_finding("no-map", Subject("dataset", options.recipe.dataset.name), remedies=[remedy]),)
     sources = tuple(map(_make_source, once.runs))
     return Inputs(once.runs, sources, records, maps, made_from, made_from.digest, once.again, chosen, findings)
 
@@ -100,7 +103,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
 def plan_inputs(store: Store, options: BuildOptions, state: State) -> DatasetInputs:
     """Return what a dataset would be made of, by the documents alone; `DatasetError` as `choose_inputs`."""
     chosen = choose_runs(store, options.recipe, state=state, robot=options.robot, tags=options.tags, prove=False)
-    return _describe_inputs(options, chosen.runs, choose_maps(store, state, options.map_names))
+    return _describe_inputs(options, chosen.runs, choose_maps(store, state, options))
 
 
 def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Sequence[StoredMap]) -> DatasetInputs:
@@ -118,6 +121,8 @@ def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Seq
         exclusions={ids.name: ExclusionInputs(ids.checksum.sha256, ids.reason) for ids in options.exclusions},
         kept_split=None if options.earlier is None else _hash_table(options.earlier),
         file_format=options.file_format,
+        labels=options.labels,
+        without_patches=options.without_patches,
         without_coordinates=options.without_coordinates,
     )
 
@@ -170,11 +175,15 @@ def _hash_files(record: StoredMap) -> str:
     return digest({name: (checksum.size_bytes, checksum.sha256) for name, checksum in files.items()})
 
 
-def choose_maps(store: Store, state: State, names: Sequence[str]) -> tuple[StoredMap, ...]:
-    """Return the maps to sample: the named ones in their order, or the only one."""
-    maps = state.maps
+def choose_maps(store: Store, state: State, options: BuildOptions) -> tuple[StoredMap, ...]:
+    """Return the maps to sample: the named ones in their order, or the only one; none for a dataset without patches."""
+    maps, names = state.maps, options.map_names
+    if options.without_patches or not (maps or names):
+        return ()
     if not maps:
-        raise DatasetError(f"{store.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
+        raise DatasetError(
+            f"{store.root}: no map {names[0]!r} in the store; add one: tcpipe add-map NAME --height FILE, or build without --map"
+        )
     unknown = [name for name in names if name not in maps]
     if unknown:
         raise DatasetError(f"{store.root}: no map {unknown[0]!r} in the store; there are {', '.join(maps)}")
@@ -210,6 +219,8 @@ _OPTIONS = {
     "exclusions": "--exclude",
     "kept_split": "--keep-split",
     "file_format": "--format",
+    "labels": "--labels",
+    "without_patches": "--without-patches",
     "without_coordinates": "--without-coordinates",
 }
 """Options of a build, by the field of `DatasetInputs` that each rules."""
@@ -231,10 +242,12 @@ def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs)
 
 
 def _is_option(change: Change, options: BuildOptions) -> bool:
-    """Return whether a change is of an option: a file may have other content, and the robot of the runs counts, whoever named it."""
+    """Return whether a change is of an option: a file may have other content, a store its first map, and the robot is that of the runs."""
     if change.path[0] in ("covariates", "exclusions", "kept_split"):
         is_own = change.path[0] == "kept_split" and options.keeps_own_split
         return not is_own and None in (change.was, change.now)
+    if change.path[0] == "map_names":
+        return bool(change.was or options.map_names)
     return change.path != ("recipe", "robot")
 
 

@@ -33,6 +33,7 @@ from tcpipe.stages.sample import Sampled, Shifts
 from tcpipe.tables.bits import DropReason, Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
+from tcpipe.terrain.classes import PAPER_CLASSES
 from tcpipe.terrain.projection import Projection, compute_geoid_height
 from tcpipe.terrain.registration import (
     REACH_M,
@@ -339,15 +340,15 @@ def find_removed_by_ground(
 ) -> tuple[Removal, tuple[Finding, ...]]:
     """Return metres of all runs by reason, for each class and slope, and findings on uneven shares and on classes not traversable.
 
-    ``used`` are the rows of ``segments`` that are train, test or unseen. Of overlapping ``sources`` the first counts; maps without a
-    terrain layer give no classes. ``shifts`` are those of the runs, by map.
+    ``used`` are the rows of ``segments`` that are train, test or unseen. Of overlapping ``sources`` the first counts; without a terrain
+    layer there are no classes. ``shifts`` are those of the runs, by map.
     """
     grounds = [
         (source, find_map_projection(source, recipe.read.gnss_crs), moved)
         for source, moved in zip(sources, shifts, strict=True)
         if "terrain" in source.layers
     ]
-    table = sources[0].classes
+    table = sources[0].classes if sources else PAPER_CLASSES
     names = ["off the map", "no data", *table.names().tolist()[1:]]
     spans, none = _list_spans(segments, used), np.empty(0, np.int64)
     by_class, by_slope = np.zeros((len(names), len(_REASONS))), np.zeros((len(_SLOPE_NAMES), len(_REASONS)))

@@ -19,6 +19,7 @@ from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import CovariateConfig, Recipe, TrainConfig
 from tcpipe.splits.regions import Regions
+from tcpipe.tables.levels import LABELS
 
 if TYPE_CHECKING:
     from tcpipe.formats.covariates import CovariateTable
@@ -60,6 +61,9 @@ class BuildOptions:
     tags: Mapping[str, str]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap; none: the only one."""
+    labels: tuple[str, ...]
+    """Labels that every sample needs, names of `LABELS`; none: the default."""
+    without_patches: bool
     region: str | None
     """The file of the regions, as text."""
     regions: Regions | None
@@ -76,12 +80,16 @@ class BuildOptions:
 def read_build_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | str) -> BuildOptions:
     """Return a user's choices for the dataset at ``place``."""
     split, map_name, keep_split = options.split, options.map_name, options.keep_split
+    if options.without_patches and map_name:
+        raise UsageError("--map, --without-patches: samples without patches need no map; remove one of them")
     tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
     return BuildOptions(
         recipe=recipe,
         robot=options.robot or recipe.robot,
         tags=options.tags or {},
         map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
+        labels=parse_labels(options.labels),
+        without_patches=options.without_patches,
         regions=None if split is None else read_regions(Path(split)),
         region=None if split is None else Path(split).read_bytes().decode("utf-8", "replace"),
         covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
@@ -91,6 +99,14 @@ def read_build_options(options: BuildDatasetOptions, recipe: Recipe, place: Path
         earlier=None if keep_split is None else read_earlier_splits(keep_split),
         keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
     )
+
+
+def parse_labels(given: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of labels, each once, in the order of `LABELS`; `UsageError` for another name."""
+    names = [name.strip() for name in (given.split(",") if isinstance(given, str) else given)]
+    if unknown := [name for name in names if name not in LABELS]:
+        raise UsageError(f"--labels {','.join(names)}: expected some of {', '.join(LABELS)}, got {', '.join(unknown)}")
+    return tuple(name for name in LABELS if name in names)
 
 
 def merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:

@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 from numpy.typing import NDArray
-from pyproj import CRS
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Exclusion, KeptSplit, SplitResult
@@ -27,8 +26,7 @@ from tcpipe.splits.regions import Regions, project_regions
 from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.terrain.projection import Projection, compute_area, parse_crs
-from tcpipe.terrain.target_grid import MapGrid
+from tcpipe.terrain.projection import Projection
 
 _ROWS = 1 << 16
 """Rows whose ids are in memory together."""
@@ -75,7 +73,7 @@ def find_excluded(
 def draw_splits(
     segments: pa.Table,
     sampled: Sampled,
-    grid: MapGrid,
+    projection: Projection | None,
     regions: Regions | None,
     recipe: Recipe,
     *,
@@ -86,13 +84,16 @@ def draw_splits(
     """Assign every patch of ``sampled`` to a split by its whole footprint, and audit the result.
 
     ``excluded`` samples, (N,), take part in the draw, so that all others have the split and fold that they would have without exclusion.
+    ``projection`` leads from WGS 84 to the plane of the footprints; None: runs are in local frames, which no region can name.
     ``regions`` are in WGS84 lon/lat; None: everything is train and test. ``earlier`` has ``sample_id``, ``split`` and ``fold`` of a dataset
     whose samples keep their split; ``tags`` the holdout's tag by run. `DatasetError` if no footprint lies inside the region.
     """
     rules, chord_m = recipe.split, recipe.segment.chord_m
     buffer_m = math.sqrt(2.0) * chord_m if rules.buffer_m is None else rules.buffer_m
     starts_ns = to_integers(segments, "start_ns")
-    run, run_names = _number_runs(segments, starts_ns)
+    if regions is not None and projection is None:
+        raise DatasetError("the region (--split) needs positions on Earth, but the runs have no GNSS; remove --split")
+    run, run_names = number_runs(segments)
     run, starts_ns = run[sampled.kept], starts_ns[sampled.kept]
     ids, rows = segments.select(["segment_id"]), sampled.kept
     kept = None if earlier is None else _read_earlier_assignment(take_rows(ids, rows).column(0), earlier)
@@ -105,7 +106,9 @@ def draw_splits(
         run,
         run_names,
         sampled.footprint_xy_m,
-        None if regions is None else _project_regions(regions, grid, sampled.footprint_lonlat_deg),
+        None
+        if regions is None or projection is None
+        else _project_regions(regions, projection, sampled.footprint_lonlat_deg),
         holdout=rules.holdout,
         test_fraction=rules.test_fraction,
         block_m=rules.block_m,
@@ -131,8 +134,9 @@ def draw_splits(
     return assigned, SplitResult(buffer_m, region, audit, counts)
 
 
-def _number_runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int32], list[str]]:
+def number_runs(segments: pa.Table) -> tuple[NDArray[np.int32], list[str]]:
     """Return the number of each segment's run in the order of recording, (M,), and the runs' ids by number."""
+    starts_ns = to_integers(segments, "start_ns")
     coded = segments.column("run_id").dictionary_encode().unify_dictionaries()
     names = coded.chunk(0).dictionary.to_pylist()
     codes = np.concatenate([chunk.indices.to_numpy() for chunk in coded.chunks])
@@ -162,9 +166,7 @@ def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignm
     return Assignment.from_names(split, fold)
 
 
-def _project_regions(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
-    crs = parse_crs(grid.crs, where="map")
-    projection = Projection(CRS.from_epsg(4326), crs, compute_area(crs, grid.bounds_m))
+def _project_regions(regions: Regions, projection: Projection, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
     west, south = (footprint_lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG).tolist()
     east, north = (footprint_lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG).tolist()
     return project_regions(regions, projection.forward, window_deg=(west, south, east, north))

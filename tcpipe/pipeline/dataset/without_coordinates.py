@@ -12,7 +12,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.formats.dataset_card import DatasetCard, RunSource, SplitResult, judge_dataset
+from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_card import LOCAL, DatasetCard, RunSource, SplitResult, judge_dataset
 from tcpipe.formats.dataset_inputs import DatasetInputs
 from tcpipe.formats.parquet import ROWS_PER_GROUP
 from tcpipe.formats.recipe_toml import load_shipped_profiles
@@ -42,7 +43,7 @@ _DOCS = {
 _KEPT_FIELDS = (
     "data_model_version", "tcpipe_version", "inputs", "name", "description", "licence", "creator", "samples", "robots", "splits",
     "folds_of_train", "terrain", "label_statistics_of_train", "patch_m", "patch_px", "layers", "tensor", "classes",
-    "energy_budget", "distance_by_reason_m", "removal", "repeatability", "flagged_samples", "physics", "added_columns", "shards",
+    "energy_budget", "labels", "distance_by_reason_m", "removal", "repeatability", "flagged_samples", "physics", "added_columns", "shards",
     "checksums",
 )  # fmt: skip
 """Fields of the card that are published as they are."""
@@ -84,14 +85,15 @@ class Publication:
         columns["height_min_m"] = to_floats(samples, "height_min_m") - self.height_m
         columns |= {f"{end}_ns": to_integers(samples, f"{end}_ns") - self.start_ns for end in _ENDS}
         for name, public in (("run_id", self.runs), ("map", self.maps), ("robot", self.robots)):
-            columns[name] = [public[value] for value in samples.column(name).to_pylist()]
+            columns[name] = [public.get(value) for value in samples.column(name).to_pylist()]
         ids = [f"{run}-{stamp}" for run, stamp in zip(columns["run_id"], columns["start_ns"].tolist(), strict=True)]
         columns |= {"sample_id": ids, "segment_id": ids}
         for name, values in columns.items():
             field = samples.schema.field(name)
             if name in _DOCS:
                 field = field.with_metadata({"unit": field.metadata[b"unit"], "doc": _DOCS[name]})
-            samples = samples.set_column(samples.schema.get_field_index(name), field, pa.array(values, field.type))
+            array = pa.array(values, field.type, from_pandas=True)
+            samples = samples.set_column(samples.schema.get_field_index(name), field, array)
         return samples.drop_columns(list(COORDINATES)).replace_schema_metadata(None)
 
     def convert_content(self, content: Content) -> Content:
@@ -120,7 +122,7 @@ class Publication:
         recipe = replace(Recipe(), **{name: getattr(card.recipe, name) for name in _KEPT_SECTIONS})
         made_from = DatasetInputs(
             versions=card.made_from.versions, recipe=replace(recipe, split=replace(recipe.split, holdout_tag="")),
-            robots=card.robots, file_format=card.format, without_coordinates=True,
+            robots=card.robots, file_format=card.format, labels=card.made_from.labels, without_coordinates=True,
         )  # fmt: skip
         return DatasetCard(
             **{name: getattr(card, name) for name in _KEPT_FIELDS}, made_from=made_from, label=replace(card.label, includes=()),
@@ -143,6 +145,10 @@ def _place(samples: pa.Table, end: str, datum_deg_m: tuple[float, float, float])
 
 def make_publication(content: Content, inputs: Inputs, *, patch_m: float) -> Publication:
     """Return the origins, by the samples of a dataset, and its public names."""
+    if content.plane == LOCAL:
+        raise DatasetError(
+            "--without-coordinates: the runs have no GNSS, so that nothing states their place on Earth; remove the option"
+        )
     low_m, height_m, start_ns = np.full(2, np.inf), math.inf, np.iinfo(np.int64).max
     datum, plane_chord, chord_chord = (0.0, 0.0, 0.0), 0.0, 0.0
     for number, piece in enumerate(content.samples.pieces()):
@@ -153,14 +159,14 @@ def make_publication(content: Content, inputs: Inputs, *, patch_m: float) -> Pub
         plane_chord += float((np.hypot(*(end_m - start_m).T) * chord_m).sum())
         chord_chord += float((chord_m**2).sum())
         low_m = np.concatenate([low_m[None], start_m, end_m]).min(axis=0)
-        height_m = float(to_floats(piece, "height_min_m").min(initial=height_m))
+        height_m = float(np.fmin.reduce(to_floats(piece, "height_min_m"), initial=height_m))
         start_ns = int(to_integers(piece, "start_ns").min(initial=start_ns))
     corners_m = content.samples.sampled.footprint_xy_m[content.samples.patch[:ROWS_PER_GROUP]]
     sides_m = np.hypot(*(corners_m[:, 1] - corners_m[:, 0]).T)
     plane_scale = plane_chord / chord_chord if chord_chord else 1.0
     shipped, robots = load_shipped_profiles().robots, sorted({run.robot for run in inputs.sources})
     return Publication(
-        datum, np.floor(low_m / plane_scale), start_ns, np.floor(height_m), plane_scale,
+        datum, np.floor(low_m / plane_scale), start_ns, np.floor(height_m) if np.isfinite(height_m) else 0.0, plane_scale,
         map_scale=float(sides_m.mean()) / patch_m if len(sides_m) else 1.0,
         runs={run.run_id: f"run{number:04}" for number, run in enumerate(inputs.sources, 1)},
         maps={name: f"map{number}" for number, name in enumerate(inputs.map_names, 1)},

@@ -58,7 +58,7 @@ def write_dataset(directory: Path, inputs: Inputs, options: BuildOptions, jobs: 
     figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
     ids, compression = figures.column("sample_id"), recipe.dataset.compression
     shards = write_patches(directory, content, ids, options.file_format, jobs, compression=compression)
-    if public is None:
+    if public is None and content.sources:
         _write_overviews(directory, content.sources)
     repeatability = measure_repeatability(
         figures,
