@@ -15,6 +15,8 @@ from pathlib import Path
 import grimp
 import pytest
 from package_source import PACKAGE, read_nodes, read_trees
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from tcpipe.recipe import Recipe
 from tcpipe.tables import levels
@@ -327,6 +329,19 @@ def _tracked_files():
         pytest.skip("not a git checkout: which files belong to the project is not known here")
     listed = subprocess.run(["git", "ls-files", "-z"], capture_output=True, text=True, check=True, cwd=ROOT)
     return [ROOT / name for name in listed.stdout.split("\0") if name and (ROOT / name).is_file()]
+
+
+def test_locks_hold_versions_within_the_bounds_of_pyproject():
+    """Minor versions of rosbags 0.x have changed its interface: only the locked one is allowed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    bounds = {canonicalize_name(found.name): found.specifier for found in map(Requirement, project["dependencies"])}
+    for lock in ("requirements.lock", "requirements-dev.lock"):
+        locked = re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / lock).read_text(), re.MULTILINE)
+        assert bounds.keys() <= {name for name, _ in locked}
+        assert not [(name, version) for name, version in locked if name in bounds and version not in bounds[name]]
+        major, minor, *_ = dict(locked)["rosbags"].split(".")
+        assert major == "0"
+        assert f"0.{int(minor) + 1}.0" not in bounds["rosbags"]
 
 
 def test_no_registry_address_and_no_path_of_one_machine():
