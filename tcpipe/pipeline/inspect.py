@@ -13,8 +13,9 @@ from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.json_files import convert_record
-from tcpipe.formats.logs.log_file import is_log_file, list_logs_below
+from tcpipe.formats.logs.log_file import list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
+from tcpipe.formats.logs.log_names import is_log_file
 from tcpipe.formats.logs.table_folders import find_table_logs, is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.published_outputs import CARDS, find_newest

@@ -15,8 +15,9 @@ from pathlib import Path
 
 from tcpipe.errors import LogError, StoreError, TcpipeError, clean_line
 from tcpipe.formats.json_files import digest
-from tcpipe.formats.logs.log_file import LOG_SUFFIXES, find_logs, is_log_file, list_logs_below
+from tcpipe.formats.logs.log_file import find_logs, list_logs_below
 from tcpipe.formats.logs.log_joining import open_logs
+from tcpipe.formats.logs.log_names import find_log_suffix, is_log_file
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
 from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files, walk_folders
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
@@ -70,8 +71,7 @@ class LogSource:
         elif is_table(path.name):
             stem = f"{path.parent.name}_{path.stem}"
         else:
-            suffix = max((end for end in LOG_SUFFIXES if path.name.lower().endswith(end)), key=len, default="")
-            stem = path.name[: len(path.name) - len(suffix)]
+            stem = path.name[: len(path.name) - len(find_log_suffix(path.name))]
         return clean_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")
 
     @property

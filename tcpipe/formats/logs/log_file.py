@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import resource
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,11 +22,11 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.bag_file import BagPart
+from tcpipe.formats.logs.log_names import find_log_suffix, is_log_file
 from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
 from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
-    METADATA,
     STORAGE_SUFFIXES,
     ZSTD_MAGIC,
     Rosbag2Files,
@@ -42,9 +42,7 @@ from tcpipe.logs.topics import AutopilotKind, Damage, Topic, find_damage, split_
 from tcpipe.progress import Meter
 from tcpipe.tables.findings import Finding
 
-AUTOPILOT_SUFFIXES = (".ulg", ".bin")
 _READ_BY_RANGE = (".mcap", ".bag")
-LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd", *AUTOPILOT_SUFFIXES)
 
 BATCH_BYTES = 1 << 25
 """About how much a piece of a log takes in memory."""
@@ -170,11 +168,6 @@ def _refuse_what_is_not_there(path: Path) -> None:
         raise LogError(f"{path}: there is no such file or directory")
 
 
-def is_log_file(name: str) -> bool:
-    """Return whether a file of this name is a log or part of one."""
-    return name.lower().endswith((*LOG_SUFFIXES, ".db3-wal")) or name == METADATA
-
-
 def find_logs(path: Path) -> list[Path]:
     """Return the logs at or below a path, in a fixed order; a ROS 2 bag directory is one log, hidden files are skipped.
 
@@ -235,10 +228,10 @@ class _OpenFiles:
 
 
 class OpenLog:
-    """What is open for reading until its ``stack`` is closed. Use as a context manager, or close it."""
+    """Files that are open for reading until the ``stack`` is closed. Use as a context manager, or close it."""
 
-    def __init__(self, stack: ExitStack) -> None:
-        self._stack = stack
+    def __init__(self, stack: ExitStack, files: Sequence[Path]) -> None:
+        self._stack, self.files = stack, files
 
     def __enter__(self) -> Self:
         """Return the log, which is open already."""
@@ -254,16 +247,27 @@ class OpenLog:
         """Close its files and remove temporary copies."""
         self._stack.close()
 
+    @property
+    def size_bytes(self) -> int:
+        """Size of the log's files together."""
+        return sum(file.stat().st_size for file in self.files)
+
+    @property
+    def size_and_time(self) -> list[list[int]]:
+        """Size [byte] and modification time [ns] of each file, by name: what tells whether a log is still the same."""
+        found = [file.stat() for file in sorted(self.files, key=lambda file: file.name)]
+        return [[stat.st_size, stat.st_mtime_ns] for stat in found]
+
 
 class Log(OpenLog):
     """A log of ROS."""
 
     def __init__(self, path: Path, opened: _OpenFiles, types: TypeLibrary, stack: ExitStack) -> None:
-        super().__init__(stack)
+        super().__init__(stack, opened.listed.paths)
         self.path = path
         self.container = opened.container
         """``mcap``, ``bag`` or ``rosbag2``."""
-        self._files, self._parts, self._types = opened.listed.paths, opened.parts, types
+        self._parts, self._types = opened.parts, types
         self._fetched = tuple(opened.fetched.values())
         self._damage = list(opened.listed.damage)
         self.topics = self._merged_topics()
@@ -290,21 +294,10 @@ class Log(OpenLog):
         return [describe_finding(finding) for finding in split_notes(self.findings)[0]]
 
     @property
-    def size_bytes(self) -> int:
-        """Size of the log's files together."""
-        return sum(file.stat().st_size for file in self._files)
-
-    @property
-    def size_and_time(self) -> list[list[int]]:
-        """Size [byte] and modification time [ns] of each file, by name: what tells whether a log is still the same."""
-        found = [file.stat() for file in sorted(self._files, key=lambda file: file.name)]
-        return [[stat.st_size, stat.st_mtime_ns] for stat in found]
-
-    @property
     def outline(self) -> str:
         """A hash (hex) of the sizes and indexes of all files, the same wherever they lie; "" where a file has no index."""
         outlines = [part.outline for part in self._parts]
-        if not all(outlines) or len(outlines) < len(self._files):
+        if not all(outlines) or len(outlines) < len(self.files):
             return ""
         return outlines[0] if len(outlines) == 1 else hashlib.sha256("".join(outlines).encode()).hexdigest()
 
@@ -322,7 +315,7 @@ class Log(OpenLog):
             return self.outline
         for fetched in self._fetched:
             fetched.whole()
-        return hash_files(sorted(self._files, key=lambda file: file.name), self.size_bytes)
+        return hash_files(sorted(self.files, key=lambda file: file.name), self.size_bytes)
 
     def definition(self, topic: str) -> tuple[str, str]:
         """Return the text of a topic's message definition, and where it is from: ``log``, or ``given`` or ``bundled`` in its stead.
@@ -542,7 +535,7 @@ def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
         elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
             continue
         elif (
-            entry.name.lower().endswith(LOG_SUFFIXES)
+            find_log_suffix(entry.name)
             and (entry.is_symlink() or entry.is_file())
             and not (entry.name.lower().endswith(".bin") and _is_other_binary(directory / entry.name))
         ):

@@ -16,8 +16,9 @@ from typing import TypeAlias
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_file import AUTOPILOT_SUFFIXES, Log, OpenLog, find_autopilot, is_log_file, open_log
-from tcpipe.formats.logs.message_tables import TableLog
+from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
+from tcpipe.formats.logs.log_names import AUTOPILOT_SUFFIXES, find_reader, is_log_file
+from tcpipe.formats.logs.message_tables import TableLog, open_registered_log
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import Mappings, find_table_run
 from tcpipe.formats.object_storage import format_path, is_url, lay_out_objects
@@ -37,7 +38,7 @@ class JoinedLog(OpenLog):
     def __init__(
         self, logs: Sequence[Log | TableLog], earlier: Log | None, topics: Mapping[str, Topic], stack: ExitStack
     ) -> None:
-        super().__init__(stack)
+        super().__init__(stack, [file for log in logs for file in log.files])
         self._logs, self._earlier, self.topics = logs, earlier, topics
 
     @property
@@ -48,11 +49,6 @@ class JoinedLog(OpenLog):
             subject, names = Subject("file", self._logs[0].path.name), {"earlier": self._earlier.path.name}
             found.append(make_finding("static-transforms-borrowed", subject, names=names))
         return found
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of all files together."""
-        return sum(log.size_bytes for log in self._logs)
 
     @property
     def outline(self) -> str:
@@ -149,11 +145,14 @@ def open_logs(
 def open_single_log(
     path: Path | str, *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> Log | TableLog:
-    """Open one log: an autopilot's; a folder that is no bag, or a table of a run, as ``tables`` say what they hold; else as `open_log`."""
+    """Open a log of an autopilot or another package's reader; a folder that is no bag, or a table, by ``tables``; or as `open_log`."""
     with ExitStack() as stack:
-        here = path
-        if is_url(path) and format_path(path).lower().endswith(AUTOPILOT_SUFFIXES):
+        here, name = path, format_path(path)
+        reader = find_reader(name) if is_url(path) or Path(path).is_file() else None
+        if is_url(path) and (reader or name.lower().endswith(AUTOPILOT_SUFFIXES)):
             here, _ = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=()))
+        if reader:
+            return open_registered_log(Path(here), reader, stack.pop_all())
         if not is_url(here) and (kind := find_autopilot(Path(here))):
             from tcpipe.formats.logs.autopilot_log import open_autopilot_log  # noqa: PLC0415  only where one is read
 

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import LogError
+from tcpipe.errors import LogError, clean_line
 from tcpipe.formats.logs.log_file import OpenLog, hash_files
 from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.arrays import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+T = TypeVar("T")
 Fields = Mapping[str, "NDArray[np.generic] | pa.Array"]
 
 
@@ -46,22 +52,16 @@ class TableLog(OpenLog):
         findings: Iterable[Finding] = (),
         stack: ExitStack | None = None,
     ) -> None:
-        super().__init__(stack or ExitStack())
+        super().__init__(stack or ExitStack(), files)
         self.path, self.container = path, container
         self._made = {found.topic.name: found.make for found in topics}
         self.topics = {found.topic.name: found.topic for found in topics}
         """Every topic by name."""
         self.findings = [*find_damage(damage for found in topics for damage in found.damage), *findings]
-        self._files = files
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the files together, also of tables that are not mapped."""
-        return sum(file.stat().st_size for file in self._files)
 
     def sha256(self) -> str:
         """Return the SHA-256 of all files, one after the other, by name; also of tables that are not mapped. `LogError`: the disk fails."""
-        return hash_files(self._files, self.size_bytes)
+        return hash_files(self.files, self.size_bytes)
 
     def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
         """Return the messages of several topics; `LogError` where one is not in the log."""
@@ -102,11 +102,47 @@ def make_topic(
 
 
 def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
-    """Return a column of messages: rows of shape (N, k) become lists, bytes texts."""
+    """Return a column of messages: rows of shape (N, k) become lists, bytes and str texts."""
     if isinstance(values, pa.Array):
         return values
+    if values.dtype.kind in "OU":
+        return pa.array(values)
     if values.dtype.kind == "S":
         return make_text_column(text.decode(errors="replace") for text in values.tolist())
     if values.ndim == 1:
         return number_column(values)
     return pa.FixedSizeListArray.from_arrays(number_column(values.ravel()), values.shape[1])
+
+
+def open_registered_log(path: Path, reader: EntryPoint, stack: ExitStack) -> TableLog:
+    """Read a file with the reader of another package; ``stack`` is closed with it. `LogError`: the reader fails."""
+    run = partial(_run_reader, path, reader)
+    topics = run(lambda: [_make_registered_topic(*topic) for topic in reader.load()(path)])
+    topics = [replace(topic, make=partial(run, topic.make)) for topic in topics]
+    return TableLog(path, reader.name.lower(), topics, [path], stack=stack)
+
+
+def _run_reader(path: Path, reader: EntryPoint, call: Callable[[], T]) -> T:
+    """Return what a call into a reader returns; `LogError` with file, package and entry point if it raises another error."""
+    try:
+        return call()
+    except LogError:
+        raise
+    except Exception as error:
+        package = f"package {reader.dist.name if reader.dist else '?'}, entry point {reader.name} = {reader.value}"
+        cause = clean_line(f"{type(error).__name__}: {error}")
+        raise LogError(f"{path}: cannot be read by {package}: {cause}; correct or uninstall that package") from error
+
+
+def _make_registered_topic(name: str, type_name: str, stamps: Any, read_fields: Callable[[], Any]) -> TopicMessages:
+    """Return a topic of a reader as `make_topic`; `ValueError`: its stamps are no rising numbers of nanoseconds."""
+    stamp_ns = np.asarray(stamps)
+    if stamp_ns.dtype != np.int64 or stamp_ns.ndim != 1 or not stamp_ns.size or (np.diff(stamp_ns) < 0).any():
+        got = f"{stamp_ns.dtype} of shape {stamp_ns.shape}"
+        raise ValueError(f"topic {name}: expected rising stamps [ns] as int64 of shape (N,), N > 0, got {got}")
+
+    def read() -> Fields:
+        fields = read_fields().items()
+        return make_stamp_fields(stamp_ns) | {key: np.asarray(v) if isinstance(v, list) else v for key, v in fields}
+
+    return make_topic(name, type_name, stamp_ns, read)

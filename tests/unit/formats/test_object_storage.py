@@ -8,7 +8,8 @@ from random_messages import assert_same, expected_columns, random_messages, writ
 from storage_server import FORBIDDEN
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_file import is_log_file, open_log
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.log_names import is_log_file
 from tcpipe.formats.object_storage import lay_out_objects, make_stand_ins
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
