@@ -81,6 +81,9 @@ def test_a_log_of_another_package_becomes_segments(tmp_path, installed):
     assert fixes["log_time_ns"][4].as_py() == 1_700_000_000_800_000_000
     assert fixes["header.frame_id"].to_pylist() == ["gps_link"] * 250
 
+    with read_log(log.as_uri()) as copied:
+        assert copied.tables(["/gps"])["/gps"].equals(fixes)
+
     (result,) = ingest([folder], store=tmp_path / "store").results
     assert (result.status, result.problems) == ("done", ())
     (run,) = Store(tmp_path / "store").runs()

@@ -5,6 +5,7 @@ import json
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from autopilot_files import Drive, write_ulog
 from mcap.writer import Writer
 from random_messages import ROS1, Message, random_messages, write_bag, write_mcap
 
@@ -188,3 +189,13 @@ def test_a_bag_says_its_definitions_too(tmp_path):
     (of,) = export(write_bag(tmp_path / "a.bag", messages), tmp_path / "out").topics
     about = described(of.path)
     assert "geometry_msgs/Quaternion orientation" in about["definition"]
+
+
+def test_a_log_of_an_autopilot_is_exported_without_definitions(tmp_path):
+    log = write_ulog(tmp_path / "a.ulg", Drive())
+    made = export(log, tmp_path / "out", topics=["/sensor_combined"])
+    (file,) = made.topics
+    assert file.messages == pq.read_metadata(file.path).num_rows > 0
+    about = described(file.path)
+    assert (about["type"], about["definition"], about["definition_from"]) == ("px4/msg/sensor_combined", "", "")
+    assert export(log, tmp_path / "out", topics=["/sensor_combined"]).status == "unchanged"
