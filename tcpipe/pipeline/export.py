@@ -17,8 +17,7 @@ from tcpipe.errors import LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.json_files import parse_typed, read_json, write_json
 from tcpipe.formats.logs.log_file import Log
-from tcpipe.formats.logs.log_joining import open_single_log
-from tcpipe.formats.logs.message_tables import TableLog
+from tcpipe.formats.logs.log_joining import AnyLog, open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.parquet import make_storable, read_schema, write_parquet_rows
 from tcpipe.logs.topics import split_notes
@@ -138,7 +137,7 @@ def export(
     return _make_exported("done", entries, wanted, shown, out)
 
 
-def _select_topics(log: Log | TableLog, log_path: str, topics: Sequence[str]) -> list[str]:
+def _select_topics(log: AnyLog, log_path: str, topics: Sequence[str]) -> list[str]:
     """Return the topics asked for, each once, or all; a text that is no topic's name is taken for several with commas between."""
     parts = (part.strip() for text in topics for part in ([text] if text in log.topics else text.split(",")))
     split = list(dict.fromkeys(part for part in parts if part))
@@ -151,7 +150,7 @@ def _select_topics(log: Log | TableLog, log_path: str, topics: Sequence[str]) ->
     return split or sorted(log.topics)
 
 
-def _make_origin(log: Log | TableLog, log_path: str, message_definitions: Path | None) -> ExportOrigin:
+def _make_origin(log: AnyLog, log_path: str, message_definitions: Path | None) -> ExportOrigin:
     return ExportOrigin(
         log=log_path if is_url(log_path) else str(Path(log_path).resolve()),
         size_and_time=tuple((size, time_ns) for size, time_ns in log.size_and_time),
@@ -219,7 +218,7 @@ def _make_exported(
     return Exported(log, out, status, files, tuple(damage), tuple(notes), 3 if damage else 0)
 
 
-def _write(log: Log | TableLog, paths: Mapping[str, Path]) -> dict[str, int | None]:
+def _write(log: AnyLog, paths: Mapping[str, Path]) -> dict[str, int | None]:
     """Write the topics in one pass; return the rows of each, None of one that cannot be read."""
     rows = dict.fromkeys(paths, 0)
     writers: dict[str, Callable[[pa.Table], None]] = {}
@@ -233,7 +232,7 @@ def _write(log: Log | TableLog, paths: Mapping[str, Path]) -> dict[str, int | No
     return {name: count if name in writers else None for name, count in rows.items()}
 
 
-def _make_schema(log: Log | TableLog, name: str, table: pa.Table) -> pa.Schema:
+def _make_schema(log: AnyLog, name: str, table: pa.Table) -> pa.Schema:
     """Return the schema of a topic's file: the table's, with the topic, its type and definition."""
     topic, (definition, source) = log.topics[name], log.definition(name) if isinstance(log, Log) else ("", "")
     schema = make_storable(table[:0]).schema

@@ -1,4 +1,4 @@
-"""Robot logs of every container behind one face: topics from the index, tables in one pass, damage listed."""
+"""Logs of ROS in every container with one interface: topics from the index, tables in one pass, damage listed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tcpipe.tables.findings import Finding
 _READ_BY_RANGE = (".mcap", ".bag")
 
 BATCH_BYTES = 1 << 25
-"""About how much a piece of a log takes in memory."""
+"""Memory of a piece of a log, about [byte]."""
 
 MAX_TOPICS = 10_000
 """A log of more topics is refused; a robot has some hundred. A topic costs a millisecond, however small."""
@@ -169,10 +169,7 @@ def _refuse_what_is_not_there(path: Path) -> None:
 
 
 def find_logs(path: Path) -> list[Path]:
-    """Return the logs at or below a path, in a fixed order; a ROS 2 bag directory is one log, hidden files are skipped.
-
-    A directory that cannot be read stands in the list itself: whoever opens it says why. `LogError`: there is no log.
-    """
+    """Return the logs at or below a path, by name, and directories that cannot be read; hidden files are skipped. `LogError`: no log."""
     path = Path(path)
     _refuse_what_is_not_there(path)
     if not path.is_dir():
@@ -184,7 +181,7 @@ def find_logs(path: Path) -> list[Path]:
 
 
 def list_logs_below(directory: Path) -> list[Path]:
-    """Return the logs in a directory as `find_logs` does; none where there is none. A directory is looked at once, whatever links to it."""
+    """Return the logs in a directory as `find_logs`, which may be none; a directory is read once, even if several links lead to it."""
     found, seen, waiting = list[Path](), set[tuple[int, int]](), [(directory, True)]
     while waiting:
         path, is_directory = waiting.pop()
@@ -513,7 +510,7 @@ def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, Fe
 
 
 def _allow_files(count: int) -> None:
-    """Let this process hold so many files open, where the system lets it: 1024 is usual, and many more are allowed."""
+    """Raise the number of files that this process may open (usually 1024), as far as the system allows it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = 2 * count + _OTHER_FILES
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -522,7 +519,7 @@ def _allow_files(count: int) -> None:
 
 
 def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
-    """Return what may be a log in a directory, and whether it is one that has to be looked into; the directory itself where it is a bag."""
+    """Return possible logs in a directory, each with whether it is a directory to search; a bag directory returns itself."""
     with os.scandir(directory) as there:
         entries = sorted(there, key=lambda entry: entry.name)
     one_bag = is_one_bag(directory)
@@ -544,14 +541,14 @@ def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
 
 
 def _is_other_binary(path: Path) -> bool:
-    """Return whether a .bin is anything but a log: many programs write files of that name; one that cannot be read may be one."""
+    """Return whether a .bin is surely no log: other programs write such files, too; an unreadable one may be a log."""
     with suppress(LogError):
         return find_autopilot(path) is None
     return False
 
 
 def _is_directory(entry: os.DirEntry[str]) -> bool:
-    """Return whether an entry is, or leads to, a directory that may be looked at."""
+    """Return whether an entry is, or links to, a directory that may be read."""
     with suppress(OSError):
         return entry.is_dir()
     return False

@@ -1,7 +1,7 @@
-"""Several files of one drive read as one log: ROS 1 splits, power logged apart; and what a later part of a split lacks.
+"""Several files of one drive read as one log: parts of a ROS 1 split, or power in a file of its own.
 
-`rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (with the time of each before the number, unless that is left out), and
-latched messages only into the part in which they came: a part that is read alone takes its static transforms from an earlier one beside it.
+`rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (often with a time before the number), and static transforms only into
+the part in which they came: a later part that is read alone takes them from the nearest earlier part in its folder.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
 _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
 _STATIC = "tf_static"
 _GAP_NS = 5_000_000_000
-"""Parts of one recording follow one another within so much."""
+"""Longest time between two parts of one log [ns]."""
 
 
 class JoinedLog(OpenLog):
-    """Logs behind one face: topics merged, tables in log-time order; with the static transforms of an ``earlier`` part."""
+    """Several logs with the interface of one: topics merged, tables in log-time order, static transforms of an ``earlier`` part."""
 
     def __init__(
         self, logs: Sequence[Log | TableLog], earlier: Log | None, topics: Mapping[str, Topic], stack: ExitStack
@@ -114,16 +114,12 @@ def _require_same_fields(topic: str, first: pa.Schema, other: pa.Schema) -> None
 
 
 AnyLog: TypeAlias = "Log | JoinedLog | TableLog"
-"""What a run is made of."""
 
 
 def open_logs(
     paths: Sequence[Path | str], *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> AnyLog:
-    """Open one log, or several as one, by path or URL; `LogError` when a topic has different types in two of them.
-
-    A folder that is no bag is one of tables, where ``tables`` says what they hold.
-    """
+    """Open one log as `open_single_log`, or several as one; `LogError` when a topic has different types in two of them."""
     firsts: dict[tuple[Path | str, ...], Path | str] = {}
     for path in sorted(paths, key=Path):
         run = find_table_run(path, tables or {})

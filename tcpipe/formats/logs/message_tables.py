@@ -1,4 +1,4 @@
-"""Logs whose topics are tables of messages that other files were turned into, behind the same face as a bag: topics, tables, damage."""
+"""Logs that are read from other files than bags: each topic is a table of messages, with the interface of `log_file.Log`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -28,7 +28,7 @@ Fields = Mapping[str, "NDArray[np.generic] | pa.Array"]
 
 @dataclass(frozen=True, slots=True)
 class TopicMessages:
-    """A topic, how its messages are made, and what of them is damaged."""
+    """A topic, the function that makes its messages, and their damage."""
 
     topic: Topic
     make: Callable[[], pa.Table]
@@ -36,11 +36,9 @@ class TopicMessages:
 
 
 class TableLog(OpenLog):
-    """A log whose topics are tables of messages; each is made when it is asked for."""
+    """A log whose topics are tables of messages, each made when it is read."""
 
-    outline = ""
-    """There is no index; the files are hashed."""
-    is_known_by_outline = False
+    outline, is_known_by_outline = "", False  # without an index the files are hashed
 
     def __init__(
         self,
@@ -91,7 +89,7 @@ def make_topic(
     read_fields: Callable[[], Fields],
     damage: Sequence[Damage] = (),
 ) -> TopicMessages:
-    """Return a topic by the stamps of its messages [ns], which are both log times too; `_make_column` says what fields become."""
+    """Return a topic with the stamps of its messages [ns], shape (N,), as both log times; `_make_column` converts its fields."""
 
     def make() -> pa.Table:
         times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
@@ -102,11 +100,9 @@ def make_topic(
 
 
 def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
-    """Return a column of messages: rows of shape (N, k) become lists, bytes and str texts."""
+    """Return a column of messages: rows of shape (N, k) become lists, bytes texts."""
     if isinstance(values, pa.Array):
         return values
-    if values.dtype.kind in "OU":
-        return pa.array(values)
     if values.dtype.kind == "S":
         return make_text_column(text.decode(errors="replace") for text in values.tolist())
     if values.ndim == 1:
@@ -117,7 +113,7 @@ def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
 def open_registered_log(path: Path, reader: EntryPoint, stack: ExitStack) -> TableLog:
     """Read a file with the reader of another package; ``stack`` is closed with it. `LogError`: the reader fails."""
     run = partial(_run_reader, path, reader)
-    topics = run(lambda: [_make_registered_topic(*topic) for topic in reader.load()(path)])
+    topics = run(lambda: [_make_read_topic(*topic) for topic in reader.load()(path)])
     topics = [replace(topic, make=partial(run, topic.make)) for topic in topics]
     return TableLog(path, reader.name.lower(), topics, [path], stack=stack)
 
@@ -134,15 +130,15 @@ def _run_reader(path: Path, reader: EntryPoint, call: Callable[[], T]) -> T:
         raise LogError(f"{path}: cannot be read by {package}: {cause}; correct or uninstall that package") from error
 
 
-def _make_registered_topic(name: str, type_name: str, stamps: Any, read_fields: Callable[[], Any]) -> TopicMessages:
+def _make_read_topic(name: str, type_name: str, stamps: Sequence[int], read: Callable[[], Fields]) -> TopicMessages:
     """Return a topic of a reader as `make_topic`; `ValueError`: its stamps are no rising numbers of nanoseconds."""
     stamp_ns = np.asarray(stamps)
     if stamp_ns.dtype != np.int64 or stamp_ns.ndim != 1 or not stamp_ns.size or (np.diff(stamp_ns) < 0).any():
         got = f"{stamp_ns.dtype} of shape {stamp_ns.shape}"
         raise ValueError(f"topic {name}: expected rising stamps [ns] as int64 of shape (N,), N > 0, got {got}")
 
-    def read() -> Fields:
-        fields = read_fields().items()
-        return make_stamp_fields(stamp_ns) | {key: np.asarray(v) if isinstance(v, list) else v for key, v in fields}
+    def read_fields() -> Fields:
+        columns = {key: value if getattr(value, "ndim", 1) == 2 else pa.array(value) for key, value in read().items()}
+        return make_stamp_fields(stamp_ns) | columns
 
-    return make_topic(name, type_name, stamp_ns, read)
+    return make_topic(name, type_name, stamp_ns, read_fields)
