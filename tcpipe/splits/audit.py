@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -36,10 +37,35 @@ LOCAL_PLACES = ("start_x_m", "start_y_m", "end_x_m", "end_y_m")
 _M_A_DEG = 111_195.0  # of a great circle: to half a per cent
 
 
+@dataclass(frozen=True, slots=True)
+class Leakage:
+    """A held-out split against train; arrays are of its samples ``rows``, shape (M,)."""
+
+    rows: Ints
+    train_neighbours: NDArray[np.uint8]
+    """Number of training samples that follow or precede each sample on its track."""
+    shares_ground: Mask
+    """Whether its footprint shares ground with a training footprint."""
+    repeats_place: Mask
+    """Whether that training footprint is of another run."""
+    nearest_m: Floats
+    """Distance to the nearest training footprint [m]; empty without training samples."""
+    overlapping_pairs: int
+    """Pairs of a held-out and a training footprint that share ground."""
+
+
 def audit_leakage(
     train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
 ) -> tuple[HeldOut, ...]:
-    """Return one entry for each split that is ``held`` out, by its name, against train.
+    """Return the counts of each split that is ``held`` out against train; parameters as for `measure_leakage`."""
+    measured = measure_leakage(train, held, run, start_ns, corners_xy_m, chord_m=chord_m)
+    return tuple(_count_leakage(name, leakage) for name, leakage in measured.items())
+
+
+def measure_leakage(
+    train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
+) -> dict[str, Leakage]:
+    """Return by its name, for each split that is ``held`` out, what its samples share with train.
 
     Parameters
     ----------
@@ -48,26 +74,23 @@ def audit_leakage(
     corners_xy_m : corners of the footprints [m], shape (N, 4, 2).
     chord_m : segment length [m]; samples follow one another if their centres are at most 1.5 chords apart.
     """
-    crossing = _count_crossing(train, held, run, start_ns, corners_xy_m, chord_m=chord_m)
+    neighbours = _count_train_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
     ground = Ground(corners_xy_m, np.flatnonzero(train))
-    return tuple(
-        _audit_split(name, np.flatnonzero(is_held), run, ground, crossing[name]) for name, is_held in held.items()
-    )
+    return {name: _measure_split(np.flatnonzero(is_held), run, ground, neighbours) for name, is_held in held.items()}
 
 
-def _count_crossing(
-    train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
-) -> dict[str, int]:
-    """Return by split how many pairs of samples follow one another on one track, one held out and one in train."""
-    order, found = np.lexsort((start_ns, run)), dict.fromkeys(held, 0)
+def _count_train_neighbours(
+    train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
+) -> NDArray[np.uint8]:
+    """Return how many training samples follow or precede each sample on its track, shape (N,)."""
+    order, found = np.lexsort((start_ns, run)), np.zeros(len(run), np.uint8)
     for first in range(0, len(order) - 1, _CHUNK):
         rows = order[first : first + _CHUNK + 1]
         before, after = rows[:-1], rows[1:]
         apart_m = np.linalg.norm(np.diff(corners_xy_m[rows].mean(axis=1), axis=0), axis=1)
         adjoining = (run[before] == run[after]) & (apart_m <= 1.5 * chord_m)
-        for name, is_held in held.items():
-            crosses = (is_held[before] & train[after]) | (train[before] & is_held[after])
-            found[name] += int((crosses & adjoining).sum())
+        found[before] += adjoining & train[after]
+        found[after] += adjoining & train[before]
     return found
 
 
@@ -84,27 +107,32 @@ class Ground:
         self.tree = cKDTree(centres)
 
 
-def _audit_split(name: str, held: Ints, run: Ints, train: Ground, crossing: int) -> HeldOut:
-    pairs = overlapping = repeated = 0
-    apart_m = [np.empty(0)]
-    for rows in _split_points(held, _CHUNK) if len(train.rows) else []:
+def _measure_split(held: Ints, run: Ints, train: Ground, neighbours: NDArray[np.uint8]) -> Leakage:
+    pairs, apart_m = 0, [np.empty(0)]
+    shares, repeats = np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
+    for part in _split_points(np.arange(len(held)), _CHUNK) if len(train.rows) else []:
+        rows = held[part]
         queries = train.corners_xy_m[rows]
         reach_m = _compute_half_diagonal_m(queries) + train.half_diagonal_m
         i, j = find_near_pairs(queries.mean(axis=1), train.tree, within_m=reach_m)
         j = train.rows[j]
         real = compute_shared_fraction(queries, train.corners_xy_m, i, j) > _CONTACT_FRACTION
         pairs += int(real.sum())
-        overlapping += len(np.unique(i[real]))
-        repeated += len(np.unique(i[real & (run[rows[i]] != run[j])]))
+        shares[part[i[real]]] = True
+        repeats[part[i[real & (run[rows[i]] != run[j])]]] = True
         apart_m.append(compute_nearest_m(queries, train))
-    nearest_m = np.concatenate(apart_m)
+    return Leakage(held, neighbours[held], shares, repeats, np.concatenate(apart_m), pairs)
+
+
+def _count_leakage(name: str, leakage: Leakage) -> HeldOut:
+    nearest_m = leakage.nearest_m
     return HeldOut(
         split=name,
-        samples=len(held),
-        overlapping_samples=overlapping,
-        overlapping_pairs=pairs,
-        same_track_pairs=crossing,
-        repeated_place_samples=repeated,
+        samples=len(leakage.rows),
+        overlapping_samples=int(leakage.shares_ground.sum()),
+        overlapping_pairs=leakage.overlapping_pairs,
+        same_track_pairs=int(leakage.train_neighbours.sum()),
+        repeated_place_samples=int(leakage.repeats_place.sum()),
         nearest_train_min_m=float(nearest_m.min()) if len(nearest_m) else None,
         nearest_train_median_m=float(np.median(nearest_m)) if len(nearest_m) else None,
     )
