@@ -1,8 +1,8 @@
 """tcpipe: from raw robot logs to datasets that a terrain-cost model can be trained on.
 
-The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `open_dataset`, `train`, `evaluate`,
-`predict_path`, `plan_path`. They are loaded when first asked for, so that ``import tcpipe`` costs nothing; ``__init__.pyi`` tells
-editors and type checkers where each is.
+The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `check_split`, `open_dataset`, `train`,
+`evaluate`, `predict_path`, `plan_path`. They are loaded when first asked for, so that ``import tcpipe`` costs nothing;
+``__init__.pyi`` tells editors and type checkers where each is.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ _HOMES = {
     "ingest": ("tcpipe.pipeline.ingest", "ingest"),
     "add_map": ("tcpipe.pipeline.maps", "add_map"),
     "build_dataset": ("tcpipe.pipeline.dataset.build", "build_dataset"),
+    "check_split": ("tcpipe.pipeline.split_check", "check_split"),
     "open_dataset": ("tcpipe.dataset", "open_dataset"),
     "train": ("tcpipe.api", "train"),
     "evaluate": ("tcpipe.api", "evaluate"),
@@ -28,6 +29,7 @@ __all__ = [
     "__version__",
     "add_map",
     "build_dataset",
+    "check_split",
     "errors",
     "evaluate",
     "ingest",

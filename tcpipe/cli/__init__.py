@@ -42,6 +42,7 @@ _COMMANDS = {
     "prune": ("log_commands", "Remove what a store no longer needs"),
     "add-map": ("dataset_commands", "Add the rasters of a site to the store"),
     "build-dataset": ("dataset_commands", "Build a dataset from segments and maps"),
+    "check-split": ("dataset_commands", "Judge the split of any table for spatial leakage"),
     "train": ("model_commands", "Train a model on a dataset"),
     "evaluate": ("model_commands", "Evaluate a model and compare it with the paper"),
     "reproduce": ("model_commands", "Repeat the paper's experiment on a simulated site"),

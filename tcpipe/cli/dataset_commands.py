@@ -30,7 +30,7 @@ from tcpipe.cli.output import (
     show_progress,
 )
 from tcpipe.errors import UsageError
-from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions
+from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions, CheckSplitOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.export import Exported
@@ -81,6 +81,23 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
     else:
         print_lines(result.format())
     return result.exit_code
+
+
+@click.command("check-split")
+@add_options(CheckSplitOptions)
+@json_option
+def check_split(options: CheckSplitOptions, *, as_json: bool) -> int:
+    """Judge the train/test split of TABLE (.parquet, .csv or .tsv) for spatial leakage: each held-out split against the training samples.
+
+    A sample leaks if its footprint shares ground with a training footprint, or if it is next to a training sample on its run.
+
+    Exit code 3: a larger share of a held-out split than --limit leaks.
+    """
+    from tcpipe.pipeline.split_check import run_check_split
+
+    result = run_check_split(options)
+    print_result(result, as_json=as_json)
+    return 3 if result.above_limit else 0
 
 
 @click.command()

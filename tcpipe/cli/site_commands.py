@@ -107,6 +107,7 @@ _ANSWERS = {
     "add-map.answer": "pipeline.maps.AddedMap",
     "audit.answer": "pipeline.audit.Audit",
     "build-dataset.answer": "pipeline.dataset.build.BuildResult",
+    "check-split.answer": "pipeline.split_check.SplitCheck",
     "cost-map.answer": "planning.cost_map.CostMapResult",
     "diff.answer": "pipeline.diff.Difference",
     "evaluate-adaptation.answer": "learning.evaluation_files.AdaptationFacts",

@@ -1,7 +1,8 @@
-"""Tables of what the ground and the weather were like: CSV or Parquet, joined to samples by time, each taking the last row before it."""
+"""Tables of others, CSV or Parquet; covariates (ground, weather), of which a sample gets the last row before it."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -76,15 +77,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
     Without ``time_column`` the only one that has its name; ``time_unit`` is of stamps that are numbers, text is ISO 8601, and UTC where it
     names no zone. `DatasetError`: it cannot be read, has no time, or two rows of one time differ.
     """
-    try:
-        if path.suffix.lower() == ".parquet":
-            table = pl.scan_parquet(path).collect()
-        else:
-            table = pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE).collect()
-    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: not a readable table ({str(error).splitlines()[0]}); expected CSV or Parquet"
-        ) from None
+    table, _ = read_rows(path)
     column = _time_column(path, table, time_column)
     stamps = _parse_stamps(path, table[column], time_unit)
     known = stamps.is_not_null()
@@ -107,6 +100,25 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
             f"{path}: rows of {_format_utc(twice[0])} differ from one another; expected one row a stamp: one station, one depth a file"
         )
     return CovariateTable(path.name, compute_checksum(path), column, rows, tuple(findings))
+
+
+def read_rows(path: Path, names: Collection[str] | None = None) -> tuple[pl.DataFrame, list[str]]:
+    """Return the columns of a CSV or Parquet file that are among ``names`` (None: all), categories as text, and the names of all.
+
+    Raises `DatasetError` if the file cannot be read.
+    """
+    try:
+        is_parquet = path.suffix.lower() == ".parquet"
+        rows = (
+            pl.scan_parquet(path) if is_parquet else pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE)
+        )
+        there = rows.collect_schema().names()
+        wanted = rows.select(there if names is None else [name for name in there if name in names])
+        return wanted.cast({pl.Categorical: pl.String}).collect(), there
+    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
+        raise DatasetError(
+            f"{path}: not a readable table ({str(error).splitlines()[0]}); expected CSV or Parquet"
+        ) from None
 
 
 def _format_utc(stamp_ns: int) -> str:

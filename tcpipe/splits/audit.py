@@ -42,7 +42,7 @@ class Leakage:
     """A held-out split against train; arrays are of its samples ``rows``, shape (M,)."""
 
     rows: Ints
-    train_neighbours: NDArray[np.uint8]
+    train_neighbours: Ints
     """Number of training samples that follow or precede each sample on its track."""
     shares_ground: Mask
     """Whether its footprint shares ground with a training footprint."""
@@ -59,7 +59,19 @@ def audit_leakage(
 ) -> tuple[HeldOut, ...]:
     """Return the counts of each split that is ``held`` out against train; parameters as for `measure_leakage`."""
     measured = measure_leakage(train, held, run, start_ns, corners_xy_m, chord_m=chord_m)
-    return tuple(_count_leakage(name, leakage) for name, leakage in measured.items())
+    return tuple(
+        HeldOut(
+            split=name,
+            samples=len(part.rows),
+            overlapping_samples=int(part.shares_ground.sum()),
+            overlapping_pairs=part.overlapping_pairs,
+            same_track_pairs=int(part.train_neighbours.sum()),
+            repeated_place_samples=int(part.repeats_place.sum()),
+            nearest_train_min_m=float(part.nearest_m.min()) if len(part.nearest_m) else None,
+            nearest_train_median_m=float(np.median(part.nearest_m)) if len(part.nearest_m) else None,
+        )
+        for name, part in measured.items()
+    )
 
 
 def measure_leakage(
@@ -74,16 +86,14 @@ def measure_leakage(
     corners_xy_m : corners of the footprints [m], shape (N, 4, 2).
     chord_m : segment length [m]; samples follow one another if their centres are at most 1.5 chords apart.
     """
-    neighbours = _count_train_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
+    neighbours = _count_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
     ground = Ground(corners_xy_m, np.flatnonzero(train))
     return {name: _measure_split(np.flatnonzero(is_held), run, ground, neighbours) for name, is_held in held.items()}
 
 
-def _count_train_neighbours(
-    train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
-) -> NDArray[np.uint8]:
+def _count_neighbours(train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float) -> Ints:
     """Return how many training samples follow or precede each sample on its track, shape (N,)."""
-    order, found = np.lexsort((start_ns, run)), np.zeros(len(run), np.uint8)
+    order, found = np.lexsort((start_ns, run)), np.zeros(len(run), np.int8)
     for first in range(0, len(order) - 1, _CHUNK):
         rows = order[first : first + _CHUNK + 1]
         before, after = rows[:-1], rows[1:]
@@ -107,7 +117,7 @@ class Ground:
         self.tree = cKDTree(centres)
 
 
-def _measure_split(held: Ints, run: Ints, train: Ground, neighbours: NDArray[np.uint8]) -> Leakage:
+def _measure_split(held: Ints, run: Ints, train: Ground, neighbours: Ints) -> Leakage:
     pairs, apart_m = 0, [np.empty(0)]
     shares, repeats = np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
     for part in _split_points(np.arange(len(held)), _CHUNK) if len(train.rows) else []:
@@ -122,20 +132,6 @@ def _measure_split(held: Ints, run: Ints, train: Ground, neighbours: NDArray[np.
         repeats[part[i[real & (run[rows[i]] != run[j])]]] = True
         apart_m.append(compute_nearest_m(queries, train))
     return Leakage(held, neighbours[held], shares, repeats, np.concatenate(apart_m), pairs)
-
-
-def _count_leakage(name: str, leakage: Leakage) -> HeldOut:
-    nearest_m = leakage.nearest_m
-    return HeldOut(
-        split=name,
-        samples=len(leakage.rows),
-        overlapping_samples=int(leakage.shares_ground.sum()),
-        overlapping_pairs=leakage.overlapping_pairs,
-        same_track_pairs=int(leakage.train_neighbours.sum()),
-        repeated_place_samples=int(leakage.repeats_place.sum()),
-        nearest_train_min_m=float(nearest_m.min()) if len(nearest_m) else None,
-        nearest_train_median_m=float(np.median(nearest_m)) if len(nearest_m) else None,
-    )
 
 
 def compute_middles(ends: Sequence[NDArray[np.generic]]) -> Floats:
