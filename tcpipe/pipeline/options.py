@@ -239,7 +239,8 @@ class CheckSplitOptions:
     )
     train: str = option("train", Option("Split of the training samples.", metavar="NAME"))
     unused: str | Sequence[str] = option(
-        "buffer", Option("Split that is not judged, as rows without one; repeatable.", metavar="NAME", repeatable=True)
+        ("buffer",),
+        Option("Split that is not judged, as rows without one; repeatable.", metavar="NAME", repeatable=True),
     )
     footprint_m: float = option(
         1.0, Option("Side of the square of ground that a sample shows.", ("--footprint",), Range(0.0, 1e6, is_open=True), "METRES")

@@ -147,11 +147,8 @@ def run_check_split(options: CheckSplitOptions) -> SplitCheck:
         held_out=tuple(checked),
     )
     if options.html is not None:
-        places = {options.train: is_train, **held}
-        places_m = {
-            name: np.mean(ends_m, axis=0)[rows]
-            for name, rows in (places | {"leaking": np.concatenate(leaking)}).items()
-        }
+        rows = {options.train: is_train, **held, "leaking": np.concatenate(leaking)}
+        places_m = {name: np.mean(ends_m, axis=0)[of] for name, of in rows.items()}
         write_text(Path(options.html), render_split_page(result.describe(), result.make_table(), places_m))
     return result
 
@@ -189,26 +186,21 @@ def _read_samples(options: CheckSplitOptions, path: Path, xy: Sequence[str]) -> 
     if path.suffix.lower() not in _SUFFIXES:
         raise DatasetError(f"{path}: unknown type of file; expected a table that ends in {' or '.join(_SUFFIXES)}")
     frame, there = read_rows(path, flags)
-    problems = [
-        f"no column {name!r} ({flag}); there are {', '.join(there)}"
-        for name, flag in flags.items()
-        if name not in there
-    ]
-    if frame.is_empty():
-        raise DatasetError(*(f"{path}: {problem}" for problem in [*problems, "the table has no rows"]))
-    table = frame.to_arrow()
-    split, is_used = np.full(table.num_rows, ""), np.ones(table.num_rows, np.bool_)
-    if options.split in there:
+    named = ", ".join(there)
+    problems = [f"no column {name!r} ({flag}); there are {named}" for name, flag in flags.items() if name not in there]
+    problems += ["the table has no rows"] if frame.width and frame.is_empty() else []
+    table, split, is_used = frame.to_arrow(), np.full(frame.height, ""), np.ones(frame.height, np.bool_)
+    if options.split in there and frame.height:
         split = to_texts(table.column(options.split).cast(pa.string()).fill_null(""))
         unused = [options.unused] if isinstance(options.unused, str) else [*options.unused]
         is_used = (split == options.train) | ~np.isin(split, ["", *unused])
-        values = f"column {options.split} has {', '.join(np.unique(split))}"
+        values = f"column {options.split} has {', '.join(np.unique(split[split != '']))}"
         if not (split == options.train).any():
             problems.append(f"no training samples, {options.train!r}: {values}; name their value (--train)")
         if not (is_used & (split != options.train)).any():
             problems.append(f"no held-out samples: {values}; expected a value besides --train and --unused")
-    for name in table.column_names:
-        if name != options.split:
+    for name in table.column_names if frame.height else ():
+        if name in xy or name != options.split:
             problems += _find_column_problems(table, name, is_used, is_number=name in xy)
     if problems:
         raise DatasetError(*(f"{path}: {problem}" for problem in problems))
