@@ -152,7 +152,7 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
 
 
 def _parse_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
-    """Return stamps [ns since 1970, UTC], null where there is none."""
+    """Return stamps [ns since 1970, UTC], null for a row without a stamp."""
     if column.dtype.is_temporal() and column.dtype not in {pl.Time, pl.Duration}:
         return column.cast(pl.Datetime("ns", getattr(column.dtype, "time_zone", None))).cast(pl.Int64)
     if column.dtype.is_numeric():

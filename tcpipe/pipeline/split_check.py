@@ -57,7 +57,7 @@ class SplitLeakage:
 
 @dataclass(frozen=True, slots=True)
 class SplitCheck:
-    """What the held-out splits of a table share with its training samples."""
+    """Leakage of the held-out splits of a table, and how it was judged."""
 
     table: str
     train_samples: int

@@ -20,6 +20,7 @@ TEXTS = {
     "name", "robot", "cluster", "map_name", "tags", "sample_id", "scenario", "names", "topics", "crs",
     "start", "goal", "holdout", "strays", "shard", "min_age_s", "forget", "drives",
     "adapt", "budget_joule", "layers", "predictor", "reason", "run", "runs",
+    "split", "time", "train", "unused", "xy",
 }  # fmt: skip
 """Parameters of commands that are text and no path."""
 
@@ -98,6 +99,7 @@ CALLS = [
     "build-dataset file --store empty",
     "build-dataset out --store empty --keep-split other",
     "build-dataset out --store empty --exclude gone.csv --reason why",
+    "check-split gone.csv --xy x,y",
     "cost-map gone out --store empty",
     "demo other",
     "diff empty empty",
