@@ -23,7 +23,7 @@ def render_split_page(
 
     These are the positions [m], (N, 2), of each split by its name, and at last those of the samples that leak.
     """
-    others = iter(CLASS_COLOURS * len(places_m))
+    others = iter(CLASS_COLOURS[1:] * len(places_m))
     colours = {name: SPLIT_COLOURS.get(name) or next(others) for name in places_m} | {"leaking": CURSOR}
     alt = "Map of the samples by split; the table below lists the counts."
     plot = replace(make_map_plot(alt=alt, axes=("x [m]", "y [m]"), height_px=420), legend=colours)
