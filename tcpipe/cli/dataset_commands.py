@@ -87,7 +87,7 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 @add_options(CheckSplitOptions)
 @json_option
 def check_split(options: CheckSplitOptions, *, as_json: bool) -> int:
-    """Judge the train/test split of TABLE (.parquet or .csv) for spatial leakage: each held-out split against the training samples.
+    """Judge the train/test split of TABLE (.parquet or .csv) for spatial leakage.
 
     A sample leaks if its footprint shares ground with a training footprint, or if it is next to a training sample on its run.
 
