@@ -108,10 +108,10 @@ def read_rows(path: Path, names: Collection[str] | None = None) -> tuple[pl.Data
     Raises `DatasetError` if the file cannot be read.
     """
     try:
-        is_parquet = path.suffix.lower() == ".parquet"
-        rows = (
-            pl.scan_parquet(path) if is_parquet else pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE)
-        )
+        if path.suffix.lower() == ".parquet":
+            rows = pl.scan_parquet(path, glob=False)
+        else:
+            rows = pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE, glob=False)
         there = rows.collect_schema().names()
         wanted = rows.select(there if names is None else [name for name in there if name in names])
         return wanted.cast({pl.Categorical: pl.String}).collect(), there

@@ -82,9 +82,7 @@ class SplitCheck:
     def describe(self) -> list[str]:
         """Return lines on what was judged, how, and with which result."""
         within_m = self.neighbours_within_m
-        on_run = (
-            "not judged without --run" if within_m is None else f"adjacent on a run, at most {within_m:.3g} m apart"
-        )
+        on_run = f"adjacent on a run, at most {within_m:.3g} m apart" if within_m else "not judged without --run"
         return [
             f"{self.table}: {self.train_samples} training samples; {self.unused_samples} samples in no split",
             f"footprint {self.footprint_m:g} m; neighbours: {on_run}",
@@ -125,7 +123,7 @@ def run_check_split(options: CheckSplitOptions) -> SplitCheck:
     for name, found in measure_leakage(is_train, held, run, order, footprints_m, chord_m=chord_m).items():
         is_neighbour = found.train_neighbours > 0
         leaking.append(found.rows[found.shares_ground | is_neighbour])
-        part = SplitLeakage(
+        of_split = SplitLeakage(
             split=name,
             samples=len(found.rows),
             leaking_samples=len(leaking[-1]),
@@ -135,7 +133,7 @@ def run_check_split(options: CheckSplitOptions) -> SplitCheck:
             nearest_train_min_m=float(found.nearest_m.min()),
             near_fraction=float((found.nearest_m <= options.footprint_m).mean()),
         )
-        checked.append(part)
+        checked.append(of_split)
     result = SplitCheck(
         table=str(path),
         train_samples=int(is_train.sum()),
