@@ -145,7 +145,7 @@ def run_check_split(options: CheckSplitOptions) -> SplitCheck:
         held_out=tuple(checked),
     )
     if options.html is not None:
-        rows = {options.train: is_train, **held, "leaking": np.concatenate(leaking)}
+        rows = {options.train: is_train, **held, "leaking samples": np.concatenate(leaking)}
         places_m = {name: np.mean(ends_m, axis=0)[of] for name, of in rows.items()}
         write_text(Path(options.html), render_split_page(result.describe(), result.make_table(), places_m))
     return result

@@ -24,12 +24,12 @@ def render_split_page(
     These are the positions [m], (N, 2), of each split by its name, and at last those of the samples that leak.
     """
     others = iter(CLASS_COLOURS[1:] * len(places_m))
-    colours = {name: SPLIT_COLOURS.get(name) or next(others) for name in places_m} | {"leaking": CURSOR}
+    colours = {name: SPLIT_COLOURS.get(name) or next(others) for name in places_m} | {"leaking samples": CURSOR}
     alt = "Map of the samples by split; the table below lists the counts."
     plot = replace(make_map_plot(alt=alt, axes=("x [m]", "y [m]"), height_px=420), legend=colours)
     every = -(-sum(map(len, places_m.values())) // _MOST_POINTS)
     for name, xy_m in places_m.items():
-        look = {"size": 9, "fill_alpha": 0.0} if name == "leaking" else {"size": 5}
+        look = {"size": 9, "fill_alpha": 0.0} if name == "leaking samples" else {"size": 5}
         plot.figure.scatter(*xy_m[::every].T, color=colours[name], **look)
     parts = [Section("Held-out splits", "Distances are between footprints.", header=rows[0], rows=rows[1:])]
     sections = [Section("Map", f"One of {every} samples." if every > 1 else "", plots=[plot]), *parts]
