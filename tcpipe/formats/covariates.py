@@ -24,6 +24,7 @@ TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
 _TIME_NAMES = ("time", "stamp", "timestamp", "datetime", "date", "date_time", "time_utc", "utc")
 _NO_VALUE = ["", "NA", "N/A", "n/a", "NaN", "nan", "null", "NULL", "None"]
+_LONGEST_HEAD = 65_536  # [byte], of a line of column names
 _STAMP, _FOUND, _ROW = "tcpipe stamp", "tcpipe found", "tcpipe row"
 _MOSTLY = 0.5
 
@@ -111,7 +112,10 @@ def read_rows(path: Path, names: Collection[str] | None = None) -> tuple[pl.Data
         if path.suffix.lower() == ".parquet":
             rows = pl.scan_parquet(path, glob=False)
         else:
-            rows = pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE, glob=False)
+            with path.open("rb") as file:
+                head = file.readline(_LONGEST_HEAD).decode("utf-8", "replace")
+            mark = max(",;\t", key=head.count)
+            rows = pl.scan_csv(path, separator=mark, infer_schema_length=None, null_values=_NO_VALUE, glob=False)
         there = rows.collect_schema().names()
         wanted = rows.select(there if names is None else [name for name in there if name in names])
         return wanted.cast({pl.Categorical: pl.String}).collect(), there

@@ -98,10 +98,10 @@ def test_what_is_missing_is_named(store, tmp_path):
     bare = open_store(tmp_path / "bare", create=True)
     bare.put(State(), "calls", "0000000100000000", Call(command="ingest", version="2.0.0"))
     with pytest.raises(DatasetError) as caught:
-        build(bare, tmp_path)
+        build(bare, tmp_path, map_name="site")
     runs, maps = caught.value.problems
     assert "no runs in the store" in runs
-    assert "no map in the store" in maps
+    assert "no map 'site' in the store" in maps
 
 
 def test_several_maps_are_listed_with_the_flag(store, tmp_path):
@@ -241,9 +241,9 @@ def test_the_card_says_what_the_power_of_any_run_feeds(store, tmp_path):
     assert open_dataset(tmp_path / "out").card.label.includes == ("computers", "user ports")
 
 
-def test_no_power_is_no_sample(store, tmp_path):
+def test_beside_runs_with_power_one_without_gives_no_sample(store, tmp_path):
     add(store, powered=False)
-    assert "none with power" in refused(store, tmp_path)
+    assert "none with power" in refused(store, tmp_path, labels="energy")
     add(store, "b", (3.0,))
     result = build(store, tmp_path, page=True)
     assert result.card.samples == 20

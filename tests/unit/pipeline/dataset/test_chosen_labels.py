@@ -79,7 +79,9 @@ def test_runs_without_power_give_the_samples_splits_and_times_of_runs_with_it(st
     result = build(unpowered, tmp_path / "without", split=region)
     ours, theirs = read(tmp_path / "without"), read(tmp_path / "with")
     names = ("split", "fold", "duration_s", "velocity_mps", "slip_fraction", "terrain_name")
-    assert [[row[name] for name in names] for row in ours.values()] == [[row[name] for name in names] for row in theirs.values()]
+    assert [[row[name] for name in names] for row in ours.values()] == [
+        [row[name] for name in names] for row in theirs.values()
+    ]
     assert list(ours) == list(theirs)
     assert {row["energy_joule"] for row in ours.values()} == {None}
     data = open_dataset(tmp_path / "without")
@@ -123,7 +125,9 @@ def test_a_label_that_no_segment_has_is_named_with_what_the_runs_lack(store, tmp
 def test_without_a_map_the_dataset_is_a_table_with_the_same_split(store, bare, tmp_path, region):
     for each in (store, bare):
         for number in range(2):
-            add_run(each, f"run{number}", make_segments(f"run{number}", [1.0, 2.0 + 9 * number], start_ns=number * 10**12))
+            add_run(
+                each, f"run{number}", make_segments(f"run{number}", [1.0, 2.0 + 9 * number], start_ns=number * 10**12)
+            )
     build(store, tmp_path / "with", split=region)
     result = build(bare, tmp_path / "without", split=region)
     assert [finding.code for finding in result.findings if "map" in finding.code] == ["no-map"]
@@ -164,7 +168,9 @@ def test_parquet_without_patches_has_a_file_of_samples_for_each_split(bare, tmp_
     card = build(bare, tmp_path / "out", file_format="parquet").card
     assert {shard.split for shard in card.shards} == {"train", "test"}
     tables = [pq.read_table(tmp_path / "out" / shard.path) for shard in card.shards]
-    assert sorted(name for table in tables for name in table.column("sample_id").to_pylist()) == sorted(read(tmp_path / "out"))
+    assert sorted(name for table in tables for name in table.column("sample_id").to_pylist()) == sorted(
+        read(tmp_path / "out")
+    )
     assert len(open_dataset(tmp_path / "out")["train"]) == card.splits["train"]
 
 
@@ -178,7 +184,9 @@ def test_without_coordinates_and_patches_no_place_on_earth_is_left(bare, tmp_pat
 
 
 def test_runs_without_gnss_are_split_and_audited_each_in_its_own_frame(bare, tmp_path, region):
-    for number in range(2):  # both begin at their own origin: the same numbers, on ground that nobody knows to be the same
+    for number in range(
+        2
+    ):  # both begin at their own origin: the same numbers, on ground that nobody knows to be the same
         table = with_null(make_segments(f"run{number}", [1.0, 12.0], start_ns=number * 10**12), *POSITIONS)
         for end, east in (("start", 0.0), ("end", 1.0)):
             at = table.schema.get_field_index(f"{end}_x_m")
