@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import Recipe
+from tcpipe.tables.findings import LEFT_OUT
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +23,13 @@ class RunInputs:
     """Checksum of its log."""
     segments_sha256: str | None
     tags: Mapping[str, str]
+    size_bytes: int = 0
+    """Size of its log; 0: not recorded."""
+    parts: tuple[Checksum, ...] = field(default=(), metadata=LEFT_OUT)
+    """Of several logs that were ingested as one: each of them, in order."""
+    robot_requested: str | None = field(default=None, metadata=LEFT_OUT)
+    message_definitions: str = field(default="", metadata={"json": ("",)})
+    """Hash of the definitions that were given for types which the log does not define."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,7 +65,7 @@ def read_regions(path: Path) -> Regions:
         problems += _find_disagreements(path, polygons)
     if problems:
         raise RegionError(*shorten_problems(problems))
-    return Regions(*(shapely.union_all(polygons[kind]) for kind in KINDS))
+    return Regions(*(shapely.normalize(shapely.union_all(polygons[kind])) for kind in KINDS))
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,8 @@ class LogOrigin:
     """Data that was hashed: the whole log, or, if only part of it was downloaded, the sizes and indexes of its files."""
     outline: str = field(default="", metadata=LEFT_OUT)
     """Hash of the size and index of the log, by which it is known where not all of it is at hand; "" where it has none."""
+    parts: tuple[Checksum, ...] = field(default=(), metadata=LEFT_OUT)
+    """Of several logs that were ingested as one: each of them, in order."""
 
 
 @dataclass(frozen=True, slots=True)

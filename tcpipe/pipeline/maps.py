@@ -79,7 +79,8 @@ def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
     if "height" not in files:
         raise UsageError(f"map {name}: no height raster; give --height FILE")
     store, state = call.store, call.state
-    inputs = MapInputs(_compute_checksums(files), options.crs, tuple(sorted(categorical)), bands)
+    main_files = {role: _name_files(paths, paths) for role, paths in sorted(files.items())}
+    inputs = MapInputs(_compute_checksums(files), main_files, options.crs, tuple(sorted(categorical)), bands)
     more = MoreLayers(
         {name: files[name] for name in layers},
         {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
@@ -167,19 +168,22 @@ def _describe_no_file(text: str) -> str:
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
 
 
+def _name_files(files: Iterable[Path], paths: Sequence[Path]) -> tuple[str, ...]:
+    """Return the names of files below the folder that the files of a role share."""
+    folder = os.path.commonpath([path.absolute().parent for path in paths])
+    return tuple(os.path.relpath(file, folder) for file in files)
+
+
 def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]:
-    """Return a checksum for every file of every role, in their order."""
+    """Return a checksum for every file of every role, in their order; the order of options does not count."""
     checksums: dict[str, dict[str, str]] = {}
     problems: list[str] = []
-    for role, paths in files.items():
-        checksums[role] = {}
-        folder = os.path.commonpath([path.absolute().parent for path in paths])
+    for role, paths in sorted(files.items()):
         try:
             plain = role.endswith(_CLASSES) or (role == "terrain" and is_drawn(paths))
-            for part in dict.fromkeys(
-                part for path in paths for part in ([path] if plain else list_raster_files(path))
-            ):
-                checksums[role][os.path.relpath(part, folder)] = compute_checksum(part).sha256
+            parts = dict.fromkeys(part for path in paths for part in ([path] if plain else list_raster_files(path)))
+            digests = [compute_checksum(part).sha256 for part in parts]
+            checksums[role] = dict(zip(_name_files(parts, paths), digests, strict=True))
         except MapError as error:
             problems += error.problems
         except OSError as error:

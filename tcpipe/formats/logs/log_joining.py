@@ -10,12 +10,14 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
 import pyarrow as pa
 
 from tcpipe.errors import LogError
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
 from tcpipe.formats.logs.log_names import AUTOPILOT_SUFFIXES, find_reader, is_log_file
 from tcpipe.formats.logs.message_tables import TableLog, open_registered_log
@@ -63,14 +65,20 @@ class JoinedLog(OpenLog):
         """Whether `sha256` holds an outline."""
         return any(log.is_known_by_outline for log in self._logs)
 
-    def sha256(self) -> str:
-        """Return the file's hash; of several, that of their hashes, in order. `LogError` when two files are the same recording."""
+    @cached_property
+    def parts(self) -> tuple[Checksum, ...]:
+        """Size and hash of each log, in order. `LogError`: two logs are the same recording."""
         digests: dict[str, Log | TableLog] = {}
         for log in self._logs:
             twin = digests.setdefault(log.sha256(), log)
             if twin is not log:
                 raise LogError(f"{log.path}: the same recording as {twin.path}; give each part once")
-        return hashlib.sha256("".join(digests).encode()).hexdigest() if len(digests) > 1 else next(iter(digests))
+        return tuple(Checksum(log.size_bytes, sha256) for sha256, log in digests.items())
+
+    def sha256(self) -> str:
+        """Return the hash of the log; of several, that of their hashes, in order."""
+        digests = [part.sha256 for part in self.parts]
+        return hashlib.sha256("".join(digests).encode()).hexdigest() if len(digests) > 1 else digests[0]
 
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return each topic's table over all files, in log-time order."""
