@@ -1,8 +1,8 @@
 """tcpipe: from raw robot logs to datasets that a terrain-cost model can be trained on.
 
-The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `check_split`, `open_dataset`, `train`,
-`evaluate`, `predict_path`, `plan_path`. They are loaded when first asked for, so that ``import tcpipe`` costs nothing;
-``__init__.pyi`` tells editors and type checkers where each is.
+The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `rebuild`, `check_split`, `open_dataset`,
+`train`, `evaluate`, `predict_path`, `plan_path`. They are loaded when they are first used, so that ``import tcpipe`` costs nothing;
+``__init__.pyi`` gives editors and type checkers the module of each.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ _HOMES = {
     "build_dataset": ("tcpipe.pipeline.dataset.build", "build_dataset"),
     "check_split": ("tcpipe.pipeline.split_check", "check_split"),
     "open_dataset": ("tcpipe.dataset", "open_dataset"),
+    "rebuild": ("tcpipe.pipeline.rebuild", "rebuild"),
     "train": ("tcpipe.api", "train"),
     "evaluate": ("tcpipe.api", "evaluate"),
     "predict_path": ("tcpipe.api", "predict_path"),
@@ -37,6 +38,7 @@ __all__ = [
     "plan_path",
     "predict_path",
     "read_log",
+    "rebuild",
     "train",
 ]
 

@@ -5,6 +5,7 @@ from tcpipe.formats.logs.log_joining import open_single_log as read_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
+from tcpipe.pipeline.rebuild import rebuild
 from tcpipe.pipeline.split_check import check_split
 
 __version__: str
@@ -21,5 +22,6 @@ __all__ = [
     "plan_path",
     "predict_path",
     "read_log",
+    "rebuild",
     "train",
 ]

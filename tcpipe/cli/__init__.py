@@ -56,6 +56,7 @@ _COMMANDS = {
     "explain": ("dataset_commands", "Trace a sample to its log"),
     "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
     "diff": ("dataset_commands", "List the differences of two datasets, by cause"),
+    "rebuild": ("dataset_commands", "Build a dataset again from its own record"),
     "simulate": ("site_commands", "Write a simulated site with its true values"),
 }
 """The module and the purpose of each command, in the order a user meets them; the command NAME-X is the function NAME_X there."""

@@ -110,6 +110,7 @@ _ANSWERS = {
     "check-split.answer": "pipeline.split_check.SplitCheck",
     "cost-map.answer": "planning.cost_map.CostMapResult",
     "diff.answer": "pipeline.diff.Difference",
+    "rebuild.answer": "pipeline.rebuild.Rebuilt",
     "evaluate-adaptation.answer": "learning.evaluation_files.AdaptationFacts",
     "evaluate-drives.answer": "planning.drives.Drives",
     "explain.answer": "pipeline.explain.Explained",

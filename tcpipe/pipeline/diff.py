@@ -29,6 +29,7 @@ _SHARED = 0.9
 """So much of their time samples share that are compared."""
 
 Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 Describe = Callable[[Change, DatasetCard, DatasetCard], Iterator[str]]
 
 
@@ -47,10 +48,13 @@ class Difference:
     labels: Mapping[str, Mapping[str, float]]
     """For every label: means and deviations over all samples."""
     changes: Mapping[str, Mapping[str, float]]
-    """For every label and its σ: median and largest absolute change, over the samples of one run that share most of their time."""
+    """For every label and its σ: median and largest absolute change, of a label also in σ of the first (``largest_in_std``); over the
+    samples of one run that share most of their time."""
     findings_gone: tuple[Finding, ...]
     """Findings of the first, by code and subject, that the second lacks: its own, its runs' and its maps'."""
     findings_new: tuple[Finding, ...]
+    differing: int
+    """Number of samples of the first that the second lacks, or has with other values, split or patch."""
     same: bool
     """Whether nothing differs."""
 
@@ -74,17 +78,21 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     in_a = np.flatnonzero(np.isfinite(row))
     in_b = row[in_a].astype(np.int64)
     both = ((first, in_a), (second, in_b))
+    splits = [table.column("split").to_numpy()[rows] for table, rows in zip(tables, (in_a, in_b), strict=True)]
+    differing = {
+        "other labels": _find_differing(both, [name for name in shared if name in _LABELLED]),
+        "other columns": _find_differing(both, [name for name in shared if name not in (*_LABELLED, *_DRAWN)]),
+        "other patches": _find_differing_patches((first, second), cards, tables, in_a, in_b),
+        "other fold": _find_differing(both, [name for name in shared if name == "fold"]),
+    }
     counts = {
         "only in a": tables[0].num_rows - len(in_a),
         "only in b": tables[1].num_rows - len(in_a),
         "in both": len(in_a),
-        "other labels": _count_differing(both, [name for name in shared if name in _LABELLED]),
-        "other columns": _count_differing(both, [name for name in shared if name not in (*_LABELLED, *_DRAWN)]),
-        "other patches": _count_differing_patches((first, second), cards, tables, in_a, in_b),
-        "other fold": _count_differing(both, [name for name in shared if name == "fold"]),
+        **{name: int(mask.sum()) for name, mask in differing.items()},
     }
-    moved = _count_moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
-    causes = tuple(_iterate_causes(*cards))
+    moved = _count_moved(*splits)
+    causes = list_causes(*cards)
     (ours, theirs) = (_find_all(card) for card in cards)
     gone, new = (
         tuple(runs[key] for key in runs if key not in other) for runs, other in ((ours, theirs), (theirs, ours))
@@ -100,6 +108,7 @@ def diff(a: str | Path, b: str | Path) -> Difference:
         changes=_measure_changes((first, second)),
         findings_gone=gone,
         findings_new=new,
+        differing=counts["only in a"] + int(np.any([splits[0] != splits[1], *differing.values()], axis=0).sum()),
         same=same,
     )
 
@@ -129,15 +138,25 @@ def _read_values(table: pa.Table, name: str) -> NDArray[np.float64]:
 
 def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, float]]:
     matched = _match_by_time(*(read_samples(directory, ["run_id", "start_ns", "end_ns"]) for directory in directories))
-    found = dict[str, dict[str, float]]()
+    found, std_of = dict[str, dict[str, float]](), dict(zip(_LABELS, _STDS, strict=True))
     for name in (*_LABELS, *_STDS):
         ours, theirs = (
             _read_values(read_samples(directory, [name]), name)[rows]
             for directory, rows in zip(directories, matched, strict=True)
         )
         change = np.abs(theirs - ours)
-        if len(change := change[np.isfinite(change)]):
-            found[name] = {"samples": len(change), "median": float(np.median(change)), "largest": float(change.max())}
+        known = np.isfinite(change)
+        if not known.any():
+            continue
+        found[name] = {
+            "samples": int(known.sum()),
+            "median": float(np.median(change[known])),
+            "largest": float(change[known].max()),
+        }
+        if name in std_of:
+            std = _read_values(read_samples(directories[0], [std_of[name]]), std_of[name])[matched[0]]
+            ratio = (change[known & (std > 0.0)] / std[known & (std > 0.0)]).max(initial=0.0)
+            found[name]["largest_in_std"] = float(ratio)
     return found
 
 
@@ -158,30 +177,31 @@ def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
     return in_a[enough], in_b[enough]
 
 
-def _count_differing(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> int:
-    """Return how many of the given rows of two datasets differ in any of the columns; what is missing in both is the same."""
+def _find_differing(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> Mask:
+    """Mark the given rows of two datasets, (N,), that differ in any of the columns; values missing in both are equal."""
     other = np.zeros(len(both[0][1]), np.bool_)
     for name in names:  # one at a time: a large dataset has gigabytes of them
         ours, theirs = (read_samples(directory, [name]).column(name).take(pa.array(rows)) for directory, rows in both)
         one_null = pc.xor(pc.is_null(ours), pc.is_null(theirs))
         other |= pc.coalesce(pc.not_equal(ours, theirs), one_null).to_numpy()
-    return int(other.sum())
+    return other
 
 
-def _count_differing_patches(
+def _find_differing_patches(
     directories: tuple[Path, Path],
     cards: tuple[DatasetCard, DatasetCard],
     tables: Sequence[pa.Table],
     in_a: Ints,
     in_b: Ints,
-) -> int:
-    """Return how many samples of both have other pixels; all of them where layers or size differ."""
+) -> Mask:
+    """Mark the samples of both, (N,), that have other pixels; all of them if layers or size differ."""
     if set(cards[0].layers) != set(cards[1].layers) or cards[0].patch_px != cards[1].patch_px:
-        return len(in_a)
+        return np.ones(len(in_a), np.bool_)
     ours, theirs = (
         _hash_patches(directory, card, table) for directory, card, table in zip(directories, cards, tables, strict=True)
     )
-    return int((ours[in_a] != theirs[in_b]).sum())
+    differs: Mask = ours[in_a] != theirs[in_b]
+    return differs
 
 
 def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> NDArray[np.int64]:
@@ -204,15 +224,19 @@ def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict
     return {name: count for name, count in moves.items() if count}
 
 
-def _iterate_causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
-    """Yield a line for everything that the two are made from differently."""
+def list_causes(a: DatasetCard, b: DatasetCard) -> tuple[str, ...]:
+    """Return a line for each entry of the records of two datasets that differs, in the order of the fields."""
     changes = list(compare_records(a.made_from, b.made_from))
-    for field, describe in _CAUSES.items():
-        yield from dict.fromkeys(
-            line for change in changes if change.path[0] == field for line in describe(change, a, b)
-        )
+    lines = [
+        line
+        for field, describe in _CAUSES.items()
+        for change in changes
+        if change.path[0] == field
+        for line in describe(change, a, b)
+    ]
     if a.inputs != b.inputs and not changes:
-        yield "inputs: differ, but a dataset without coordinates does not store them"
+        lines.append("inputs: differ, but a dataset without coordinates does not store them")
+    return tuple(dict.fromkeys(lines))
 
 
 def _describe_change(word: str) -> Describe:
@@ -223,6 +247,10 @@ def _describe_change(word: str) -> Describe:
         yield f"{word}: {name}{format_value(change.was)} → {format_value(change.now)}"
 
     return describe
+
+
+def _describe_version(change: Change, _a: DatasetCard, _b: DatasetCard) -> Iterator[str]:
+    yield f"{change.name} version {format_value(change.was)} → {format_value(change.now)}"
 
 
 def _describe_file(word: str, kind: str) -> Describe:
@@ -286,7 +314,7 @@ def _describe_region(_: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]
 
 
 _CAUSES: dict[str, Describe] = {
-    "versions": _describe_change("code"),
+    "versions": _describe_version,
     "recipe": _describe_change("recipe"),
     "runs": _describe_run,
     "robots": _describe_change("robots"),

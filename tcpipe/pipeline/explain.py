@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
-from tcpipe.formats.dataset_card import DatasetCard, list_shifts
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     is_shard,
@@ -24,20 +24,17 @@ from tcpipe.formats.dataset_files import (
     read_samples,
     sample_columns,
 )
-from tcpipe.formats.documents import State
-from tcpipe.formats.json_files import to_plain
+from tcpipe.formats.json_files import convert_record, to_plain
 from tcpipe.formats.maps.map_facts import MapInputs
-from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_table
 from tcpipe.formats.runs import RunFacts
 from tcpipe.formats.stored_runs import StoredRun, read_streams
 from tcpipe.recipe import Recipe
-from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import to_integers
-from tcpipe.tables.levels import GEOMETRY, PLACED_SEGMENTS, Streams
+from tcpipe.tables.levels import GEOMETRY, Streams
 
 _NEARBY_NS = 5_000_000_000
 """Rejections this long before and after a segment are printed [ns]."""
@@ -60,11 +57,11 @@ class MessageRange:
     topic: str
     type: str
     time: str
-    """Which stamps rule: ``header`` or ``log``."""
+    """Stamps that are used: ``header`` or ``log``."""
     placed_by: str
     first: int
     last: int
-    """Less than ``first``: none."""
+    """Less than ``first``: no message."""
     of: int
     first_ns: int | None
     last_ns: int | None
@@ -72,7 +69,7 @@ class MessageRange:
 
 @dataclass(frozen=True, slots=True)
 class NearbyMask:
-    """A stretch of dropped track near a segment: why, and how far from its start or end."""
+    """A span of masked track near a segment: reasons, and the time to its start or end."""
 
     why: tuple[str, ...]
     where: Literal["before", "after"]
@@ -82,7 +79,7 @@ class NearbyMask:
 
 @dataclass(frozen=True, slots=True)
 class NearbyRefusal:
-    """How many measurements of a role near a segment the filter refused, by reason."""
+    """Number of measurements of a role near a segment that the filter rejected, by reason."""
 
     role: str
     reason: str
@@ -91,21 +88,17 @@ class NearbyRefusal:
 
 @dataclass(frozen=True, slots=True)
 class SampleMap:
-    """The map that a patch is cut from, and the tiles of it that the patch touches."""
+    """The map from which a patch was sampled, and the files that it was made from."""
 
     name: str
     crs: str
-    sources: Mapping[str, str]
-    inputs: MapInputs
-    corners_xy_m: tuple[tuple[float, float], ...]
-    """Of the patch; none where the map gives no patch any more."""
-    tiles_col_row: tuple[tuple[int, int], ...]
-    tile_px: int
+    sources: Mapping[str, str] | None
+    inputs: MapInputs | None
 
 
 @dataclass(frozen=True, slots=True)
 class Versions:
-    """By which version of the program the dataset was made, in which data model, and which version this is."""
+    """Version of tcpipe that built the dataset, the data model, and the version of tcpipe that runs now."""
 
     dataset: str
     here: str
@@ -117,7 +110,7 @@ class History:
     """A sample's whole history."""
 
     sample: Mapping[str, Value]
-    """Its row of samples.parquet by column, and which ``row`` it is."""
+    """Its row of samples.parquet by column, with the number of the ``row``."""
     labels: Mapping[str, float]
     quality: tuple[str, ...]
     run: RunFacts
@@ -128,7 +121,7 @@ class History:
     rejected: tuple[NearbyRefusal, ...]
     map: SampleMap
     recipe_differs_in: Mapping[str, Setting]
-    """The recipe's keys that are not at their default."""
+    """Keys of the recipe that differ from their default."""
     versions: Versions
 
 
@@ -145,10 +138,10 @@ class Explained:
 
 
 def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
-    """Tell where a sample of a dataset came from.
+    """Return where a sample of a dataset came from.
 
     Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data model, or the store no
-    longer holds the sample's run.
+    longer contains the sample's run.
     """
     opened = open_store(store)
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
@@ -158,12 +151,10 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
             f"{directory}: is without coordinates, so that its samples have no known source; explain the dataset with them"
         )
     sample = _read_sample(directory, sample_id)
-    run = _find_run(opened, state := opened.scan(), directory, card, sample)
-    source = open_map(*opened.map_at(opened.find_map(sample["map"], state)))
-    return Explained(sample_id, _read_history(card, sample, run, source=source))
+    return Explained(sample_id, _read_history(card, sample, _find_run(opened, directory, card, sample)))
 
 
-def _read_history(card: DatasetCard, sample: Row, run: StoredRun, *, source: MapFile) -> History:
+def _read_history(card: DatasetCard, sample: Row, run: StoredRun) -> History:
     window, streams = (sample["start_ns"], sample["end_ns"]), read_streams(run.place, run.facts)
     return History(
         sample=sample,
@@ -173,7 +164,7 @@ def _read_history(card: DatasetCard, sample: Row, run: StoredRun, *, source: Map
         messages={} if streams is None else dict(_find_messages(streams, *window)),
         masks=tuple(_iterate_masks(run, *window)),
         rejected=tuple(_iterate_rejections(run, *window)),
-        map=_map(source, sample, card),
+        map=_find_map(card, sample["map"]),
         recipe_differs_in={
             key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
         },
@@ -189,7 +180,7 @@ _LABELS = tuple(
 
 
 def _read_sample(directory: Path, sample_id: str) -> Row:
-    """Return the row of a sample, and which ``row`` it is."""
+    """Return the row of a sample by column, with its number as ``row``."""
     ids = read_samples(directory, ["sample_id"]).column("sample_id")
     row = pc.index(ids, sample_id).as_py()
     if row < 0:
@@ -206,13 +197,13 @@ def _read_sample(directory: Path, sample_id: str) -> Row:
     return {**group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0], "row": row}
 
 
-def _find_run(store: Store, state: State, directory: Path, card: DatasetCard, sample: Row) -> StoredRun:
+def _find_run(store: Store, directory: Path, card: DatasetCard, sample: Row) -> StoredRun:
     recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample["run_id"]), None)
     if recipe_id is None:
         raise DatasetError(
             f"{directory}: its card lists no run {sample['run_id']}; 'tcpipe verify {directory}' lists all problems"
         )
-    found = store.find_runs(f"{sample['run_id']}/{recipe_id}", state)
+    found = store.find_runs(f"{sample['run_id']}/{recipe_id}")
     if not found:
         raise DatasetError(
             f"{store.root}: run {sample['run_id']} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
@@ -266,35 +257,13 @@ def _iterate_rejections(run: StoredRun, start_ns: int, end_ns: int) -> Iterator[
         yield NearbyRefusal(role, reason, count)
 
 
-def _map(source: MapFile, sample: Row, card: DatasetCard) -> SampleMap:
-    known = {**sample, "position_std_m": 0.0}  # that of the shift is in it already
-    corners = _sample_segment(known, source, card).footprint_xy_m.reshape(-1, 2)
-    px = source.grid.px_from_xy(corners)
-    ends = (px.min(axis=0), px.max(axis=0)) if len(px) else (np.zeros(2), -np.ones(2))
-    low, high = (np.floor(end / source.tile_px).astype(int) for end in ends)
-    return SampleMap(
-        name=source.name,
-        crs=source.grid.crs,
-        sources=source.facts.sources,
-        inputs=source.facts.inputs,
-        corners_xy_m=tuple((x, y) for x, y in corners.tolist()),
-        tiles_col_row=tuple((col, row) for row in range(low[1], high[1] + 1) for col in range(low[0], high[0] + 1)),
-        tile_px=source.tile_px,
-    )
-
-
-def _sample_segment(segment: Mapping[str, Value], source: MapFile, card: DatasetCard) -> Sampled:
-    """Sample one segment, given as a row of values, moved as the dataset's run was."""
-    row = {column.name: pa.array([segment[column.name]], column.dtype) for column in PLACED_SEGMENTS.columns}
-    table = pa.Table.from_arrays(list(row.values()), schema=PLACED_SEGMENTS.arrow())
-    shifts = list_shifts(
-        entry for map_source in card.maps if map_source.name == source.name for entry in map_source.registration
-    )
-    return sample_segments(table, source, card.recipe.sample, gnss_crs=card.recipe.read.gnss_crs, shifts=shifts)
+def _find_map(card: DatasetCard, name: str) -> SampleMap:
+    source = next(source for source in card.maps if source.name == name)
+    return convert_record(source, SampleMap)
 
 
 def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
-    """Return a recipe's values by dotted key; a table whose keys are the user's own is one value."""
+    """Return the values of a recipe by dotted key; a table with keys of the user is one value."""
     flat: dict[str, Setting] = {}
     for key, value in to_plain(asdict(recipe)).items():
         flat |= {f"{key}.{name}": item for name, item in value.items()} if isinstance(value, Mapping) else {key: value}
@@ -325,9 +294,8 @@ def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
         yield f"masked   {mask.apart_s:.2f} s {mask.where}: {', '.join(mask.why)}, {mask.rows} rows"
     for rejected in facts.rejected:
         yield f"rejected {rejected.count} of {rejected.role} ({rejected.reason}) within {_NEARBY_NS / 1e9:g} s"
-    tiles = ", ".join(f"({col}, {row})" for col, row in ground.tiles_col_row)
-    made_of = ", ".join(f"{layer} {name}" for layer, name in sorted(ground.sources.items()))
-    yield f"map      {ground.name} in {ground.crs} from {made_of}; tiles (column, row) {tiles}"
+    made_of = ", ".join(f"{layer} {name}" for layer, name in sorted((ground.sources or {}).items()))
+    yield f"map      {ground.name} in {ground.crs} from {made_of}"
     changed = (
         ", ".join(f"{key} = {value}" for key, value in facts.recipe_differs_in.items()) or "all keys at their defaults"
     )

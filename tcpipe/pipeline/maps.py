@@ -32,8 +32,8 @@ from tcpipe.terrain.layers import find_wrong_name
 
 logger = logging.getLogger("tcpipe")
 
-_ROLES = ("height", "ortho", "terrain", "classes")
-_CLASSES = "classes"
+ROLES = ("height", "ortho", "terrain", "classes")
+CLASSES = "classes"
 """Role of a class table, and behind a layer's name that of the layer's own."""
 
 
@@ -72,8 +72,8 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
 def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
     name, layers, categorical = check_map_name(options.name), options.layers or {}, options.categorical or {}
     _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
-    given = {role: getattr(options, role) for role in _ROLES}
-    tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
+    given = {role: getattr(options, role) for role in ROLES}
+    tables = {f"{name} {CLASSES}": table for name, table in categorical.items() if table}
     files = _find_files({role: value for role, value in {**given, **layers, **tables}.items() if value})
     bands = None if options.ortho_bands == "grey" else options.ortho_bands
     if "height" not in files:
@@ -83,7 +83,7 @@ def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
     inputs = MapInputs(_compute_checksums(files), main_files, options.crs, tuple(sorted(categorical)), bands)
     more = MoreLayers(
         {name: files[name] for name in layers},
-        {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
+        {name: files[f"{name} {CLASSES}"][0] if table else None for name, table in categorical.items()},
         options.ortho_bands,
     )
     if name in state.maps and not options.force:
@@ -180,7 +180,7 @@ def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[st
     problems: list[str] = []
     for role, paths in sorted(files.items()):
         try:
-            plain = role.endswith(_CLASSES) or (role == "terrain" and is_drawn(paths))
+            plain = role.endswith(CLASSES) or (role == "terrain" and is_drawn(paths))
             parts = dict.fromkeys(part for path in paths for part in ([path] if plain else list_raster_files(path)))
             digests = [compute_checksum(part).sha256 for part in parts]
             checksums[role] = dict(zip(_name_files(parts, paths), digests, strict=True))
@@ -200,7 +200,7 @@ def _find_unchanged(store: Store, state: State, name: str, inputs: MapInputs) ->
     except (MapError, StoreError) as error:
         raise MapError(*error.problems, f"map {name}: add it again with --force") from None
     before = found.facts.inputs
-    roles = dict.fromkeys([*_ROLES, *before.files, *inputs.files])
+    roles = dict.fromkeys([*ROLES, *before.files, *inputs.files])
     changes = [_describe_change(role, before.files.get(role, {}), inputs.files.get(role, {})) for role in roles]
     changes = [change for change in changes if change]
     for option in ("crs", "categorical", "ortho_bands"):
@@ -222,7 +222,7 @@ def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str
     if sorted(before.values()) == sorted(now.values()):
         return f"the files of {role} come in another order"
     if not before or not now:
-        option = f"--{role}" if role in _ROLES else f"--layer {role}"
+        option = f"--{role}" if role in ROLES else f"--layer {role}"
         return f"{option} was not given then, but is now" if now else f"{option} was given then, but is not now"
     names = [name for name in now if now[name] not in before.values()]
     return f"{role} has another content ({', '.join(names or before)})"
