@@ -54,7 +54,7 @@ class Difference:
     """Findings of the first, by code and subject, that the second lacks: its own, its runs' and its maps'."""
     findings_new: tuple[Finding, ...]
     differing: int
-    """Number of samples of the first that the second lacks, or has with other values, split or patch."""
+    """Number of samples that only one has, or that have other values, another split or another patch."""
     same: bool
     """Whether nothing differs."""
 
@@ -79,7 +79,7 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     in_b = row[in_a].astype(np.int64)
     both = ((first, in_a), (second, in_b))
     splits = [table.column("split").to_numpy()[rows] for table, rows in zip(tables, (in_a, in_b), strict=True)]
-    differing = {
+    masks = {
         "other labels": _find_differing(both, [name for name in shared if name in _LABELLED]),
         "other columns": _find_differing(both, [name for name in shared if name not in (*_LABELLED, *_DRAWN)]),
         "other patches": _find_differing_patches((first, second), cards, tables, in_a, in_b),
@@ -89,7 +89,7 @@ def diff(a: str | Path, b: str | Path) -> Difference:
         "only in a": tables[0].num_rows - len(in_a),
         "only in b": tables[1].num_rows - len(in_a),
         "in both": len(in_a),
-        **{name: int(mask.sum()) for name, mask in differing.items()},
+        **{name: int(mask.sum()) for name, mask in masks.items()},
     }
     moved = _count_moved(*splits)
     causes = list_causes(*cards)
@@ -108,7 +108,9 @@ def diff(a: str | Path, b: str | Path) -> Difference:
         changes=_measure_changes((first, second)),
         findings_gone=gone,
         findings_new=new,
-        differing=counts["only in a"] + int(np.any([splits[0] != splits[1], *differing.values()], axis=0).sum()),
+        differing=counts["only in a"]
+        + counts["only in b"]
+        + int(np.any([*masks.values(), splits[0] != splits[1]], 0).sum()),
         same=same,
     )
 
@@ -148,15 +150,11 @@ def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, floa
         known = np.isfinite(change)
         if not known.any():
             continue
-        found[name] = {
-            "samples": int(known.sum()),
-            "median": float(np.median(change[known])),
-            "largest": float(change[known].max()),
-        }
-        if name in std_of:
-            std = _read_values(read_samples(directories[0], [std_of[name]]), std_of[name])[matched[0]]
-            ratio = (change[known & (std > 0.0)] / std[known & (std > 0.0)]).max(initial=0.0)
-            found[name]["largest_in_std"] = float(ratio)
+        count, change = int(known.sum()), change[known]
+        found[name] = {"samples": count, "median": float(np.median(change)), "largest": float(change.max())}
+        if std := std_of.get(name):
+            std_a = _read_values(read_samples(directories[0], [std]), std)[matched[0]][known]
+            found[name]["largest_in_std"] = float((change[std_a > 0.0] / std_a[std_a > 0.0]).max(initial=0.0))
     return found
 
 

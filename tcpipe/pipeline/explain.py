@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
-from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     is_shard,
@@ -24,8 +24,7 @@ from tcpipe.formats.dataset_files import (
     read_samples,
     sample_columns,
 )
-from tcpipe.formats.json_files import convert_record, to_plain
-from tcpipe.formats.maps.map_facts import MapInputs
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_table
 from tcpipe.formats.runs import RunFacts
@@ -87,16 +86,6 @@ class NearbyRefusal:
 
 
 @dataclass(frozen=True, slots=True)
-class SampleMap:
-    """The map from which a patch was sampled, and the files that it was made from."""
-
-    name: str
-    crs: str
-    sources: Mapping[str, str] | None
-    inputs: MapInputs | None
-
-
-@dataclass(frozen=True, slots=True)
 class Versions:
     """Version of tcpipe that built the dataset, the data model, and the version of tcpipe that runs now."""
 
@@ -111,7 +100,6 @@ class History:
 
     sample: Mapping[str, Value]
     """Its row of samples.parquet by column, with the number of the ``row``."""
-    labels: Mapping[str, float]
     quality: tuple[str, ...]
     run: RunFacts
     """The run, and the log that it was read from."""
@@ -119,7 +107,8 @@ class History:
     """By role."""
     masks: tuple[NearbyMask, ...]
     rejected: tuple[NearbyRefusal, ...]
-    map: SampleMap
+    map: MapSource
+    """The map from which its patch was sampled, as the card of the dataset has it."""
     recipe_differs_in: Mapping[str, Setting]
     """Keys of the recipe that differ from their default."""
     versions: Versions
@@ -158,25 +147,17 @@ def _read_history(card: DatasetCard, sample: Row, run: StoredRun) -> History:
     window, streams = (sample["start_ns"], sample["end_ns"]), read_streams(run.place, run.facts)
     return History(
         sample=sample,
-        labels={name: sample[name] for name in _LABELS},
         quality=flag_names(sample["quality"], Quality),
         run=run.facts,
         messages={} if streams is None else dict(_find_messages(streams, *window)),
         masks=tuple(_iterate_masks(run, *window)),
         rejected=tuple(_iterate_rejections(run, *window)),
-        map=_find_map(card, sample["map"]),
+        map=next(source for source in card.maps if source.name == sample["map"]),
         recipe_differs_in={
             key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
         },
         versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
     )
-
-
-_LABELS = tuple(
-    f"{name}{end}"
-    for name, unit in (("power", "_watt"), ("velocity", "_mps"), ("duration", "_s"), ("energy", "_joule"))
-    for end in (unit, f"_std{unit}")
-)
 
 
 def _read_sample(directory: Path, sample_id: str) -> Row:
@@ -257,11 +238,6 @@ def _iterate_rejections(run: StoredRun, start_ns: int, end_ns: int) -> Iterator[
         yield NearbyRefusal(role, reason, count)
 
 
-def _find_map(card: DatasetCard, name: str) -> SampleMap:
-    source = next(source for source in card.maps if source.name == name)
-    return convert_record(source, SampleMap)
-
-
 def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
     """Return the values of a recipe by dotted key; a table with keys of the user is one value."""
     flat: dict[str, Setting] = {}
@@ -274,13 +250,13 @@ _DEFAULTS = flatten_recipe(Recipe())
 
 
 def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
-    sample, labels, run, ground = facts.sample, facts.labels, facts.run, facts.map
+    sample, run, ground = facts.sample, facts.run, facts.map
     fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
     yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"
     yield (
-        f"labels   power {labels['power_watt']:.1f} ± {labels['power_std_watt']:.1f} W, "
-        f"velocity {labels['velocity_mps']:.3f} ± {labels['velocity_std_mps']:.3f} m/s, "
-        f"duration {labels['duration_s']:.3f} s, energy {labels['energy_joule']:.1f} J; "
+        f"labels   power {sample['power_watt']:.1f} ± {sample['power_std_watt']:.1f} W, "
+        f"velocity {sample['velocity_mps']:.3f} ± {sample['velocity_std_mps']:.3f} m/s, "
+        f"duration {sample['duration_s']:.3f} s, energy {sample['energy_joule']:.1f} J; "
         f"quality {', '.join(facts.quality) or 'clean'}"
     )
     there = [path if is_url(path) or Path(path).exists() else f"{path} (now missing)" for path in run.log.paths]

@@ -110,9 +110,7 @@ def test_the_same_dataset_is_rebuilt_from_files_of_other_names(made, tmp_path, t
         (shuffled / kept).parent.mkdir(parents=True, exist_ok=True)
         (shuffled / kept).write_bytes(content)
     (shuffled / "bag").rename(shuffled / "moved")
-    done = tcpipe(
-        "rebuild", made / "dataset", "--logs", shuffled, "--to", "new", "--jobs", "2", "--quiet", cwd=tmp_path
-    )
+    done = tcpipe("rebuild", made / "dataset", "--logs", shuffled, "--to", "new", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "identical: 18 samples with their patches\n"), done.stderr
     before, now = read_files(made / "dataset"), read_files(tmp_path / "new")
     assert {name for name in before if before[name] != now[name]} == set()
@@ -132,7 +130,7 @@ def test_a_changed_dataset_is_named_with_its_cause(made, tmp_path, temporary):
     write_sealed(changed / "dataset.json", replace(card, checksums=sums))
     done = tcpipe("rebuild", changed, "--logs", made / "raw", "--json", "--quiet", cwd=tmp_path)
     found = json.loads(done.stdout)
-    assert (done.returncode, found["samples"], found["differing"], found["added"]) == (3, 18, 3, 0)
+    assert (done.returncode, found["is_identical"], found["samples"], found["differing"]) == (3, False, 18, 3)
     assert found["largest_in_std"] == pytest.approx(0.5)
     (cause,) = found["causes"]
     assert re.fullmatch(r"results version 0 → \d+", cause)
@@ -156,10 +154,10 @@ def test_every_missing_and_altered_file_and_another_recipe_are_named_at_once(mad
         f"{dataset / 'samples.parquet'}: its sha256 is",
         f"{dataset / 'dataset.json'}: run bag-",
         "ingested with recipe",
-        f"{raw}: does not contain power.mcap that the dataset records for run drive-",
-        f"{raw / 'bag'}: altered: not the content that the dataset records for run bag-",
-        f"{raw / 'a.tif'}: altered: not the content that the dataset records for height of map site",
-        f"{raw}: does not contain soil.csv that the dataset records for covariates",
+        f"{raw}: power.mcap is missing: expected the log of run drive-",
+        f"{raw}: {raw / 'bag'} was altered: expected the log of run bag-",
+        f"{raw}: {raw / 'a.tif'} was altered: expected the height of map site with sha256 ",
+        f"{raw}: soil.csv is missing: expected the table of covariates with sha256 ",
     ):
         assert words in said
     assert not (tmp_path / "new").exists()
@@ -167,7 +165,7 @@ def test_every_missing_and_altered_file_and_another_recipe_are_named_at_once(mad
 
 
 def test_an_interrupted_rebuild_leaves_nothing(made, tmp_path):
-    command = [COMMAND, "rebuild", made / "dataset", "--logs", made / "raw", "--to", tmp_path / "new", "--quiet"]
+    command = [COMMAND, "rebuild", made / "dataset", "--logs", made / "raw", "--to", tmp_path / "new", "--jobs", "2"]
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     with subprocess.Popen(

@@ -91,7 +91,6 @@ def read_build_options(options: BuildDatasetOptions, recipe: Recipe, place: Path
         labels=parse_labels(options.labels),
         without_patches=options.without_patches,
         regions=None if split is None else read_regions(Path(split)),
-        region=None if split is None else Path(split).read_bytes().decode("utf-8", "replace"),
         covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
         exclusions=read_exclusions(options.exclude, options.reason),
         file_format=options.file_format,
