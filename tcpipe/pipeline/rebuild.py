@@ -92,19 +92,20 @@ def rebuild(dataset: str | Path, *, logs: str | Path, to: str | Path | None = No
         options = replace(_make_build_options(card, found, scratch / "files"), out=out, store=store, jobs=jobs)
         run_build_dataset(options if card.made_from.kept_split is None else replace(options, keep_split=directory))
         difference, rebuilt = diff(directory, out), read_card(out)
-    causes = _list_causes(card, rebuilt) or difference.causes
+    causes = _list_causes(card, rebuilt)
     changes = (change.get("largest_in_std", 0.0) for change in difference.changes.values())
     is_identical = not (difference.differing or causes)
     return Rebuilt(card.samples, difference.differing, max(changes, default=0.0), causes, is_identical)
 
 
 def _list_causes(card: DatasetCard, rebuilt: DatasetCard) -> tuple[str, ...]:
-    """Return the differences of two records, except those that follow from others: segments, files of maps, the kept split."""
-    before, now = card.made_from, rebuilt.made_from
+    """Return the differences of two records; other segments and files of maps count only if nothing else differs."""
+    before, now = card.made_from, replace(rebuilt.made_from, kept_split=card.made_from.kept_split)
     segments = {run_id: run.segments_sha256 for run_id, run in before.runs.items()}
     runs = {run_id: replace(run, segments_sha256=segments.get(run_id)) for run_id, run in now.runs.items()}
-    given = replace(now, runs=runs, maps=before.maps, kept_split=before.kept_split)
-    return list_causes(card, replace(rebuilt, made_from=given, inputs=given.digest))
+    records = (replace(now, runs=runs, maps=before.maps), now)
+    cards = (replace(rebuilt, made_from=record, inputs=record.digest) for record in records)
+    return next(filter(None, (list_causes(card, each) for each in cards)), ())
 
 
 def _find_content(card: DatasetCard, directory: Path, root: Path, staging: Path) -> dict[str, Paths]:
@@ -136,6 +137,8 @@ def _find_unusable(card: DatasetCard, where: Path) -> Iterator[str]:
     for source in card.maps:
         if source.inputs is None or not source.inputs.main_files:
             yield f"{where}: files of map {source.name} are not recorded; add it again and build the dataset again"
+        elif source.classes_from == "store" and not any(each.classes_from in ("names", "file") for each in card.maps):
+            yield f"{where}: map {source.name} has the classes of a map that is not recorded; add it again with --classes"
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,16 +225,13 @@ def _ingest_logs(inputs: DatasetInputs, found: Mapping[str, Paths], store: Path,
 
 
 def _name_log(run_id: str, run: RunInputs, found: Mapping[str, Paths], folder: Path) -> list[Path]:
-    """Return paths with the recorded names: the log's own, beside which earlier parts are found, or links."""
+    """Return paths with the recorded names, parts in order: the log's own, beside which earlier parts are found, or links."""
     parts, stem = [found[part.sha256] for part in run.parts] or [found[run.sha256]], run_id.rpartition("-")[0]
     if not run.parts and LogSource(parts[0], ()).stem == stem and tuple(path.name for path in parts[0]) == run.logs:
         return list(parts[0])
-    numbered = [(number, path) for number, paths in enumerate(parts) for path in paths]
-    above = {name: stem.removesuffix(f"_{Path(name).stem}") if is_table(name) else "log" for name in run.logs}
-    return [
-        _link(folder / f"{number:04d}" / above[name] / name, (path,))  # parts are joined in the order of their paths
-        for name, (number, path) in zip(run.logs, numbered, strict=False)
-    ]
+    above = stem.removesuffix(f"_{Path(run.logs[0]).stem}") if is_table(run.logs[0]) else "log"
+    places = [(folder / f"{number:04d}" / above, path) for number, paths in enumerate(parts) for path in paths]
+    return [_link(place / name, (path,)) for name, (place, path) in zip(run.logs, places, strict=False)]
 
 
 def _make_map_options(source: MapSource, found: Mapping[str, Paths], folder: Path) -> AddMapOptions:

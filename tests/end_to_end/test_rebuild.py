@@ -22,12 +22,15 @@ from stored_files import flip, read_files
 
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.dataset_files import read_card
+from tcpipe.formats.dataset_inputs import RunInputs
 from tcpipe.formats.integrity import compute_checksum, write_sealed
+from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.log_sources import find_sources
 from tcpipe.pipeline.maps import add_map
-from tcpipe.pipeline.rebuild import rebuild
-from tcpipe.recipe import CovariateConfig, FuseConfig, Recipe
+from tcpipe.pipeline.rebuild import _name_log, rebuild
+from tcpipe.recipe import CovariateConfig, FuseConfig, Recipe, TableMapping
 from tcpipe.simulation import make_tiny, simulate
 from tcpipe.store import open_store
 
@@ -186,3 +189,40 @@ def test_what_cannot_be_rebuilt_is_refused(made, tmp_path):
         rebuild(tmp_path / "public", logs=made / "raw")
     with pytest.raises(UsageError, match=r"contains files; give a new folder \(--to\)"):
         rebuild(made / "dataset", logs=made / "raw", to=made / "dataset")
+
+
+def wheels(name):
+    return {"wheel_odometry": TableMapping(name, stamp="t", stamp_unit="s", columns={"linear_x": "v"})}
+
+
+@pytest.mark.parametrize(
+    ("tables", "before", "after"),
+    [
+        (wheels("wheels.csv"), ("day/wheels.csv", "day/notes.csv"), ("moved/wheels.csv", "moved/notes.csv")),
+        (
+            wheels("wheels_*.csv") | {"power": TableMapping("bus_*.csv", stamp="t", columns={"voltage": "v"})},
+            ("day/bus_1.csv", "day/wheels_1.csv"),
+            ("moved/bus_7.csv", "moved/wheels_7.csv"),
+        ),
+    ],
+)
+def test_a_log_of_tables_is_found_and_gets_its_name_back(tmp_path, tables, before, after):
+    for folder, names in (("old", before), ("new", after)):
+        for speed, name in enumerate(names):
+            (tmp_path / folder / name).parent.mkdir(parents=True, exist_ok=True)
+            lines = "".join(f"{1.7e9 + 0.1 * row:.1f},{speed}\n" for row in range(50))
+            (tmp_path / folder / name).write_text(f"t,v\n{lines}")
+
+    def find(*paths):
+        (source,) = find_sources(paths, as_one=False, staging=tmp_path / "staging", tables=tables).sources
+        with open_logs(source.paths, tables=tables) as log:
+            return source, log.sha256()
+
+    source, sha256 = find(tmp_path / "old")
+    names = tuple(path.name for path in source.paths)
+    run = RunInputs("recipe", "husky", names, sha256, segments_sha256=None, tags={})
+    moved, same = find(tmp_path / "new")
+    assert same == sha256
+    paths = _name_log(f"{source.stem}-{sha256[:8]}", run, {sha256: moved.paths}, tmp_path / "links")
+    again, same = find(*paths)
+    assert (again.stem, tuple(path.name for path in again.paths), same) == (source.stem, names, sha256)

@@ -64,8 +64,6 @@ class BuildOptions:
     labels: tuple[str, ...]
     """Labels that every sample needs, names of `LABELS`; none: the default."""
     without_patches: bool
-    region: str | None
-    """The file of the regions, as text."""
     regions: Regions | None
     covariates: tuple[CovariateTable, ...]
     exclusions: tuple[ExcludedIds, ...]
