@@ -28,7 +28,7 @@ class LogOrigin:
     outline: str = field(default="", metadata=LEFT_OUT)
     """Hash of the size and index of the log, by which it is known where not all of it is at hand; "" where it has none."""
     parts: tuple[Checksum, ...] = field(default=(), metadata=LEFT_OUT)
-    """Of several logs that were ingested as one: each of them, in order."""
+    """Size and sha256 of each log, in order, where several were ingested as one."""
 
 
 @dataclass(frozen=True, slots=True)
