@@ -256,7 +256,7 @@ def _make_map_options(source: MapSource, found: Mapping[str, Paths], folder: Pat
 
 def _make_build_options(card: DatasetCard, found: Mapping[str, Paths], folder: Path) -> BuildDatasetOptions:
     """Return the options that build a dataset as its card records it, but for a kept split."""
-    inputs, region, split = card.made_from, card.split.region, folder / "region" / "region.geojson"
+    inputs, region, split = card.made_from, card.split.region, folder / "region.geojson"
     if region is not None:
         features = (Feature({"split": kind}, polygon) for kind, polygon in region.items())
         write_json(split, FeatureCollection(tuple(features)))
@@ -267,7 +267,7 @@ def _make_build_options(card: DatasetCard, found: Mapping[str, Paths], folder: P
         tags=inputs.tags,
         recipe=inputs.recipe,
         file_format="parquet" if inputs.file_format == "parquet" else "zarr",
-        covariates=[_link(folder / each.name, found[each.checksum.sha256]) for each in card.covariates],
-        exclude=[_link(folder / each.name, found[each.checksum.sha256]) for each in card.exclusions],
+        covariates=[_link(folder / "covariates" / each.name, found[each.checksum.sha256]) for each in card.covariates],
+        exclude=[_link(folder / "exclude" / each.name, found[each.checksum.sha256]) for each in card.exclusions],
         reason=[each.reason for each in card.exclusions],
     )

@@ -1,10 +1,12 @@
 import json
 
+import numpy as np
 import pytest
 import shapely
 
 from tcpipe.errors import RegionError
-from tcpipe.formats.geojson import MAX_VALUES, read_regions
+from tcpipe.formats.geojson import MAX_VALUES, read_regions, regions_to_json
+from tcpipe.formats.json_files import to_plain
 
 SQUARE = [[15.0, 47.0], [15.001, 47.0], [15.001, 47.001], [15.0, 47.001], [15.0, 47.0]]
 BESIDE = [[round(lon + 0.001, 7), lat] for lon, lat in SQUARE]
@@ -54,6 +56,21 @@ def test_inside_is_the_union_without_holes(tmp_path):
     assert shapely.equals(regions.train_test, shapely.box(15, 47, 15.0015, 47.001))
     hole = [[15.0004, 47.0004], [15.0004, 47.0006], [15.0006, 47.0006], [15.0006, 47.0004], [15.0004, 47.0004]]
     assert not read(tmp_path, polygon(SQUARE, hole)).train_test.contains(shapely.Point(15.0005, 47.0005))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_regions_that_are_written_and_read_again_are_the_same(tmp_path, seed):
+    """A card has the regions as they were read, and a rebuilt dataset has to have them too."""
+    draw = np.random.default_rng(seed)
+    features = []
+    for kind, count in (("train_test", 6), ("exclude", 3)):
+        for middle in draw.uniform(0.0, 0.02, (count, 2)) + (15.0, 47.0):
+            angle_rad, radius_deg = np.sort(draw.uniform(0.0, 6.28, 7)), draw.uniform(0.002, 0.008, 7)
+            ring = middle + np.stack([np.cos(angle_rad), np.sin(angle_rad)], 1) * radius_deg[:, None]
+            features.append(feature(polygon([*ring.tolist(), ring[0].tolist()]), split=kind))
+    before = to_plain(regions_to_json(read(tmp_path, collection(*features))))
+    again = collection(*(feature(area, split=kind) for kind, area in before.items()))
+    assert to_plain(regions_to_json(read(tmp_path, again))) == before
 
 
 def test_the_property_split_rules(tmp_path):
