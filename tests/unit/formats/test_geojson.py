@@ -64,8 +64,8 @@ def test_regions_that_are_written_and_read_again_are_the_same(tmp_path, seed):
     draw = np.random.default_rng(seed)
     features = []
     for kind, count in (("train_test", 6), ("exclude", 3)):
-        for middle in draw.uniform(0.0, 0.02, (count, 2)) + (15.0, 47.0):
-            angle_rad, radius_deg = np.sort(draw.uniform(0.0, 6.28, 7)), draw.uniform(0.002, 0.008, 7)
+        for middle in draw.uniform((15.0, 47.0), (15.02, 47.02), (count, 2)):
+            angle_rad, radius_deg = np.linspace(0.0, 5.5, 7) + draw.random(), draw.uniform(0.002, 0.008, 7)
             ring = middle + np.stack([np.cos(angle_rad), np.sin(angle_rad)], 1) * radius_deg[:, None]
             features.append(feature(polygon([*ring.tolist(), ring[0].tolist()]), split=kind))
     before = to_plain(regions_to_json(read(tmp_path, collection(*features))))
