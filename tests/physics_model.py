@@ -73,6 +73,7 @@ class PhysicsModel:
     residuals: dict = field(default_factory=made_residuals)
     physics: PhysicsFit | None = None
     takes_turns: bool = False
+    is_time_alone: bool = False
 
     @property
     def card(self):

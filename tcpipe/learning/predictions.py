@@ -59,7 +59,8 @@ def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     columns = {"v": (velocity_column, "velocity_std_mps"), "T": ("duration_s", "duration_std_s")}
     if power_column:
         columns = {"w": (energy.power, energy.power_std), **columns, "E": (energy.energy, energy.energy_std)}
-    with_label = np.all([np.isfinite(split.column(name).astype(np.float64)) for name, _ in columns.values()], axis=0)
+    has_costs = [np.isfinite(split.column(name).astype(np.float64)) for name, _ in columns.values()]
+    with_label = np.isfinite(split.labels).all(axis=1) & np.all(has_costs, axis=0)
     chosen = split.take(with_label)
     deviations = {cost: chosen.column(std).astype(np.float64) for cost, (_, std) in columns.items()}
     own_deviations = {cost: chosen.own_std(std) for cost, (_, std) in columns.items()}
@@ -189,9 +190,7 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
     ]
     expected = dataset_card.label.columns if dataset_card.labels["energy"] else dataset_card.label.columns[1:]
     if len(card.inputs.outputs) != len(expected) or card.inputs.is_time_alone != (len(expected) == 1):
-        problems.append(
-            f"it predicts {', '.join(card.inputs.outputs)}, expected {' and '.join(expected)}, the labels of the dataset"
-        )
+        problems.append(f"it predicts only {', '.join(card.inputs.outputs)}, expected {' and '.join(expected)}")
     absent = [name for name in card.layout.layers if name not in dataset_card.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:

@@ -266,6 +266,8 @@ def _make_build_options(card: DatasetCard, found: Mapping[str, Paths], folder: P
         robot=next(iter(inputs.robots), None),
         tags=inputs.tags,
         recipe=inputs.recipe,
+        labels=inputs.labels,
+        without_patches=inputs.without_patches,
         file_format="parquet" if inputs.file_format == "parquet" else "zarr",
         covariates=[_link(folder / "covariates" / each.name, found[each.checksum.sha256]) for each in card.covariates],
         exclude=[_link(folder / "exclude" / each.name, found[each.checksum.sha256]) for each in card.exclusions],
