@@ -109,7 +109,8 @@ def run_evaluation(
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
     name = values.dataset.name
     note = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
-    lead = f"Model {Path(model).name} on dataset {name}: errors of time T and energy E{note}."
+    costs = "time T and energy E" if "E" in values.costs else "time T"
+    lead = f"Model {Path(model).name} on dataset {name}: errors of {costs}{note}."
     samples = read_evaluated_samples(place, dataset)
     write_text(
         place / PAGE,
