@@ -42,16 +42,7 @@ def run_train(options: TrainOptions) -> TrainResult:
     if options.predictor is None:
         given["model"] = options.model or ("resnet18" if is_network else "auto")
     config = from_values(FitConfig, {**asdict(resolve_recipe(options.recipe).train), **given}, where="train")
-    result = run(options.dataset, options.out, config=config, no_resume=options.no_resume, predictor=options.predictor)
-    if options.onnx is not None:
-        from tcpipe.formats.atomic import write_atomic_file
-        from tcpipe.learning.models import load_model
-        from tcpipe.learning.onnx_model import export_network
-
-        graph = export_network(load_model(options.out, options.predictor).predictor, str(options.out))
-        with write_atomic_file(Path(options.onnx)) as temporary:
-            temporary.write_bytes(graph)
-    return result
+    return run(options.dataset, options.out, config=config, no_resume=options.no_resume, predictor=options.predictor)
 
 
 train = as_function(TrainOptions, run_train)

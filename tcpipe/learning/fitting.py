@@ -23,8 +23,8 @@ from tcpipe.tables.bounds import Bounds
 
 Floats = NDArray[np.float32]
 
-ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "residual", "resnet18", "onnx", "own"]
-"""Curves of class and slope, physics, a curve and boosted trees or a small network, the paper's network, a graph, or own code."""
+ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "resnet18", "own"]
+"""Curves of class and slope, physics, a curve and boosted trees, the paper's network, or own code."""
 
 Loss = Literal["nrmse", "paper_eq4"]
 

@@ -23,18 +23,15 @@ class TrainOptions:
     out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
     """The same dataset and options are not trained again."""
     _: KW_ONLY
-    model: Literal["auto", "mean", "linear", "spline", "physics", "boosting", "residual", "resnet18"] | None = option(
+    model: Literal["auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"] | None = option(
         None,
         Option(
-            "Curves of class and slope, physics, a curve and boosted trees or a small network on what it leaves, or the paper's network. "
+            "Curves of class and slope, physics, a curve and boosted trees on what it leaves, or the paper's network. "
             "auto: the simplest that predicts other runs as well as the best (default; with an option of the network, resnet18).",
-            kind=("auto", "mean", "linear", "spline", "physics", "boosting", "residual", "resnet18"),
+            kind=("auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"),
         ),
     )  # fmt: skip
     predictor: str | None = option(None, PREDICTOR)
-    onnx: str | Path | None = option(
-        None, Option("Also write the network as an ONNX graph.", (), "output_file", "FILE")
-    )
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     loss: Loss = option(
         "nrmse",

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import io
 import math
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ from tcpipe.errors import ModelError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.weights import check_arrays
 from tcpipe.learning.fitting import mean_loss
-from tcpipe.recipe import TrainConfig
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -70,49 +68,7 @@ class BasicBlock(nn.Module):
         return functional.relu(self.second(functional.relu(self.first(images))) + self.shortcut(images))
 
 
-class Network(nn.Module):
-    """A network of patches with a head, whose weights are arrays by name."""
-
-    head: nn.Linear
-
-    def predict(self, patches: Floats) -> Floats:
-        """Return outputs of patches of shape (N, px, px, depth), some at a time, shape (N, outputs)."""
-        self.eval()
-        out = np.empty((len(patches), self.head.out_features), np.float32)
-        with torch.inference_mode():
-            for first in range(0, len(patches), _TOGETHER):
-                part = slice(first, first + _TOGETHER)
-                out[part] = self(move_to_device(patches[part])).numpy(force=True)
-        return out
-
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
-        return {name: value.numpy(force=True).copy() for name, value in self._list_weights().items()}
-
-    @classmethod
-    def from_arrays(cls, *sizes: int, arrays: Arrays) -> Self:
-        """Return a network of these sizes with its weights; `ModelError` if they are another's, before memory is taken."""
-        with torch.device("meta"):
-            network = cls(*sizes)
-        network.load(arrays)
-        return network
-
-    def load(self, arrays: Arrays) -> None:
-        """Put weights in, on the device that there is; `ModelError` if they are another network's."""
-        forms = {name: ("float32", tuple(value.shape)) for name, value in self._list_weights().items()}
-        check_arrays(arrays, forms)
-        self.to_empty(device=find_device())
-        self.to(memory_format=torch.channels_last)
-        for name, value in self._list_weights().items():
-            value.copy_(torch.from_numpy(np.ascontiguousarray(arrays[name])))
-
-    def _list_weights(self) -> dict[str, Any]:
-        """Return a view of every weight, without the count of batches that no fixed share asks for."""
-        own = {name: weight for name, weight in self.state_dict().items() if not name.endswith("num_batches_tracked")}
-        return {_make_weight_name(name): _reorder_axes(value) for name, value in own.items()}
-
-
-class ResNet18(Network):
+class ResNet18(nn.Module):
     """Patches, float32 (N, depth, px, px), to outputs, (N, outputs); ``width`` filters in the first stage, 64 of ResNet-18."""
 
     def __init__(self, depth: int, outputs: int, width: int) -> None:
@@ -134,6 +90,42 @@ class ResNet18(Network):
             values = block(values) if name.startswith("stage") else values
         return self.head(values.mean((2, 3)))
 
+    def predict(self, patches: Floats) -> Floats:
+        """Return outputs of patches of shape (N, px, px, depth), some at a time, shape (N, outputs)."""
+        self.eval()
+        out = np.empty((len(patches), self.head.out_features), np.float32)
+        with torch.inference_mode():
+            for first in range(0, len(patches), _TOGETHER):
+                part = slice(first, first + _TOGETHER)
+                out[part] = self(move_to_device(patches[part])).numpy(force=True)
+        return out
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
+        return {name: value.numpy(force=True).copy() for name, value in self._list_weights().items()}
+
+    @classmethod
+    def from_arrays(cls, depth: int, outputs: int, width: int, *, arrays: Arrays) -> ResNet18:
+        """Return a network of these sizes with its weights; `ModelError` if they are another's, before memory is taken."""
+        with torch.device("meta"):
+            network = cls(depth, outputs, width)
+        network.load(arrays)
+        return network
+
+    def load(self, arrays: Arrays) -> None:
+        """Put weights in, on the device that there is; `ModelError` if they are another network's."""
+        forms = {name: ("float32", tuple(value.shape)) for name, value in self._list_weights().items()}
+        check_arrays(arrays, forms)
+        self.to_empty(device=find_device())
+        self.to(memory_format=torch.channels_last)
+        for name, value in self._list_weights().items():
+            value.copy_(torch.from_numpy(np.ascontiguousarray(arrays[name])))
+
+    def _list_weights(self) -> dict[str, Any]:
+        """Return a view of every weight, without the count of batches that no fixed share asks for."""
+        own = {name: weight for name, weight in self.state_dict().items() if not name.endswith("num_batches_tracked")}
+        return {_make_weight_name(name): _reorder_axes(value) for name, value in own.items()}
+
 
 def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Sequence[float]) -> ResNet18:
     """Return the untrained network on the device that there is; ``start`` is what it predicts on average: the head's biases."""
@@ -146,29 +138,6 @@ def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Seq
     network.head.bias.data[:] = torch.tensor(list(start))
     made: ResNet18 = network.to(find_device(), memory_format=torch.channels_last)
     return made
-
-
-class _Units(nn.Module):
-    """A network with the axes of patches, whose outputs have their units."""
-
-    def __init__(self, network: nn.Module, scale: Sequence[float]) -> None:
-        super().__init__()
-        self.network, self.scale = network, torch.tensor(scale)
-
-    def forward(self, patches: Any) -> Any:
-        return self.network(patches.permute(0, 3, 1, 2)) * self.scale
-
-
-def export_graph(network: nn.Module, shape: Sequence[int], scale: Sequence[float]) -> bytes:
-    """Return a network as an ONNX graph from patches, each of this shape, to its outputs over ``scale``; needs the package onnx."""
-    stream, whole = io.BytesIO(), _Units(network, scale).cpu().eval()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the newer exporter needs one package more
-        torch.onnx.export(
-            whole, (torch.zeros(1, *shape),), stream, dynamo=False, input_names=["patches"], output_names=["outputs"],
-            dynamic_axes={"patches": {0: "samples"}, "outputs": {0: "samples"}},
-        )  # fmt: skip
-    return stream.getvalue()
 
 
 def find_device() -> Any:
@@ -203,50 +172,6 @@ def _make_weight_name(name: str) -> str:
 def _reorder_axes(value: Any) -> Any:
     """Return a view with the axes that a file has: outputs last."""
     return value.permute(2, 3, 1, 0) if value.ndim == 4 else value.T if value.ndim == 2 else value
-
-
-_FILTERS = 16, 32, 32
-
-
-class SmallNetwork(Network):
-    """Three convolutions with stride 2 and a mean over the patch: patches (N, depth, px, px) to outputs, (N, outputs)."""
-
-    def __init__(self, depth: int, outputs: int) -> None:
-        super().__init__()
-        layers: list[nn.Module] = []
-        for filters in _FILTERS:
-            layers += [nn.Conv2d(depth, filters, 3, 2, 1), nn.GroupNorm(4, filters), nn.ReLU()]
-            depth = filters
-        self.layers = nn.Sequential(*layers)
-        self.head = nn.Linear(depth, outputs)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
-
-    def forward(self, images: Any) -> Any:
-        """Return the outputs."""
-        return self.head(self.layers(images).mean((2, 3)))
-
-    def fit(self, batches: Iterator[tuple[Floats, Floats, Floats]], steps: int, config: TrainConfig) -> None:
-        """Fit outputs to labels by weighted least squares, in so many steps of a batch of patches, labels and weights."""
-        optimizer = torch.optim.AdamW(self.parameters(), weight_decay=config.residual_weight_decay)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.residual_learning_rate, steps)
-        self.train()
-        for _ in range(steps):
-            patches, *others = next(batches)
-            labels, weights = (torch.from_numpy(values).to(find_device()) for values in others)
-            loss = (weights * (self(move_to_device(patches)) - labels) ** 2).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-
-    @classmethod
-    def make(cls, depth: int, outputs: int, *, seed: int) -> SmallNetwork:
-        """Return an untrained network; the same seed gives the same weights."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            made: SmallNetwork = cls(depth, outputs).to(find_device(), memory_format=torch.channels_last)
-        return made
 
 
 _EPSILON = 1e-7

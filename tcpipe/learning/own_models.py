@@ -19,8 +19,6 @@ from types import ModuleType
 from typing import Any
 
 from tcpipe.errors import ModelError, TcpipeError, UsageError
-from tcpipe.learning.fitting import ModelKind
-from tcpipe.learning.onnx_model import OnnxModel
 from tcpipe.learning.predictor import Predictor
 
 logger = logging.getLogger("tcpipe")
@@ -38,18 +36,10 @@ class OwnKind:
     digest: str
     """Of the file's bytes; of a package its name and version."""
     kind: type[Predictor]
-    model: ModelKind = "own"
 
 
 def load_own_kind(source: str) -> OwnKind:
-    """Return the kind of model that ``FILE.py``, ``FILE.py:NAME`` or the name of an entry point stands for; this runs its code.
-
-    ``FILE.onnx`` is a graph, which is no code.
-    """
-    if source.endswith(".onnx"):
-        data = _read(source, Path(source))
-        kind = type("Graph", (OnnxModel,), {"graph": data})
-        return OwnKind(source, hashlib.sha256(data).hexdigest(), kind, "onnx")
+    """Return the kind of model that ``FILE.py``, ``FILE.py:NAME`` or the name of an entry point stands for; this runs its code."""
     path, name = source, ""
     if not source.endswith(".py") and ".py:" in source:
         path, _, name = source.rpartition(":")
@@ -68,14 +58,10 @@ def load_own_kind(source: str) -> OwnKind:
     return OwnKind(source, digest, _make_kind(found, source))
 
 
-def _read(source: str, path: Path) -> bytes:
+def _load_file(source: str, path: Path, name: str) -> OwnKind:
     if not path.is_file():
         raise UsageError(f"--predictor {source}: there is no file {path}")
-    return path.read_bytes()
-
-
-def _load_file(source: str, path: Path, name: str) -> OwnKind:
-    code = _read(source, path)
+    code = path.read_bytes()
     digest = hashlib.sha256(code).hexdigest()
     module = ModuleType(f"tcpipe_own_{digest[:16]}")
     module.__file__ = str(path.resolve())

@@ -221,9 +221,7 @@ KINDS: Mapping[ModelKind, str] = {
     "spline": "tcpipe.learning.physics_model:SplineModel",
     "physics": "tcpipe.learning.physics_model:PhysicsModel",
     "boosting": "tcpipe.learning.table_model:BoostingModel",
-    "residual": "tcpipe.learning.residual_model:ResidualModel",
     "resnet18": "tcpipe.learning.network_model:NetworkModel",
-    "onnx": "tcpipe.learning.onnx_model:OnnxModel",
     "own": "tcpipe.learning.predictor:Predictor",
 }
 """Class of each kind, simplest first; a class is imported when it is needed."""

@@ -174,7 +174,7 @@ def train(
     """
     rules, other = config or FitConfig(), variant or Variant()
     own = None if predictor is None else load_own_kind(predictor)
-    rules = rules if own is None else replace(rules, model=own.model, predictor=own.digest)
+    rules = rules if own is None else replace(rules, model="own", predictor=own.digest)
     data = open_dataset(dataset, label=rules.label)
     if not data.card.layers:
         raise DatasetError(

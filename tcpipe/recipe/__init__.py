@@ -331,7 +331,7 @@ class TrainConfig(_Section):
     cross_fit: bool = False
     """ResNet-18: train a network without each other fold, too, so that intervals rest on all samples (five times as long)."""
     mirror: bool = True
-    """Networks: mirror every other patch."""
+    """ResNet-18: mirror every other patch."""
     trees: Annotated[int, Bounds(ge=1, le=10_000)] = 150
     """Boosting: most trees of an output."""
     tree_learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 0.1
@@ -342,12 +342,6 @@ class TrainConfig(_Section):
     """Boosting: max_depth."""
     leaf_samples: Annotated[int, Bounds(ge=1, le=1_000_000)] = 10
     """Boosting: min_data_in_leaf."""
-    residual_passes: Annotated[int, Bounds(ge=1, le=10_000)] = 80
-    """Residual network: passes over the samples (300 to 5000 steps)."""
-    residual_learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 3e-3
-    """Residual network (AdamW)."""
-    residual_weight_decay: Annotated[float, Bounds(ge=0, le=1)] = 1e-2
-    """Residual network (AdamW)."""
 
 
 @dataclass(frozen=True, slots=True)

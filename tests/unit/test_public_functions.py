@@ -72,7 +72,7 @@ def test_every_option_is_a_keyword_with_the_same_default(name):
             assert default is inspect.Parameter.empty
         elif option.multiple:
             assert default == ()
-        elif default is None and name == "train" and keyword not in {"layers", "model", "onnx", "predictor", "recipe"}:
+        elif default is None and name == "train" and keyword not in {"layers", "model", "predictor", "recipe"}:
             assert getattr(FitConfig(), keyword) == option.default
         else:
             assert default == option.to_info_dict()["default"]

@@ -176,23 +176,3 @@ def test_a_shipped_kind_needs_no_code(place, tmp_path):
     tcpipe.train(place[0] / "dataset", tmp_path / "model", model="physics")
     with pytest.raises(UsageError, match="a model of kind physics needs no code; remove --predictor"):
         load_model(tmp_path / "model", "by_hand.py")
-
-
-def test_a_network_is_written_as_onnx_and_a_folder_of_a_graph_needs_no_code(place, tmp_path):
-    for package in ("torch", "onnx", "onnxruntime"):
-        pytest.importorskip(package)
-    data, graph = place[0] / "dataset", tmp_path / "network.onnx"
-    tcpipe.train(data, tmp_path / "network", model="resnet18", epochs=1, width=16, onnx=graph)
-    assert tcpipe.train(data, tmp_path / "graph", predictor=str(graph)).model == "onnx"
-    patches = tcpipe.open_dataset(data)["test"].patches
-    network, other = load_model(tmp_path / "network"), load_model(tmp_path / "graph")
-    assert other.predict(patches) == pytest.approx(network.predict(patches), rel=1e-4)
-    graph.write_bytes(b"none")
-    with pytest.raises(ModelError, match="no ONNX graph that can be run"):
-        tcpipe.train(data, tmp_path / "none", predictor=str(graph))
-
-
-def test_only_a_network_is_written_as_onnx(place, tmp_path):
-    done = command("train", place[0] / "dataset", "physics", "--model", "physics", "--onnx", "graph.onnx", cwd=tmp_path)
-    assert "expected a model of kind resnet18 without extra features to write as ONNX" in done.stderr
-    assert not (tmp_path / "graph.onnx").exists()

@@ -94,22 +94,3 @@ def test_curves_are_models_like_the_others(dataset, tmp_path, kind):
     said = model.predict(data["unseen"].with_channels("height").patches, there).mean
     assert said == pytest.approx(curves.predict(there.slope_rad, there.class_id), rel=1e-6)
     assert not model.takes_turns
-
-
-def test_a_residual_network_learns_what_the_curve_leaves(dataset, labelled, tmp_path, monkeypatch):
-    pytest.importorskip("torch")
-    labelled(by_picture)
-    monkeypatch.setattr("tcpipe.learning.residual_model._FEWEST_STEPS", 40)
-    errors = {}
-    for name in ("linear", "residual", "residual again"):
-        train(dataset, tmp_path / name, config=FitConfig(model=name.split()[0], residual_passes=1))
-        residuals = load_model(tmp_path / name).residuals
-        assert len(residuals["power_watt"]) == len(open_dataset(dataset)["train"])
-        errors[name] = np.std(residuals["power_watt"] - residuals["power_predicted_watt"])
-    assert errors["residual"] < 0.7 * errors["linear"]
-    weights = [(tmp_path / name / "weights.npz").read_bytes() for name in ("residual", "residual again")]
-    assert weights[0] == weights[1]
-    model, split = load_model(tmp_path / "residual"), open_dataset(dataset)["test"]
-    features = read_extra_features(split)
-    said = model.predict(split.patches, features).mean
-    assert model.predict(split.patches[3:4], features.take(slice(3, 4))).mean == pytest.approx(said[3:4], rel=1e-4)
