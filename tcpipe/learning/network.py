@@ -157,7 +157,8 @@ def move_to_device(patches: Floats) -> Any:
 
 def _pad_images(images: Any, size: int, stride: int) -> Any:
     """Put zeros around images so that a window in steps gives ceil(pixels / stride), as TensorFlow's "same" does."""
-    missing = [max((-(-pixels // stride) - 1) * stride + size - pixels, 0) for pixels in images.shape[:1:-1]]
+    sizes = map(int, images.shape[:1:-1])  # numbers: a graph that torch traced with sizes as tensors gave wrong outputs
+    missing = [max((-(-pixels // stride) - 1) * stride + size - pixels, 0) for pixels in sizes]
     return functional.pad(images, [part for pixels in missing for part in (pixels // 2, pixels - pixels // 2)])
 
 
