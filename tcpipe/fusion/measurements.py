@@ -180,6 +180,11 @@ class Measurements:
         return replace(self, **named)
 
     @property
+    def is_antenna_alone(self) -> bool:
+        """Whether only fixes, and a receiver's own velocity, measure motion: forward and backward look the same."""
+        return self.gnss is not None and self.imu is None and not self.odometries() and not self.has_attitude
+
+    @property
     def has_attitude(self) -> bool:
         """Whether a pose measures the attitude, or yaw alone."""
         return self.gnss is not None and self.gnss.quat_xyzw is not None

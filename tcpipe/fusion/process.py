@@ -76,10 +76,9 @@ def is_gliding(measurements: Measurements) -> bool:
 
     The velocity then strays over ground, and which way the body looks is not asked.
     """
-    alone = measurements.imu is None and not measurements.odometries() and not measurements.has_attitude
-    return (
-        alone and measurements.gnss is not None and _compute_fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
-    )
+    if measurements.gnss is None or not measurements.is_antenna_alone:
+        return False
+    return _compute_fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
 
 
 def is_turned_by_course(measurements: Measurements) -> bool:

@@ -36,7 +36,7 @@ from tcpipe.stages.fuse_inputs import (
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
 from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks
-from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, select_findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
@@ -84,6 +84,7 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
         *find_fuse_findings(used, summary, run=run),
         *used.excluded.values(),
         *find_parameter_findings(used, summary, streams),
+        *([make_finding("direction-assumed", Subject("role", GNSS))] if fused.is_forward_assumed else []),
         *audit.findings,
         *clocks.findings,
     )
@@ -102,13 +103,15 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
-    """Yield the findings of reading; one without extrinsics suggests none where fusing has estimated them."""
+    """Yield the findings of reading: on missing extrinsics without remedy if fusing estimates them, and not at all if none are needed."""
     estimated = {
         role for finding in fused for remedy in finding.remedies for role in remedy.recipe.get("read.extrinsics", ())
     }
+    unneeded = {each.subject.name for each in select_findings(fused, "track-of-antenna", "imu-too-slow")}
     for finding in read:
-        is_estimated = finding.code == "sensor-not-placed" and finding.subject.name in estimated
-        yield replace(finding, remedies=()) if is_estimated else finding
+        role = finding.subject.name if finding.code == "sensor-not-placed" else ""
+        if role not in unneeded:
+            yield replace(finding, remedies=()) if role in estimated else finding
 
 
 def _find_nothing(streams: Streams, inputs: FusionInputs, run: Subject) -> Finding:

@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import audit_trajectory
+from tcpipe.fusion.direction import assume_forward
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import (
@@ -38,7 +39,7 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Every section's trajectory, facts, columns and audit; time without a track [s]."""
+    """Trajectory, facts, columns and audit of every section; time without a track [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -47,6 +48,8 @@ class Fused:
     windows: int = 0
     astray: int = 0
     skipped_s: float = 0.0
+    is_forward_assumed: bool = False
+    """Whether neither a sensor nor a command shows the direction of travel of a section."""
 
 
 def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
@@ -62,6 +65,10 @@ def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) ->
         initial = _make_initial_state(section, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
         trajectory = _estimate(section, initial, output_ns, config)
+        if section.measurements.gnss is not None and section.measurements.is_antenna_alone:
+            commanded_mps = make_command_columns(streams, section.clock_epoch, output_ns)["commanded_velocity_mps"]
+            trajectory = assume_forward(trajectory, section.measurements.gnss.lever_arm_m, commanded_mps)
+            fused.is_forward_assumed |= not np.isfinite(commanded_mps).any()
         # 3. What came out is held against what went in.
         trajectory, audit = audit_trajectory(trajectory, trajectory.corrected or section.measurements)
         fused.disagreements += (replace(each, clock_epoch=section.clock_epoch) for each in audit.disagreements)
