@@ -208,23 +208,20 @@ def exclude_sensors(inputs: FusionInputs, exclusions: Iterable[SensorExclusion],
     gone = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
     kept = {number: measurements.replace_sensors(gone) for number, measurements in inputs.measurements.items()}
     datum = None if GNSS in excluded else inputs.datum_deg_m
-    found = replace(inputs, datum_deg_m=datum, measurements=kept, excluded=excluded)
-    return _define_base_by_antenna(found, streams)
+    return _define_base_by_antenna(replace(inputs, datum_deg_m=datum, measurements=kept, excluded=excluded), streams)
 
 
 def _define_base_by_antenna(inputs: FusionInputs, streams: Streams) -> FusionInputs:
     """Return the inputs with an antenna that nothing places exactly at base_link, if no other sensor of motion is fused."""
-    fused = {number: m for number, m in inputs.measurements.items() if m.sensors()}
-    is_alone = bool(fused) and all(m.is_antenna_alone for m in fused.values())
-    if not is_alone or streams.sensors[GNSS].placed_by != "assumed":
+    fixes = {number: m.gnss for number, m in inputs.measurements.items() if m.gnss and m.is_antenna_alone}
+    others = any(m.sensors() for number, m in inputs.measurements.items() if number not in fixes)
+    if others or not fixes or streams.sensors[GNSS].placed_by != "assumed":
         return inputs
-    fixes = {number: m.gnss for number, m in fused.items() if m.gnss is not None}
-    placed = {
-        number: fused[number].replace_sensors({GNSS: replace(gnss, lever_arm_std_m=NO_LEVER_ARM)})
-        for number, gnss in fixes.items()
-    }
+    measurements = dict(inputs.measurements)
+    for number, gnss in fixes.items():
+        measurements[number] = replace(measurements[number], gnss=replace(gnss, lever_arm_std_m=NO_LEVER_ARM))
     findings = dict.fromkeys((*inputs.findings, make_finding("track-of-antenna", Subject("role", GNSS))))
-    return replace(inputs, measurements={**inputs.measurements, **placed}, findings=[*findings])
+    return replace(inputs, measurements=measurements, findings=[*findings])
 
 
 def find_longest_epoch(inputs: FusionInputs) -> int:

@@ -11,7 +11,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import audit_trajectory
-from tcpipe.fusion.direction import assume_forward
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import (
@@ -24,9 +23,9 @@ from tcpipe.fusion.measurements import (
     cut_sections,
     make_track_stamps,
 )
-from tcpipe.fusion.signals import compute_seconds, hold_last, is_covered
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_covered
 from tcpipe.geometry.datum import geodetic_from_enu
-from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
+from tcpipe.geometry.rotation import matrix_from_quat, multiply, rpy_from_matrix
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
@@ -39,7 +38,7 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Trajectory, facts, columns and audit of every section; time without a track [s]."""
+    """Trajectory, facts, columns and audit of every section; time without a track [s]; whether nothing shows the direction of one."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -49,7 +48,6 @@ class Fused:
     astray: int = 0
     skipped_s: float = 0.0
     is_forward_assumed: bool = False
-    """Whether neither a sensor nor a command shows the direction of travel of a section."""
 
 
 def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
@@ -97,6 +95,40 @@ def _estimate(
 
         return run_ukf15(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
     return run_error_state(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
+
+
+_COMMANDED_MPS = 0.05  # slower commands show no direction
+_SHOWN_M = 0.2  # shorter drives may be noise of a stationary robot
+_HALF_TURN = np.array([0.0, 0.0, 1.0, 0.0])
+
+
+def assume_forward(
+    found: Trajectory, arm_m: tuple[float, float, float], commanded_mps: NDArray[np.float64]
+) -> Trajectory:
+    """Return the trajectory of a lone antenna at ``arm_m`` [m] in base_link with a robot that drives forward.
+
+    It drives backward where ``commanded_mps`` [m/s], shape (N,), NaN where unknown, is negative. A robot that the estimate drives the
+    other way is turned by half a turn about its z axis; the antenna keeps its place.
+    """
+    rotation, velocity = matrix_from_quat(found.quat_xyzw), found.velocity_enu_mps
+    ahead_mps = np.sum(rotation[:, :, 0] * velocity, axis=1) * np.where(commanded_mps < -_COMMANDED_MPS, -1.0, 1.0)
+    # Rows up to the next change of sign are one drive; short ones keep the direction of the one before.
+    drive = np.cumsum(np.diff(np.sign(ahead_mps), prepend=0.0) != 0.0)
+    driven_m = np.bincount(drive, np.abs(ahead_mps)) * compute_median_period_ns(found.stamp_ns) * 1e-9
+    shown = np.flatnonzero(driven_m[drive] > _SHOWN_M)
+    if not shown.size:
+        return found
+    last = np.searchsorted(shown, np.arange(drive.size), "right") - 1
+    turned = (ahead_mps[shown[np.maximum(last, 0)]] < 0.0)[:, None]
+    moved_m = np.array([2.0 * arm_m[0], 2.0 * arm_m[1], 0.0])
+    moved_mps = np.cross(found.angular_velocity_radps, moved_m)
+    return replace(
+        found,
+        position_enu_m=found.position_enu_m + turned * (rotation @ moved_m),
+        quat_xyzw=np.where(turned, multiply(found.quat_xyzw, _HALF_TURN), found.quat_xyzw),
+        velocity_enu_mps=velocity + turned * np.einsum("nij,nj->ni", rotation, moved_mps),
+        angular_velocity_radps=found.angular_velocity_radps * np.where(turned, [-1.0, -1.0, 1.0], 1.0),
+    )
 
 
 def _make_columns(
