@@ -271,9 +271,9 @@ def _make_odometry_density(measurements: Measurements) -> _Density:
 
 
 def _make_fix_density(gnss: Positions | None) -> _Density:
-    """Without odometry: the square of the acceleration of the fixes, over a second or five of them; else what is usual.
+    """Return the noise density without odometry: by the acceleration of the fixes over a second, or over five of them; else the usual.
 
-    Fixes that are too noisy to show a velocity over that time do not show how steady it is either.
+    Over a longer window an acceleration of a second looks smaller. Fixes too noisy to show a velocity do not show how steady it is.
     """
     if gnss is None or gnss.stamp_ns.size < _FIXES:
         return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
@@ -283,6 +283,7 @@ def _make_fix_density(gnss: Positions | None) -> _Density:
         velocity = compute_slopes(gnss.stamp_ns, gnss.position_enu_m[:, axis], window_s)
         found += np.square(compute_slopes(gnss.stamp_ns, velocity, window_s))
     unseen = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
+    found *= (window_s / _FIX_WINDOW_S) ** 2
     density = np.minimum(np.maximum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, unseen), _UNKNOWN)
     stamp_ns = gnss.stamp_ns
     return lambda at_ns: _interpolate_density(stamp_ns, density, at_ns)
