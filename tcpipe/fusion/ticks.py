@@ -20,7 +20,7 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import DETERMINED, NoiseModel
 from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
 from tcpipe.fusion.initial import compute_course_rate
-from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.measurements import NO_LEVER_ARM, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,
     UNSEEN_TURN_RADPS,
@@ -54,6 +54,7 @@ _MOVING_MPS = 0.05  # slower is stationary (ruling)
 _ACCELERATION_WINDOW_S = 0.4
 # Sideways velocities are independent after this time: what lasts longer of them is in the states of turning centre and mounting.
 _SLIDE_LASTS_S = 0.016
+_SWAY_LASTS_S = 0.5  # an antenna that is base_link itself sways, and is not where the robot turns
 _LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
 
@@ -244,7 +245,9 @@ def _add_constraints(
     if is_gliding(m):  # which way the body looks is not known
         return
     value[:, state.SIDEWAYS, :2] = 0.0
-    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * _SLIDE_LASTS_S / period_s
+    is_base = m.gnss is not None and m.is_antenna_alone and m.gnss.lever_arm_std_m == NO_LEVER_ARM
+    slide_lasts_s = _SWAY_LASTS_S if is_base else _SLIDE_LASTS_S
+    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * slide_lasts_s / period_s
     imu = m.imu
     if imu is None or not imu.accelerometer_usable:
         every = max(1, round(_LEVEL_EVERY_S / period_s))

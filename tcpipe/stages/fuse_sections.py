@@ -97,7 +97,6 @@ def _estimate(
     return run_error_state(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
 
 
-_COMMANDED_MPS = 0.05  # slower commands show no direction
 _SHOWN_M = 0.2  # shorter drives may be noise of a stationary robot
 _HALF_TURN = np.array([0.0, 0.0, 1.0, 0.0])
 
@@ -111,7 +110,7 @@ def assume_forward(
     other way is turned by half a turn about its z axis; the antenna keeps its place.
     """
     rotation, velocity = matrix_from_quat(found.quat_xyzw), found.velocity_enu_mps
-    ahead_mps = np.sum(rotation[:, :, 0] * velocity, axis=1) * np.where(commanded_mps < -_COMMANDED_MPS, -1.0, 1.0)
+    ahead_mps = np.sum(rotation[:, :, 0] * velocity, axis=1) * np.where(commanded_mps < 0.0, -1.0, 1.0)
     # Rows up to the next change of sign are one drive; short ones keep the direction of the one before.
     drive = np.cumsum(np.diff(np.sign(ahead_mps), prepend=0.0) != 0.0)
     driven_m = np.bincount(drive, np.abs(ahead_mps)) * compute_median_period_ns(found.stamp_ns) * 1e-9

@@ -73,8 +73,15 @@ def alone(truth):
     return fuse(record(truth))
 
 
-def test_an_antenna_alone_defines_the_track_and_its_errors_are_as_claimed(alone, truth):
-    table, datum = alone.table, alone.info.datum
+@pytest.fixture(scope="module")
+def once_a_second(truth):
+    return fuse(record(truth, gnss_hz=1.0, gnss_outliers=0.0))
+
+
+@pytest.mark.parametrize("track", ["alone", "once_a_second"])
+def test_an_antenna_alone_defines_the_track_and_its_errors_are_as_claimed(track, truth, request):
+    track = request.getfixturevalue(track)
+    table, datum = track.table, track.info.datum
     t = seconds(table)
     antenna = truth.at(truth.position, t) + truth.slerp(t).apply(drive.LEVER)
     geodetic = [to_floats(table, name) for name in ("lon_deg", "lat_deg", "alt_m")]
