@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.logs.column_names import translate
+
 Floats = NDArray[np.float64]
 Read = Callable[[str, int | None], Floats]
 """Returns a column's values, those of one element where it is a list."""
@@ -107,20 +109,21 @@ UNITS: dict[str, dict[str, float]] = {
 """What one of a unit is in another: that by which they are grouped."""
 
 _UNIT_NAMES = """
-deg degree degrees °; rad radian radians; m meter meters metre metres; cm; mm; km; ft feet; m/s mps m_s; cm/s cmps; mm/s mmps; km/h kmh kph;
-mph; kn kt kts knot knots; rad/s radps rads rad_s; deg/s degps degs dps deg_s °/s; rpm; m/s2 m/s^2 m/s² m/s/s mps2; g; mg; V volt volts;
+deg degree degrees °; rad radian radians; m meter meters metre metres; cm; mm; km; ft feet;
+m/s mps m_s m_per_s meters_per_sec meters_per_second; cm/s cmps; mm/s mmps; km/h kmh kph km_h; mph; kn kt kts knot knots;
+rad/s radps rads rad_s; deg/s degps degs dps deg_s °/s grad/s; rpm u/min; m/s2 m/s^2 m/s² m/s/s mps2 ms2; g; mg; V volt volts;
 mV millivolt millivolts; A amp amps ampere amperes; mA milliamp milliamps; W watt watts; mW; kW; J joule joules; kJ; Wh; mWh; kWh;
 s sec secs second seconds; ms msec milliseconds; us µs μs usec microseconds; ns nsec nanoseconds"""
 """Units, and what else they are called in the name of a column."""
 _UNIT_OF = {name.lower(): names[0] for names in map(str.split, _UNIT_NAMES.split(";")) for name in names}
 _SUFFIX = re.compile(
-    r"(.*[^_ .\-])[_ .\-]++(" + "|".join(sorted(map(re.escape, _UNIT_OF), key=len, reverse=True)) + ")"
+    r"(.*?[^_ .\-])[_ .\-]++(" + "|".join(sorted(map(re.escape, _UNIT_OF), key=len, reverse=True)) + ")"
 )
 
 
 def simplify_name(name: str) -> str:
-    """Return a column's name in lower case without its unit, ``_`` for blanks and hyphens: that by which it is recognised."""
-    return re.sub(r"[\s-]+", "_", split_unit(name)[0].strip().lower())
+    """Return a column's name in English and lower case, without its unit, ``_`` for blanks and hyphens, to recognise it by."""
+    return re.sub(r"[\s-]+", "_", translate(split_unit(name)[0]).strip().lower())
 
 
 def split_unit(name: str) -> tuple[str, str | None, bool]:

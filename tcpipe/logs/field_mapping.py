@@ -28,6 +28,7 @@ from tcpipe.logs.expressions import (
     split_unit,
 )
 from tcpipe.logs.fix_quality import CODES, CODES_OF_NAMES, classify_fixes, find_status, split_codes
+from tcpipe.logs.power_fields import match_sided_velocities
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
@@ -122,8 +123,8 @@ MAPPED_TYPES = {
 
 STAMP_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 """What one of a unit of stamps is in [ns]."""
-_YEARS_S = (3e8, 1e10)
-"""Seconds since 1970 from 1979 to 2286: what a stamp is told its unit by."""
+YEARS_S = (3e8, 1e10)
+"""Seconds since 1970 from 1979 to 2286: they identify the unit of a stamp."""
 _LEAPS = ((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18))
 """From when [s since 1970] GPS time is how far ahead of UTC [s] (IERS Bulletin C)."""
 
@@ -292,7 +293,7 @@ def parse_stamps_ns(values: Array, unit: str) -> NDArray[np.int64] | str:
     """
     if unit == "auto":
         middle = float(np.median(values)) if values.size else 0.0
-        fitting = [name for name, ns in STAMP_UNITS.items() if _YEARS_S[0] < middle * ns / 1e9 < _YEARS_S[1]]
+        fitting = [name for name, ns in STAMP_UNITS.items() if YEARS_S[0] < middle * ns / 1e9 < YEARS_S[1]]
         if not fitting:
             return f"its stamps ({middle:.12g}) do not count from 1970; set their unit, one of {', '.join(STAMP_UNITS)}"
         unit = fitting[0]
@@ -359,20 +360,24 @@ def _match_axes(before: str, name: str) -> dict[str, str]:
     return {f"{name}_{axis}": rf"(.*[_.])?({before})[_.]?{axis}" for axis in "xyz"}
 
 
-_VELOCITY = {"linear_x": r"(.*[_.])?(t?l(in(ear)?)?|v(el(ocity)?)?)[_.]?x|speed|velocity|forward_velocity|v"}
+_MOVER = r"wheels?|odom(etry)?|motors?|encoders?|esc|robot|vehicle|forward"
+_VELOCITY = {
+    "linear_x": r"(?!.*(ang|gyr|omega|rot|acc))(.*[_.])?(t?l(in(ear)?)?|v(el(ocity)?)?)[_.]?x|"
+    rf"(({_MOVER})_)?(speed|velocity|vel|v)(_({_MOVER}))?"
+}
 _TURN = {"angular_z": r"(.*[_.])?(t?a(ng(ular)?)?|w|omega)[_.]?z|yaw_?rate|omega"}
 CALLED: Mapping[str, Mapping[str, str]] = {
     "gnss": {
         "latitude": r"(.*[_.])?lat(itude)?",
         "longitude": r"(.*[_.])?(lon(gitude)?|lng|long)",
         "altitude": r"(.*[_.])?(alt(itude)?|height|h)(_?(msl|hae|ellipsoid(al)?))?",
-        "east_std": r"sde",
+        "east_std": r"sde|(.*[_.])?h(or(izontal)?)?_?acc(uracy)?",
         "north_std": r"sdn",
-        "up_std": r"sdu",
+        "up_std": r"sdu|(.*[_.])?v(er(tical)?)?_?acc(uracy)?",
         "quality": "|".join(CODES_OF_NAMES.values()),
     },
     "imu": {
-        **_match_axes("w|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),
+        **_match_axes("w|g|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),
         **_match_axes("a|acc(el)?|lin(ear)?_?acc(el(eration)?)?", "linear_acceleration"),
     },
     "command": {**_VELOCITY, **_TURN},
@@ -392,12 +397,47 @@ _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
 
 def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
     """Return the name of each field of a role; {} where one is missing that the role needs."""
+    found = match_known_fields(role, names)
+    return found if all(field in found for field, definition in MAPPED[role].items() if definition.needed) else {}
+
+
+def match_known_fields(role: str, names: Sequence[str]) -> dict[str, str]:
+    """Return the name of each field of a role that has one."""
     found: dict[str, str] = {}
-    for field, pattern in CALLED[role].items():
+    for field, pattern in CALLED.get(role, {}).items():
         match = next((name for name in names if re.fullmatch(pattern, simplify_name(name))), None)
         if match is not None and match not in found.values():
             found[field] = match
-    return found if all(field in found for field, definition in MAPPED[role].items() if definition.needed) else {}
+    return found
+
+
+_COMMAND = re.compile(r"cmd|command|joy|setpoint|target")
+_OF_GNSS = re.compile(r"gps|gnss|gvel|sog|over_?ground")
+
+
+def match_table_roles(file: str, names: Sequence[str]) -> dict[str, tuple[dict[str, str], str]]:
+    """Return by role the column or expression of each field in a table, and what its names leave open.
+
+    A speed or a position beside fixes was probably computed from them, unless another column is the receiver's speed.
+    """
+    is_command = _COMMAND.search(file.lower())
+    commands = [name for name in names if is_command or _COMMAND.search(name.lower())]
+    measured = [name for name in names if name not in commands]
+    found = {"gnss": match_field_names("gnss", measured), "imu": match_field_names("imu", measured)}
+    taken = {name for fields in found.values() for name in fields.values()}
+    rest = [name for name in measured if name not in taken]
+    own = [name for name in rest if not _OF_GNSS.search(simplify_name(name))]
+    speed = match_field_names("wheel_odometry", own)
+    sided = match_sided_velocities(own)
+    found |= {"command": match_field_names("command", commands), "wheel_odometry": sided or speed}
+    found["pose"] = {} if found["gnss"] or speed or sided else match_field_names("pose", rest)
+    has_other = any(_OF_GNSS.search(simplify_name(name)) and re.search("vel|speed|sog", name.lower()) for name in rest)
+    is_wheels = re.search(_MOVER, simplify_name(speed.get("linear_x", ""))) is not None
+    doubt = "" if sided or is_wheels or has_other or not found["gnss"] else _COMPUTED_SPEED
+    return {role: (fields, doubt if role == "wheel_odometry" else "") for role, fields in found.items() if fields}
+
+
+_COMPUTED_SPEED = "if wheels measure it: the speed of a receiver is no second sensor"
 
 
 def list_number_fields(topic: Topic) -> list[str]:

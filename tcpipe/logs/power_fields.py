@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from tcpipe.logs.column_names import translate
 from tcpipe.logs.expressions import UNITS, split_unit
 
 SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr", "bl", "br"})
@@ -52,8 +53,8 @@ class _Named:
 
 
 def split_words(name: str) -> list[str]:
-    """Return the words of a name in lower case: at capitals, digits and signs."""
-    return [word.lower() for word in _WORDS.findall(name)]
+    """Return the English words of a name in lower case: at capitals, digits and signs."""
+    return [word.lower() for word in _WORDS.findall(translate(name))]
 
 
 def split_sides(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -91,24 +92,38 @@ def match_power_fields(names: Iterable[str]) -> PowerFields | None:
 def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
     """Return the forward velocity as the mean of those of both sides, and the turn rate for a track of 0.5 m; {} without.
 
-    Turn rates of wheels are no velocities.
+    Turn rates of wheels are velocities of a wheel with a radius of 0.1 m, and give no turn rate.
     """
+    words = {name: {*split_words(name)} for name in names}
+    units = {name: "rpm" if "rpm" in words[name] else split_unit(name)[1] for name in words}
     speeds = [
         name
-        for name in names
-        if {"vel", "velocity", "speed", "spd"} & set(split_words(name))
-        or split_unit(name.replace("`", ""))[1] in UNITS["m/s"]
+        for name, of_name in words.items()
+        if {"vel", "velocity", "speed", "spd", "rpm"} & of_name or units[name] in UNITS["m/s"]
     ]
-    sides = {"l", "left", "r", "right", "fl", "fr", "rl", "rr"}
-    sided = [name for name in speeds if sides & set(split_words(name))]
-    units = {split_unit(name.replace("`", ""))[1] for name in sided}
-    left = [name for name in sided if {"l", "left", "fl", "rl"} & set(split_words(name))]
+    sided = [name for name in speeds if {"l", "left", "r", "right", "fl", "fr", "rl", "rr"} & words[name]]
+    left = [quote(name) for name in sided if {"l", "left", "fl", "rl"} & words[name]]
     cores = {split_sides(name)[0] for name in sided}
-    if not left or 2 * len(left) != len(sided) or len(cores) != 1 or len(units) != 1 or units & {*UNITS["rad/s"]}:
+    if not left or 2 * len(left) != len(sided) or len(cores) != 1 or len({units[name] for name in sided}) != 1:
         return {}
-    right = [name for name in sided if name not in left]
-    turn = f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)} / 0.5"
-    return {"linear_x": f"({' + '.join([*left, *right])}) / {len(sided)}", "angular_z": turn}
+    right = [name for name in map(quote, sided) if name not in left]
+    unit, mean = units[sided[0]] or "m/s", f"({' + '.join([*left, *right])}) / {len(sided)}"
+    if unit in UNITS["rad/s"]:
+        factor = f" * {UNITS['rad/s'][unit]:.9g}" if unit != "rad/s" else ""
+        return {"linear_x": f"{mean}{factor} * 0.1"}
+    to_mps = f" * {UNITS['m/s'][unit]:.9g}" if UNITS["m/s"].get(unit, 1.0) != 1.0 else ""
+    return {
+        "linear_x": mean,
+        "angular_z": f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)}{to_mps} / 0.5",
+    }
+
+
+_PLAIN = re.compile(r"[A-Za-z_]\w*")
+
+
+def quote(name: str) -> str:
+    """Return a column's name as an expression names it: in backquotes unless it is a word."""
+    return name if _PLAIN.fullmatch(name) else f"`{name}`"
 
 
 def _read_name(name: str) -> _Named | None:

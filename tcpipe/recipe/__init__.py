@@ -380,8 +380,16 @@ class TableMapping:
     """Its σ, as a fraction: one error of a run."""
     stamp: str | None = None
     """Column of the stamps; default: the first."""
-    stamp_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of numeric stamps; auto infers it from their size if they count from 1970. Text is date and time, UTC unless stated."""
+    stamp_unit: Literal["auto", "s", "ms", "us", "ns", "ms_today"] = "auto"
+    """Unit of numeric stamps; auto infers it from their size if they count from 1970, else from the name. ms_today counts from midnight."""
+    stamp_format: str = field(default="", metadata={"json": ("",)})
+    """Format of stamps that are text, as "%d.%m.%Y %H:%M:%S%.f"; "": one of the usual."""
+    stamp_zone: str = field(default="", metadata={"json": ("",)})
+    """Time zone of stamps without one, as "Europe/Vienna" or "UTC"; also of the tables that state none."""
+    stamp_date: str = field(default="", metadata={"json": ("",)})
+    """Date of times of day: a column, or as "2025-07-09"; "": that of the file's name, else of its last change (a warning)."""
+    stamp_utc: str = field(default="", metadata={"json": ("",)})
+    """Column of UTC, also in whole seconds: the stamps of a faster clock are shifted onto it by one constant."""
     offset_s: Offset = 0.0
     """Added to the stamps [s]."""
 

@@ -68,15 +68,19 @@ def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
 
 
 def find_table_run(path: Path | str, mappings: Mappings) -> TableRun | None:
-    """Return the run that a table belongs to by its name, None where no mapped name has a ``*`` that fits."""
+    """Return the run that a table belongs to by its name, None where the recipe maps no file of such a name.
+
+    The tables of a run are in one folder; the text of a ``*`` is the same in the names of all of them.
+    """
     path = Path(path)
     for mapping in mappings.values():
         parts = mapping.file.split("/")
-        if "*" not in mapping.file or len(path.parts) <= len(parts):
+        if len(path.parts) < len(parts):
             continue
         pattern = "([^/]+)".join(map(re.escape, mapping.file.split("*")))
         if named := re.fullmatch(pattern, "/".join(path.parts[-len(parts) :])):
-            names = {name: mapping.file.replace("*", named[1]) for name, mapping in mappings.items()}
+            text = named[1] if "*" in mapping.file else "*"
+            names = {name: mapping.file.replace("*", text) for name, mapping in mappings.items()}
             of_run = {name: replace(mapping, file=names[name]) for name, mapping in mappings.items()}
             return TableRun(path.parents[len(parts) - 1], of_run)
     return None

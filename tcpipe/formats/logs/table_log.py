@@ -24,23 +24,11 @@ from numpy.typing import NDArray
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.message_tables import Fields, TableLog, TopicMessages, make_stamp_fields, make_topic
 from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
-from tcpipe.logs.expressions import split_unit
-from tcpipe.logs.field_mapping import (
-    STAMP_UNITS,
-    FieldSource,
-    find_mapping_problems,
-    find_topic,
-    make_message_fields,
-    parse_stamps_ns,
-    read_fields,
-    utc_from_gps_ns,
-)
+from tcpipe.formats.logs.table_stamps import Stamps, find_stamps
+from tcpipe.logs.field_mapping import FieldSource, find_mapping_problems, find_topic, make_message_fields, read_fields
 from tcpipe.logs.topics import Damage
 from tcpipe.power.sources import FLOAT_TYPES
 from tcpipe.recipe import TableMapping
-
-_GPS_TIME = "GPST"
-"""What RTKLIB calls a column of GPS time."""
 
 
 def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = None) -> TableLog:
@@ -50,8 +38,9 @@ def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = N
     """
     problems: list[str] = []
     read: list[TopicMessages] = []
+    zone = next((mapping.stamp_zone for mapping in mappings.values() if mapping.stamp_zone), "")
     for name, mapping in mappings.items():
-        found = _read_table(path, name, mapping)
+        found = _read_table(path, name, mapping, mapping.stamp_zone or zone)
         if isinstance(found, TopicMessages):
             read.append(found)
         else:
@@ -62,8 +51,8 @@ def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = N
     return TableLog(path, "tables", read, list_table_files(path) if files is None else files)
 
 
-def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages | list[str]:
-    """Return a table's messages, or every problem of its mapping."""
+def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> TopicMessages | list[str]:
+    """Return a table's messages, or every problem of its mapping; ``zone`` is that of times without one, "" if none is stated."""
     where = f"recipe tables.{name}"
     role = mapping.role or name
     problems = list(find_mapping_problems(where, role, mapping.columns, mapping.units))
@@ -83,11 +72,15 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages
         stamp = names[0] if mapping.stamp is None else mapping.stamp
         fields = read_fields(f"{where}.columns", role, mapping.columns, mapping.units, names)
         problems = [f"{problem} ({mapping.file})" for problem in fields] if isinstance(fields, list) else []
-        if stamp not in names:
-            problems.append(f"{where}.stamp: {mapping.file} has no column {stamp}; it has {', '.join(names)}")
+        problems += [
+            f"{where}.{key}: {mapping.file} has no column {column}; it has {', '.join(names)}"
+            for key, column in (("stamp", stamp), ("stamp_utc", mapping.stamp_utc))
+            if column and column not in names
+        ]
         if isinstance(fields, list) or problems:
             return problems
-        cells, values = read_values(path, stamp, fields)
+        of_stamps = (stamp, mapping.stamp_utc, mapping.stamp_date)
+        cells, values = read_values(path, [column for column in of_stamps if column in names], fields)
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
@@ -96,29 +89,15 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> TopicMessages
         if not np.isfinite(cells.columns[column]).any()
     ]
     twice = [note for column in (stamp, *cells.columns) if (note := describe_duplicate(column, names))]
-    cells = replace(cells, notes=(*cells.notes, *twice))
-    stamp_ns = _read_stamps(cells, stamp, mapping)
-    if isinstance(stamp_ns, str):
-        return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
+    stamps = find_stamps(cells.stamps, stamp, mapping, zone=zone, path=path)
+    if isinstance(stamps, str):
+        return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamps}"]
+    cells = replace(cells, notes=(*cells.notes, *twice, *stamps.notes))
     if empty:
         return empty
     source = mapping.make_power_source(name)
     read_as = find_topic(name, role, mapping.columns, source.type if source else None)
-    return _read_messages((*read_as, role), mapping, cells, values, stamp_ns)
-
-
-def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.int64] | str:
-    """Return the known stamps [ns, UTC], or what is in the way of that."""
-    known = cells.stamp[cells.stamp_known]
-    if not known.size:
-        return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
-    named, stated = split_unit(stamp)[1], mapping.stamp_unit
-    unit = "ns" if cells.stamp_is_time else named if stated == "auto" and named in STAMP_UNITS else stated
-    found = parse_stamps_ns(known, unit)
-    if isinstance(found, str):
-        return f"{found} (stamp_unit)"
-    found = utc_from_gps_ns(found) if cells.stamp_is_time and stamp == _GPS_TIME else found
-    return found + round(mapping.offset_s * 1e9)
+    return _read_messages((*read_as, role), mapping, cells, values, stamps)
 
 
 def _read_messages(
@@ -126,18 +105,24 @@ def _read_messages(
     mapping: TableMapping,
     cells: Cells,
     values: Mapping[str, NDArray[np.float64]],
-    stamp_ns: NDArray[np.int64],
+    stamps: Stamps,
 ) -> TopicMessages:
-    """Return a table as the messages of its topic, type and role, in order of time, and what of it is lost."""
+    """Return a table as the messages of its topic, type and role, in order of time, and its damage.
+
+    Rows without any of the values are no messages: several sensors share a table, and each row is of one of them.
+    """
     topic, kind, role = read_as
-    lost = int(np.count_nonzero(~cells.stamp_known))
+    has_value = np.any([np.isfinite(value) for value in values.values()], axis=0)
+    is_used = stamps.known & (has_value if has_value.any() else True)
+    lost = int(np.count_nonzero(~stamps.known))
     damage = [Damage("time-invalid", mapping.file, messages_lost=lost)] if lost else []
     damage += [
         Damage("table-cells", mapping.file, messages_lost=count, reason=f"column {column}, row {row}: {text!r}")
         for column, (count, row, text) in cells.texts.items()
     ]
     damage += [Damage("table-cells", mapping.file, messages_lost=0, reason=note) for note in cells.notes]
-    order = np.flatnonzero(cells.stamp_known)
+    order = np.flatnonzero(is_used)
+    stamp_ns = stamps.ns[order]
     if backward := int(np.count_nonzero(np.diff(stamp_ns) < 0)):
         damage.append(Damage("messages-unordered", mapping.file, messages_lost=0, places=backward))
         by_time = np.argsort(stamp_ns, kind="stable")
@@ -180,15 +165,13 @@ _EDGES = re.compile(rb"^ | (?=\r?$)", re.MULTILINE)
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """Columns that were read: numbers, NaN where there is none; ``stamp`` as it stands, or [ns since 1970] where it is a time in words.
+    """Columns that were read, shape (N,): ``columns`` as numbers, NaN where there is none, ``stamps`` as they are in the file.
 
-    ``texts`` says by column how many cells hold something that is no number, and the first with its row (from 1); ``notes`` what the
-    file's form shows.
+    ``texts`` has by column the number of cells that are no number, and row (from 1) and text of the first; ``notes`` are remarks on the
+    file's form.
     """
 
-    stamp: NDArray[np.int64] | NDArray[np.float64]
-    stamp_known: NDArray[np.bool_]
-    stamp_is_time: bool
+    stamps: dict[str, pl.Series]
     columns: dict[str, NDArray[np.float64]]
     texts: dict[str, tuple[int, int, str]]
     notes: tuple[str, ...] = ()
@@ -205,8 +188,8 @@ def describe_duplicate(column: str, names: Sequence[str]) -> str:
     return f"several columns are called {column}: the first is read, {second} is the next" if second in names else ""
 
 
-def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[str] = ()) -> Cells:
-    """Read a column of stamps, columns of numbers and of ``words`` or numbers; every other column is passed over.
+def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], words: Sequence[str] = ()) -> Cells:
+    """Read columns of stamps, of numbers and of ``words`` or numbers, and no other.
 
     `LogError`: the file cannot be read as a table.
     """
@@ -214,23 +197,15 @@ def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[st
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            frame = _collect_columns(path, [*dict.fromkeys([stamp, *wanted, *words])], numbers=wanted)
-            stamps = frame[stamp]
-            stamps = _parse_times(stamps) if stamps.dtype == pl.String else stamps
-            if is_time := stamps.dtype.is_temporal():
-                stamps = stamps.cast(pl.Datetime("ns")).cast(pl.Int64)
+            frame = _collect_columns(path, [*dict.fromkeys([*stamps, *wanted, *words])], numbers=wanted)
             numbers = {name: frame[name].cast(pl.Float64, strict=False) for name in wanted}
             texts = {
                 name: odd for name in wanted if numbers[name].null_count() and (odd := _find_non_number(path, name))
             }
         except (pl.exceptions.PolarsError, OSError) as error:
             raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
-    whole = stamps.dtype.is_integer()
-    made = stamps.cast(pl.Int64 if whole else pl.Float64, strict=False)
     return Cells(
-        made.fill_null(0).to_numpy(),
-        (made.is_not_null() & made.is_finite()).to_numpy() if not whole else made.is_not_null().to_numpy(),
-        is_time,
+        {name: frame[name] for name in stamps},
         {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()}
         | {name: frame[name].to_numpy() for name in words},
         texts,
@@ -238,14 +213,28 @@ def read_cells(path: Path, *, stamp: str, columns: list[str], words: Sequence[st
     )
 
 
+def read_numbers(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Return the columns that contain numbers, shape (rows,), NaN where a cell has none; `LogError` where it is no table."""
+    try:
+        frame = _collect_columns(path, [*names], numbers=[*names])
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
+    numbers = {name: frame[name].cast(pl.Float64) for name in names if frame[name].dtype.is_numeric()}
+    return {
+        name: values.fill_null(np.nan).to_numpy()
+        for name, values in numbers.items()
+        if values.null_count() < len(values)
+    }
+
+
 def read_values(
-    path: Path, stamp: str, fields: Mapping[str, FieldSource]
+    path: Path, stamps: Sequence[str], fields: Mapping[str, FieldSource]
 ) -> tuple[Cells, dict[str, NDArray[np.float64]]]:
     """Return the cells that fields are made of, and the fields' values, shape (rows,)."""
     used = {name: [column for column, _ in field.expression.operands()] for name, field in fields.items()}
     numbers = [column for name, columns in used.items() if name != "quality" for column in columns]
-    cells = read_cells(path, stamp=stamp, columns=numbers, words=used.get("quality", ()))
-    rows = len(cells.stamp)
+    cells = read_cells(path, stamps=stamps, columns=numbers, words=used.get("quality", ()))
+    rows = len(cells.stamps[stamps[0]])
     return cells, {
         name: field.evaluate(lambda column, _: cells.columns[column], rows) for name, field in fields.items()
     }
@@ -257,16 +246,6 @@ def _collect_columns(path: Path, columns: list[str], numbers: list[str] | None) 
         return _scan(path, numbers).select(columns).collect()
     except pl.exceptions.ComputeError:
         return _scan(path, numbers, quote=None).select(columns).collect()
-
-
-def _parse_times(texts: pl.Series) -> pl.Series:
-    """Return texts as times; where they are none, null: ISO 8601 with and without a zone, UTC where none is told."""
-    for zone in ("", "%#z"):
-        for between in ("T", " "):
-            found = texts.str.to_datetime(f"%Y-%m-%d{between}%H:%M:%S%.f{zone}", time_unit="ns", strict=False)
-            if found.null_count() <= len(found) // 2:
-                return found.dt.convert_time_zone("UTC").dt.replace_time_zone(None) if zone else found
-    return texts.cast(pl.Float64, strict=False)
 
 
 def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:
@@ -289,7 +268,7 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
     comments, lines = _split_comment_lines(head)
     if not lines:
         raise LogError(f"{path}: it contains no table: it is empty")
-    separator = next((sign for sign in (b",", b";", b"\t") if sign in lines[0]), b" ")
+    separator = next((sign for sign in (b";", b"\t", b",") if sign in lines[0]), b" ")
     first = (_DAY_AND_TIME.sub(rb"\1-\2-\3T", lines[0]) if separator == b" " else lines[0]).split(
         None if separator == b" " else separator
     )
@@ -327,7 +306,7 @@ def _is_name(field: bytes) -> bool:
     try:
         float(text or b"0")
     except ValueError:
-        return not re.match(rb"\d{4}[-/]\d\d[-/]\d\d|\d\d:\d\d", text)
+        return not re.match(rb"\d{4}[-/]\d\d[-/]\d\d|\d\d?[./]\d\d?[./]\d{4}|\d\d:\d\d", text)
     return False
 
 

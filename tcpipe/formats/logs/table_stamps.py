@@ -1,0 +1,247 @@
+"""Stamps of tables: counters, dates and times in words, milliseconds of a day, and counters that a coarse column ties to UTC."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from tcpipe.logs.expressions import simplify_name, split_unit
+from tcpipe.logs.field_mapping import STAMP_UNITS, YEARS_S, parse_stamps_ns, utc_from_gps_ns
+from tcpipe.recipe import TableMapping
+
+Integers = NDArray[np.int64]
+
+DAY_FIRST, _MONTH_FIRST = "%d/%m/%Y %H:%M:%S%.f", "%m/%d/%Y %H:%M:%S%.f"
+_FORMS = (
+    *(f"%Y-%m-%d{between}%H:%M:%S%.f{zone}" for zone in ("", "%#z") for between in ("T", " ")),
+    *("%d.%m.%Y %H:%M:%S%.f", "%Y/%m/%d %H:%M:%S%.f", DAY_FIRST, _MONTH_FIRST, "%m/%d/%Y %I:%M:%S%.f %p"),
+    "%H:%M:%S%.f",
+)
+"""Formats of dates and times that are recognised; the last has no date."""
+_GPS_TIME = "GPST"
+"""RTKLIB's name of a column of GPS time."""
+_OF_UTC = re.compile(r"(.*_)?(utc|gmt|zulu)(_.*)?")
+_OF_DAY = re.compile(r"(.*_)?ms_(today|of_day)")
+_COUNTERS = {"millis": "ms", "micros": "us", **{unit: unit for unit in STAMP_UNITS}}
+"""Units of counters whose column is called like a unit, or like a function of a microcontroller."""
+_DATE_IN_NAME = re.compile(r"(?<!\d)(20\d\d)([-_.]?)([01]\d)\2([0-3]\d)(?!\d{3})")
+_DAY_NS = 86_400_000_000_000
+_SAMPLE_ROWS = 1000
+_SLOWEST_STEP_S = 6.0
+"""Ten rows in a minute: the unit of a counter is the coarsest with shorter steps."""
+_MAX_TIE_SPREAD_NS, _MAX_STRAY_SHARE = 2_000_000_000, 0.05
+_COARSEST = tuple(reversed(STAMP_UNITS.items()))
+Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A column of stamps, shape (N,): [ns] since 1970 in UTC or in local time, since midnight, or since the start of a counter.
+
+    Attributes
+    ----------
+    ns : 0 where ``known`` is false.
+    unit : unit of numbers: s, ms, us or ns.
+    is_guessed : neither the size of a counter's values nor its name states the unit; its steps suggest it.
+    sample : first text, "" of numbers.
+    """
+
+    kind: Kind
+    ns: Integers
+    known: NDArray[np.bool_]
+    unit: str = ""
+    is_guessed: bool = False
+    sample: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Stamps:
+    """Stamps of a table's rows [ns], shape (N,), whether each is known, and what was assumed of them."""
+
+    ns: Integers
+    known: NDArray[np.bool_]
+    notes: tuple[str, ...] = ()
+
+
+def find_stamps(
+    columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, *, zone: str, path: Path
+) -> Stamps | str:
+    """Return the stamps of a table of the recipe, or in words why they cannot be read.
+
+    ``columns`` contains the columns that ``stamp``, ``stamp_date`` and ``stamp_utc`` name, ``zone`` that of times without one.
+    """
+    try:
+        found = _read_stamps(columns, stamp, mapping, "UTC" if mapping.stamp_utc else zone, path)
+        if isinstance(found, Stamps) and mapping.stamp_utc:
+            as_utc = replace(mapping, stamp_unit="auto", stamp_format="")
+            utc = _read_stamps(columns, mapping.stamp_utc, as_utc, "UTC", path)
+            found = f"{mapping.stamp_utc}: {utc} (stamp_utc)" if isinstance(utc, str) else _tie_to_utc(found, utc)
+    except pl.exceptions.PolarsError as error:
+        return str(error).splitlines()[0]
+    if isinstance(found, str):
+        return found
+    return replace(found, ns=found.ns + round(mapping.offset_s * 1e9))
+
+
+def _read_stamps(
+    columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, zone: str, path: Path
+) -> Stamps | str:
+    column, dates = columns[stamp], columns.get(mapping.stamp_date)
+    if dates is not None:
+        column = (dates.cast(pl.String) + " " + column.cast(pl.String)).alias(stamp)
+    clock = read_clock(column, form=mapping.stamp_format, unit=mapping.stamp_unit)
+    if isinstance(clock, str):
+        return clock
+    if clock.kind in ("local", "day") and not zone:
+        sample = f" ({clock.sample})" if clock.sample else ""
+        return f'its times{sample} have no zone; state it, as stamp_zone = "Europe/Vienna" or "UTC"'
+    if clock.is_guessed:
+        first = clock.ns[clock.known][0] / STAMP_UNITS[clock.unit]
+        return (
+            f"its stamps ({first:.12g}) do not count from 1970; set their unit, one of {', '.join(STAMP_UNITS)} "
+            f"(stamp_unit; by their steps {clock.unit})"
+        )
+    ns, notes = clock.ns, tuple[str, ...]()
+    if clock.kind == "day":
+        ns = _unwrap_days(ns, clock.known)
+        midnight = _find_midnight(mapping.stamp_date, path, int(ns[clock.known][-1]), zone)
+        if isinstance(midnight, str):
+            return midnight
+        ns, notes = ns + midnight[0], midnight[1]
+    if clock.kind in ("local", "day"):
+        ns = _convert_to_utc(ns, zone)
+    return Stamps(np.where(clock.known, ns, 0), clock.known, notes)
+
+
+def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Clock | str:
+    """Return what a column counts, or in words why it is no clock.
+
+    ``form`` is the recipe's ``stamp_format`` of texts, ``unit`` its ``stamp_unit`` of numbers.
+    """
+    if column.dtype == pl.String:
+        times = _parse_times(column, form)
+        if times is not None:
+            return times
+        column = column.cast(pl.Float64, strict=False)
+    if column.dtype.is_temporal():
+        kind: Kind = "utc" if _has_zone(column.dtype) else "day" if column.dtype == pl.Time else "local"
+        return _make_clock(kind, column, str(column.drop_nulls().first()))
+    numbers = column if column.dtype.is_integer() else column.cast(pl.Float64, strict=False)
+    known = (numbers.is_not_null() & numbers.is_finite()).to_numpy()
+    values = numbers.filter(pl.Series(known)).to_numpy()
+    if not values.size:
+        return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
+    if unit == "ms_today" or (unit == "auto" and _OF_DAY.fullmatch(simplify_name(column.name))):
+        return Clock("day", _fill_rows(np.round(values * 1e6).astype(np.int64), known), known)
+    named = split_unit(column.name)[1] or _COUNTERS.get(simplify_name(column.name), "")
+    stated = unit if unit != "auto" else named if named in STAMP_UNITS else ""
+    ns = parse_stamps_ns(values, stated or "auto")
+    is_guessed = isinstance(ns, str)
+    if isinstance(ns, str):
+        step = float(np.median(np.diff(values))) if values.size > 1 else 0.0
+        stated = next((name for name, one in _COARSEST if 0 < step * one / 1e9 <= _SLOWEST_STEP_S), "s")
+        ns = np.asarray(parse_stamps_ns(values, stated), np.int64)
+    is_utc = YEARS_S[0] < float(np.median(ns)) / 1e9 < YEARS_S[1]
+    return Clock("utc" if is_utc else "counter", _fill_rows(ns, known), known, stated, is_guessed=is_guessed)
+
+
+def _fill_rows(ns: Integers, known: NDArray[np.bool_]) -> Integers:
+    """Return the stamps of known rows at their rows, 0 elsewhere."""
+    found = np.zeros(len(known), np.int64)
+    found[known] = ns
+    return found
+
+
+def _make_clock(kind: Kind, times: pl.Series, sample: str) -> Clock:
+    """Return the clock of dates or times; the name of the column may state UTC or GPS time."""
+    counted = (times if kind == "day" else times.cast(pl.Datetime("ns"))).cast(pl.Int64)
+    known, ns = counted.is_not_null().to_numpy(), counted.fill_null(0).to_numpy()
+    if kind == "local" and times.name == _GPS_TIME:
+        return Clock("utc", utc_from_gps_ns(ns), known, sample=sample)
+    is_utc = kind == "local" and _OF_UTC.fullmatch(simplify_name(times.name))
+    return Clock("utc" if is_utc else kind, ns, known, sample=sample)
+
+
+def _parse_times(column: pl.Series, form: str) -> Clock | str | None:
+    """Return the clock of texts, None where most of them are no times; in words where days and months cannot be told apart."""
+    texts = column.str.strip_chars().str.replace(r",(\d+)", ".${1}")
+    sample = texts.filter(texts.is_not_null() & (texts != "")).head(_SAMPLE_ROWS)
+    tried = {each: _parse(sample, each) for each in ([form] if form else _FORMS)}
+    fitting = {each: times for each, times in tried.items() if 2 * times.null_count() < len(times)}
+    first = "".join(sample.head(1).to_list())
+    if not fitting:
+        return f"stamp_format is {form!r}, and its first text is {first!r}" if form and first else None
+    best = min(fitting, key=lambda each: fitting[each].null_count())
+    rival = fitting.get(_MONTH_FIRST)
+    if best == DAY_FIRST and rival is not None and not (rival == fitting[best]).all():
+        return f"its dates ({first}) may begin with day or month; state stamp_format = {best!r} or {_MONTH_FIRST!r}"
+    times = _parse(texts, best)
+    kind: Kind = "day" if times.dtype == pl.Time else "utc" if "%#z" in best or "%z" in best else "local"
+    return _make_clock(kind, times, first)
+
+
+def _parse(texts: pl.Series, form: str) -> pl.Series:
+    """Return texts as times, null where they are none; a format without a year is a time of day."""
+    if not re.search("%[YyGFDcs+]", form):
+        return texts.str.to_time(form, strict=False)
+    times = texts.str.to_datetime(form, time_unit="ns", strict=False)
+    return times.dt.convert_time_zone("UTC").dt.replace_time_zone(None) if _has_zone(times.dtype) else times
+
+
+def _has_zone(kind: pl.DataType) -> bool:
+    return isinstance(kind, pl.Datetime) and kind.time_zone is not None
+
+
+def _unwrap_days(ns: Integers, known: NDArray[np.bool_]) -> Integers:
+    """Return times of day [ns] with a day added at each midnight that the rows pass."""
+    found = ns.copy()
+    found[known] += _DAY_NS * np.cumsum(np.diff(ns[known], prepend=ns[known][:1]) < -_DAY_NS // 2)
+    return found
+
+
+def _find_midnight(stated: str, path: Path, last_ns: int, zone: str) -> tuple[int, tuple[str, ...]] | str:
+    """Return the midnight [ns, local time] from which times of day count, and a note where it is assumed.
+
+    The date is the recipe's, else that in the file's name, else the one at which the last row is nearest to the file's last change.
+    """
+    named = _DATE_IN_NAME.search(path.stem)
+    text = stated or ("-".join(named.group(1, 3, 4)) if named else "")
+    if text:
+        try:
+            return (date.fromisoformat(text) - date(1970, 1, 1)).days * _DAY_NS, ()
+        except ValueError:
+            if stated:
+                return f"stamp_date is {stated!r}; expected a column of {path.name}, or a date, as 2025-07-09"
+    changed = pl.Series([datetime.fromtimestamp(path.stat().st_mtime, UTC)]).dt.cast_time_unit("ns")
+    changed_ns = int(changed.dt.convert_time_zone(zone).dt.replace_time_zone(None).cast(pl.Int64)[0])
+    days = round((changed_ns - last_ns) / _DAY_NS)
+    day = date(1970, 1, 1) + timedelta(days=days)
+    return days * _DAY_NS, (f"no date; {day} by the last change of the file: if that is wrong, set stamp_date",)
+
+
+def _convert_to_utc(ns: Integers, zone: str) -> Integers:
+    """Return local times [ns] as UTC; of an hour that comes twice the first. `pl.exceptions.PolarsError`: there is no such zone."""
+    local = pl.Series(ns).cast(pl.Datetime("ns")).dt.replace_time_zone(zone, ambiguous="earliest", non_existent="null")
+    return local.dt.convert_time_zone("UTC").cast(pl.Int64).fill_null(0).to_numpy()
+
+
+def _tie_to_utc(stamps: Stamps, utc: Stamps) -> Stamps | str:
+    """Return stamps shifted onto UTC by a coarser column: by the median over the rows in which that column changes."""
+    both = stamps.known & utc.known & (utc.ns > YEARS_S[0] * 1e9)
+    changes = np.flatnonzero(both & (np.diff(utc.ns, prepend=utc.ns[:1]) != 0))
+    rows = changes if changes.size else np.flatnonzero(both)
+    if not rows.size:
+        return "stamp_utc has no times since 1979"
+    apart = utc.ns[rows] - stamps.ns[rows]
+    offset = int(np.median(apart))
+    share = float(np.mean(np.abs(apart - offset) > _MAX_TIE_SPREAD_NS))
+    notes = (f"{share:.0%} of its UTC stamps are 2 s or more from the others",) if share > _MAX_STRAY_SHARE else ()
+    return Stamps(np.where(stamps.known, stamps.ns + offset, 0), stamps.known, (*utc.notes, *notes))
