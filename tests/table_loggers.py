@@ -51,7 +51,8 @@ class Drive:
         along = np.interp(fix_t, self.t, self.distance)
         first = np.searchsorted(fix_t, fix_t)
         east, north = (
-            along * part + 0.01 * noise.standard_normal(t.size)[first] for part in (np.cos(COURSE_RAD), np.sin(COURSE_RAD))
+            along * part + 0.01 * noise.standard_normal(t.size)[first]
+            for part in (np.cos(COURSE_RAD), np.sin(COURSE_RAD))
         )
         return {
             "t": t,
@@ -107,7 +108,8 @@ def write_text(path: Path, columns: Mapping[str, object], *, separator: str = ",
     """Write a table as text, numbers with up to 9 decimals."""
     path.parent.mkdir(parents=True, exist_ok=True)
     frame = pl.DataFrame({name: list(values) for name, values in columns.items()})
-    frame.write_csv(path, separator=separator, decimal_comma=comma, float_precision=9)
+    text = frame.write_csv(separator=separator, decimal_comma=comma, float_precision=9)
+    path.write_text(text.replace(';""\n', ";\n"), encoding="utf-8")
 
 
 def write_german(drive: Drive, folder: Path) -> None:
@@ -134,7 +136,7 @@ def write_microcontroller(drive: Drive, folder: Path) -> None:
     per_minute = 30 / np.pi / WHEEL_RADIUS_M
     columns = {
         "millis": np.round(1000 * (rows["t"] + COUNTER_START_S)).astype(np.int64),
-        "gps_time": pl.Series(utc).cast(pl.Int64).mul(1) if False else [datetime.fromtimestamp(s, ZoneInfo("UTC")).strftime("%Y-%m-%dT%H:%M:%SZ") for s in utc.tolist()],
+        "gps_time": pl.from_epoch(pl.Series(utc)).dt.strftime("%Y-%m-%dT%H:%M:%SZ"),
         "lat": rows["latitude"],
         "lon": rows["longitude"],
         "alt": rows["altitude"],
@@ -145,7 +147,7 @@ def write_microcontroller(drive: Drive, folder: Path) -> None:
         "Voltage [V]": rows["volt"],
         "current_mA": 1000 * rows["amp"],
     }
-    write_text(folder / "LOG7.CSV".lower(), columns)
+    write_text(folder / "log7.csv", columns)
 
 
 VESC_ZEROS = (
@@ -196,7 +198,9 @@ def write_french(drive: Drive, folder: Path) -> None:
     """Four tables of one drive with suffixes of their own, and local times as ISO texts without a zone."""
     fast, slow = drive.sample(50), drive.sample(20)
     fixes = {name: values[slow["is_fix"]] for name, values in slow.items()}
-    stamps = {rate: format_local(rows["t"], "%Y-%m-%d %H:%M:%S%.3f") for rate, rows in ((50, fast), (20, slow), (5, fixes))}
+    stamps = {
+        rate: format_local(rows["t"], "%Y-%m-%d %H:%M:%S%.3f") for rate, rows in ((50, fast), (20, slow), (5, fixes))
+    }
     write_text(
         folder / "sortie1_gps.csv",
         {"horodatage": stamps[5], **{name: fixes[name] for name in ("latitude", "longitude", "altitude")}},

@@ -360,6 +360,7 @@ def _match_axes(before: str, name: str) -> dict[str, str]:
     return {f"{name}_{axis}": rf"(.*[_.])?({before})[_.]?{axis}" for axis in "xyz"}
 
 
+_HORIZONTAL_STD = r"(.*[_.])?h(or(izontal)?)?_?acc(uracy)?"
 _MOVER = r"wheels?|odom(etry)?|motors?|encoders?|esc|robot|vehicle|forward"
 _VELOCITY = {
     "linear_x": r"(?!.*(ang|gyr|omega|rot|acc))(.*[_.])?(t?l(in(ear)?)?|v(el(ocity)?)?)[_.]?x|"
@@ -371,8 +372,8 @@ CALLED: Mapping[str, Mapping[str, str]] = {
         "latitude": r"(.*[_.])?lat(itude)?",
         "longitude": r"(.*[_.])?(lon(gitude)?|lng|long)",
         "altitude": r"(.*[_.])?(alt(itude)?|height|h)(_?(msl|hae|ellipsoid(al)?))?",
-        "east_std": r"sde|(.*[_.])?h(or(izontal)?)?_?acc(uracy)?",
-        "north_std": r"sdn",
+        "east_std": rf"sde|{_HORIZONTAL_STD}",
+        "north_std": rf"sdn|{_HORIZONTAL_STD}",
         "up_std": r"sdu|(.*[_.])?v(er(tical)?)?_?acc(uracy)?",
         "quality": "|".join(CODES_OF_NAMES.values()),
     },
@@ -406,7 +407,7 @@ def match_known_fields(role: str, names: Sequence[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for field, pattern in CALLED.get(role, {}).items():
         match = next((name for name in names if re.fullmatch(pattern, simplify_name(name))), None)
-        if match is not None and match not in found.values():
+        if match is not None and (match not in found.values() or field == "north_std"):
             found[field] = match
     return found
 

@@ -151,10 +151,13 @@ def _choose(named: Sequence[_Named]) -> tuple[list[_Named], list[_Named]]:
     return (ranked or [[]])[0], [field for group in ranked[1:] if _rank(group) == _rank(ranked[0]) for field in group]
 
 
-def _rank(group: Sequence[_Named]) -> tuple[bool, bool]:
-    """Return whether the fields are not named like the supply, and whether they are named like a motor."""
+def _rank(group: Sequence[_Named]) -> tuple[bool, bool, bool]:
+    """Return whether the fields are not named like the supply, whether like a motor, and whether like one of several controllers.
+
+    VESC Tool's ``setup`` is the sum over all controllers.
+    """
     supply, phase = (any(pattern.fullmatch(word) for word in group[0].core) for pattern in (_SUPPLY, _PHASE))
-    return not supply, phase
+    return not supply, phase, "setup" not in group[0].core
 
 
 def _take_first_element(name: str) -> str:
@@ -165,6 +168,6 @@ def _take_first_element(name: str) -> str:
 def _find_doubt(drawn: Sequence[_Named], others: Sequence[_Named]) -> str:
     if others:
         return f"{', '.join(other.name for other in others)} could be meant as well"
-    if _rank(drawn) == (True, True):
+    if _rank(drawn)[:2] == (True, True):
         return "uncomment if these are drawn from the battery; currents of motor phases are larger"
     return ""

@@ -60,7 +60,14 @@ _LARGEST_GAP_NS = 14 * 3_600_000_000_000
 """Largest difference of local time from UTC [ns]."""
 _MIN_FAST_SHARE = 0.9
 _TRIAL_NS = 60_000_000_000
-_CONTRADICTIONS = {"unit-suspected", "distance-contradicted", "drives-backwards", "path-unlike", "misleads-track"}
+_SCALE_TOLERANCE = 0.03
+_CONTRADICTIONS = (
+    "unit-suspected",
+    "distance-contradicted",
+    "drives-backwards",
+    "path-unlike",
+    "gnss-contradicts-odometry",
+)
 """Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
 _HINTS = {
     "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
@@ -408,11 +415,21 @@ def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedL
     for finding in findings:
         role, why = finding.subject.name, f"in the first minute: {describe_finding(finding)}"
         if finding.code == "imu-units":
-            for remedy in finding.remedies:
-                added = propose_lines(remedy.recipe, {}, "")
-                more += [replace(line, note=why) for line in added]
-        elif finding.code in _CONTRADICTIONS and role in ("imu", "wheel_odometry"):
-            reasons[role] = why
+            added = (line for remedy in finding.remedies for line in propose_lines(remedy.recipe, {}, ""))
+            more += [replace(line, note=why) for line in added]
+        elif finding.code == "odometry-scale" and role == "wheel_odometry":
+            scale = finding.numbers["scale"]
+            unit = next(
+                (unit for unit, mps in UNITS["m/s"].items() if abs(scale * mps - 1.0) < _SCALE_TOLERANCE), "m/s"
+            )
+            line = ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)
+            more += [line] if unit != "m/s" and not any(line.key == other.key for other in lines) else []
+        elif finding.code in _CONTRADICTIONS and (of := finding.names.get("suspect", role)) in (
+            "imu",
+            "wheel_odometry",
+        ):
+            reasons[of] = why
+    more = [line for line in more if line.table.removeprefix("tables.") not in reasons]
     return [
         replace(line, is_certain=False, note=reasons[name] if line.key == "file" else line.note)
         if (name := line.table.removeprefix("tables.")) in reasons

@@ -132,13 +132,26 @@ def _judge_fixes(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[d
 
 
 def _judge_imu(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dict[str, str], str]:
-    """Judge by gravity: the median of each axis is what a robot that drives about feels."""
-    acceleration = [name for name in found if name.startswith("linear")]
-    felt = float(np.sqrt(sum(np.median(values[name]) ** 2 if values[name].size else 0.0 for name in acceleration)))
-    if abs(felt - 1.0) < 0.1:
-        return found | {name: f"{found[name]} * {_GRAVITY_MPS2}" for name in acceleration}, ""
-    near = abs(felt - _GRAVITY_MPS2) < 1.0
-    return found, "" if near else f"the acceleration at rest is {felt:.3g}, not 9.81 m/s²: check axes and units"
+    """Judge accelerations by gravity, the median of each axis; beside accelerations in g, fast turn rates are in deg/s."""
+
+    def measure(begin: str) -> float:
+        axes = [np.median(np.abs(of)) for name, of in values.items() if name.startswith(begin) and of.size]
+        return float(np.linalg.norm(axes))
+
+    force = measure("linear")
+    if abs(force - 1.0) < 0.1:
+        turn = np.pi / 180.0 if measure("angular_velocity") > _FASTEST_MEDIAN_RADPS else 1.0
+        factors = {"linear_acceleration": _GRAVITY_MPS2, "angular_velocity": turn}
+        scaled = {name: (text, factors.get(name[:-2], 1.0)) for name, text in found.items()}
+        return {
+            name: text if factor == 1.0 else f"{text} * {factor:.9g}" for name, (text, factor) in scaled.items()
+        }, ""
+    near = abs(force - _GRAVITY_MPS2) < 1.0
+    return found, "" if near else f"the acceleration at rest is {force:.3g}, not 9.81 m/s²: check axes and units"
+
+
+_FASTEST_MEDIAN_RADPS = 0.3
+"""No robot turns at half of the time as fast as this."""
 
 
 @dataclass(frozen=True, slots=True)

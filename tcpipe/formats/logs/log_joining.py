@@ -22,7 +22,7 @@ from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
 from tcpipe.formats.logs.log_names import AUTOPILOT_SUFFIXES, find_reader, is_log_file
 from tcpipe.formats.logs.message_tables import TableLog, open_registered_log
 from tcpipe.formats.logs.rosbag2 import is_one_bag
-from tcpipe.formats.logs.table_folders import Mappings, find_table_run
+from tcpipe.formats.logs.table_folders import Mappings, find_table_run, is_table
 from tcpipe.formats.object_storage import format_path, is_url, lay_out_objects
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -167,6 +167,11 @@ def open_single_log(
             from tcpipe.formats.logs.table_log import open_tables  # noqa: PLC0415  polars only where a table is read
 
             return open_tables(run.folder, run.mappings, run.files) if run else open_tables(path, tables)
+        if path.is_file() and is_table(path.name):
+            files = ", ".join(dict.fromkeys(mapping.file for mapping in tables.values()))
+            raise LogError(
+                f"{path}: the recipe's tables are called {files}; write a * for the part of a name that differs by run"
+            )
     return open_log(path, message_definitions=message_definitions)
 
 

@@ -80,7 +80,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
         if isinstance(fields, list) or problems:
             return problems
         of_stamps = (stamp, mapping.stamp_utc, mapping.stamp_date)
-        cells, values = read_values(path, [column for column in of_stamps if column in names], fields)
+        cells, values = read_values(path, [column for column in of_stamps if column and column in names], fields)
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [

@@ -1,10 +1,13 @@
 """What the tables of a folder propose: names and values decide together, and what they leave open is a comment."""
 
 import numpy as np
+import polars as pl
 import pytest
+from table_loggers import Drive, write_spanish
 
 from tcpipe.errors import LogError, UsageError
 from tcpipe.formats.logs.log_joining import open_single_log
+from tcpipe.formats.logs.table_folders import find_table_logs
 from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
 from tcpipe.pipeline.proposals import propose_recipe
 
@@ -227,3 +230,74 @@ def test_one_table_of_odd_names_is_fixes_wheels_and_power(tmp_path):
     assert read["/gnss"]["altitude"][0].as_py() == pytest.approx(3.048)
     assert read["/wheel_odometry"]["twist.twist.linear.x"][0].as_py() == pytest.approx(1.85 / 3.6)
     assert read["/wheel_odometry"]["twist.twist.angular.z"][0].as_py() == pytest.approx(0.1 / 3.6 / 0.5)
+
+
+def test_what_is_not_recognised_is_named_under_its_role_with_three_values(tmp_path):
+    table = {"millis": 1000 + 100 * np.arange(ROWS), "lat": 47.0 + 1e-6 * SECONDS, "lon": 15.0}
+    table |= {"ax[g]": 0.0, "ay[g]": 0.1, "az[g]": 1.0, "rot__pitch": SECONDS, "rot__yaw": 0.2}
+    write(tmp_path / "log.csv", **table)
+    values, _, text = proposed(tmp_path / "log.csv")
+    assert set(values["tables"]) == {"gnss"}
+    (imu,) = (line for line in text.splitlines() if "imu is not recognised" in line)
+    for word in ("ax[g] (0, 0, 0)", "az[g] (1, 1, 1)", "rot pitch (0, 0.1, 0.2)", "rot yaw"):
+        assert word in imu
+    assert '# columns.linear_acceleration_x = "ax[g]"' in text
+    assert '# columns.angular_velocity_x = "column?"' in text
+
+
+def test_a_gyroscope_is_no_wheel(tmp_path):
+    write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES)
+    axes = {f"angular_velocity_{axis}": 0.01 + SECONDS for axis in "xyz"}
+    write(
+        tmp_path / "imu.csv",
+        time=SECONDS + UTC_S,
+        **axes,
+        **dict(zip(("ax", "ay", "az"), (0.1, 0.2, 9.8), strict=True)),
+    )
+    write(tmp_path / "gyro.csv", time=SECONDS + UTC_S, **axes)
+    assert set(proposed(tmp_path)[0]["tables"]) == {"gnss", "imu"}
+
+
+@pytest.mark.parametrize(
+    "drives", [("drive1",), ("drive1", "drive2"), ("north", "south"), ("2025-07-09_14-03-12", "2025-07-10_09-00-00")]
+)
+def test_files_of_one_drive_share_the_first_part_of_their_names(tmp_path, drives):
+    for number, drive in enumerate(drives):
+        start_s = UTC_S + 1e5 * number
+        write(tmp_path / f"{drive}_gps.csv", time=SECONDS + start_s, **FIXES)
+        write(tmp_path / f"{drive}_imu.csv", time=SECONDS + start_s, **INERTIAL)
+        write(tmp_path / f"{drive}_power.csv", time=SECONDS + start_s, voltage=24.0 + SECONDS, current=2.0 + SECONDS)
+    values, recipe, text = proposed(tmp_path)
+    names = {name: of["file"].partition("*")[2] for name, of in values["tables"].items()}
+    assert {name: file.partition("_")[2].rpartition("_")[2] or file for name, file in names.items()} == {
+        "gnss": "gps.csv",
+        "imu": "imu.csv",
+        "power": "power.csv",
+    }
+    assert "no time in common" not in text
+    assert len(find_table_logs(tmp_path, recipe.tables)) == len(drives)
+    log = open_single_log(tmp_path / f"{drives[0]}_imu.csv", tables=recipe.tables)
+    assert set(log.topics) == {"/gnss", "/imu", "/power"}
+
+
+@pytest.mark.parametrize("is_noise", [False, True])
+def test_the_first_minute_shows_a_unit_or_contradicts_a_table(tmp_path, is_noise):
+    write_spanish(Drive(), tmp_path)
+    table = pl.read_parquet(tmp_path / "viaje.parquet")
+    noise = 3.0 * np.abs(np.sin(np.arange(len(table)) / 40.0))
+    wheels = pl.Series(noise) if is_noise else pl.col("velocidad_rueda") * 3.6
+    table.with_columns(velocidad_rueda=wheels).write_parquet(tmp_path / "viaje.parquet")
+    values, _, text = proposed(tmp_path)
+    if is_noise:
+        assert set(values["tables"]) == {"gnss", "imu", "power"}
+        assert "in the first minute: gnss: contradicts the other sensors" in text
+    else:
+        assert values["tables"]["wheel_odometry"]["units"] == {"linear_x": "km/h"}
+        assert "in the first minute: wheel_odometry: scale 3.59" in text
+
+
+def test_what_ingest_would_reject_is_a_comment(tmp_path):
+    write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES)
+    write(tmp_path / "power.csv", time=SECONDS + UTC_S, **{"voltage__[%]": 24.0 + SECONDS, "current": 2.0 + SECONDS})
+    values, _, _ = proposed(tmp_path)
+    open_single_log(tmp_path, tables=parse_recipe(values, where="as written").tables)
