@@ -104,16 +104,18 @@ def format_local(t: np.ndarray, form: str) -> list[str]:
     return stamps.dt.strftime(form).to_list()
 
 
-def write_text(path: Path, columns: Mapping[str, object], *, separator: str = ",", comma: bool = False) -> None:
+def write_text(
+    path: Path, columns: Mapping[str, object], *, separator: str = ",", comma: bool = False, encoding: str = "utf-8"
+) -> None:
     """Write a table as text, numbers with up to 9 decimals."""
     path.parent.mkdir(parents=True, exist_ok=True)
     frame = pl.DataFrame({name: list(values) for name, values in columns.items()})
     text = frame.write_csv(separator=separator, decimal_comma=comma, float_precision=9)
-    path.write_text(text.replace(';""\n', ";\n"), encoding="utf-8")
+    path.write_text(text.replace(';""\n', ";\n"), encoding=encoding)
 
 
 def write_german(drive: Drive, folder: Path) -> None:
-    """One wide table with date and time of day apart, decimal commas, repeated fixes, km/h and mA."""
+    """Write one wide table, encoded as spreadsheets do, with date and time of day apart, decimal commas, repeated fixes, km/h and mA."""
     rows = drive.sample(20)
     columns = {
         "Datum": format_local(rows["t"], "%d.%m.%Y"),
@@ -126,11 +128,11 @@ def write_german(drive: Drive, folder: Path) -> None:
         "Ubat [V]": rows["volt"],
         "Ibat [mA]": 1000 * rows["amp"],
     }
-    write_text(folder / "Messfahrt.csv", columns, separator=";", comma=True)
+    write_text(folder / "Messfahrt.csv", columns, separator=";", comma=True, encoding="cp1252")
 
 
 def write_microcontroller(drive: Drive, folder: Path) -> None:
-    """One table on a counter since power-on beside whole seconds of GNSS time; g, deg/s, revolutions per minute and mA."""
+    """Write one table on a counter since power-on beside whole seconds of GNSS time; g, deg/s, revolutions per minute and mA."""
     rows = drive.sample(50)
     utc = (START_NS + np.round(rows["t"] * 1e9).astype(np.int64)) // 10**9
     per_minute = 30 / np.pi / WHEEL_RADIUS_M
@@ -157,7 +159,7 @@ VESC_ZEROS = (
 
 
 def write_vesc_tool(drive: Drive, folder: Path) -> None:
-    """A table as VESC Tool logs it: milliseconds of the local day, the date in the file's name, g and deg/s without saying so."""
+    """Write a table as VESC Tool logs it: milliseconds of the local day, the date in the file's name, g and deg/s without saying so."""
     rows = drive.sample(20)
     midnight_s = START.hour * 3600 + START.minute * 60 + START.second + START.microsecond * 1e-6
     zeros = np.zeros(rows["t"].size)
@@ -195,7 +197,7 @@ def write_vesc_tool(drive: Drive, folder: Path) -> None:
 
 
 def write_french(drive: Drive, folder: Path) -> None:
-    """Four tables of one drive with suffixes of their own, and local times as ISO texts without a zone."""
+    """Write four tables of one drive with suffixes of their own, and local times as ISO texts without a zone."""
     fast, slow = drive.sample(50), drive.sample(20)
     fixes = {name: values[slow["is_fix"]] for name, values in slow.items()}
     stamps = {
@@ -214,7 +216,7 @@ def write_french(drive: Drive, folder: Path) -> None:
 
 
 def write_spanish(drive: Drive, folder: Path) -> None:
-    """A Parquet table with times in milliseconds since 1970 and a table of the IMU with tcpipe's own names."""
+    """Write a Parquet table with times in milliseconds since 1970 and a table of the IMU with tcpipe's own names."""
     rows, fast = drive.sample(20), drive.sample(50)
     columns = {
         "tiempo": START_NS // 10**6 + np.round(1000 * rows["t"]).astype(np.int64),

@@ -24,6 +24,7 @@ from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_remote_logs
 from tcpipe.pipeline.named_runs import find_named_runs, is_path
+from tcpipe.pipeline.proposals import propose_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, is_store
 from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
@@ -170,8 +171,6 @@ def _inspect_logs_or_tables(
             return _inspect_logs_at(logs, path, ask)
     elif of_tables or not is_table(path.name):
         return ask(path)
-    from tcpipe.pipeline.table_proposals import propose_tables  # noqa: PLC0415  polars only where a table is read
-
     return InspectedTables(path=str(path), recipe=propose_tables(path).toml())
 
 

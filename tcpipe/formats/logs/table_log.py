@@ -274,6 +274,10 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
     )
     names = None if any(map(_is_name, first)) else _find_column_names(comments, len(first), spaced=separator == b" ")
     source: Path | BytesIO = path
+    try:
+        lines[0].decode()
+    except UnicodeDecodeError:  # as spreadsheets write it
+        source = BytesIO(path.read_bytes().decode("cp1252", errors="replace").encode())
     if separator == b" ":  # several of them are one
         text = _SPACES.sub(b" ", _DAY_AND_TIME.sub(rb"\1-\2-\3T", path.read_bytes().replace(b"\r", b"")))
         source = BytesIO(_EDGES.sub(b"", text))

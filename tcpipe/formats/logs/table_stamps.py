@@ -37,6 +37,8 @@ _DAY_NS = 86_400_000_000_000
 _SAMPLE_ROWS = 1000
 _SLOWEST_STEP_S = 6.0
 """Ten rows in a minute: the unit of a counter is the coarsest with shorter steps."""
+_MIN_FAST_SHARE = 0.9
+_PREFERRED = ("counter", "day", "local", "utc")
 _MAX_TIE_SPREAD_NS, _MAX_STRAY_SHARE = 2_000_000_000, 0.05
 _COARSEST = tuple(reversed(STAMP_UNITS.items()))
 Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
@@ -60,6 +62,18 @@ class Clock:
     unit: str = ""
     is_guessed: bool = False
     sample: str = ""
+
+    def count_stamps(self) -> int:
+        """Return the number of different stamps."""
+        return len(np.unique(self.ns[self.known]))
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenClock:
+    """The stamps that suit a table best, and by key of the recipe what states them: value, note, and whether it is certain."""
+
+    clock: Clock
+    keys: Mapping[str, tuple[str, str, bool]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,3 +259,39 @@ def _tie_to_utc(stamps: Stamps, utc: Stamps) -> Stamps | str:
     share = float(np.mean(np.abs(apart - offset) > _MAX_TIE_SPREAD_NS))
     notes = (f"{share:.0%} of its UTC stamps are 2 s or more from the others",) if share > _MAX_STRAY_SHARE else ()
     return Stamps(np.where(stamps.known, stamps.ns + offset, 0), stamps.known, (*utc.notes, *notes))
+
+
+def choose_clock(columns: Mapping[str, pl.Series]) -> ChosenClock | None:
+    """Return the clock among columns that may be stamps, None without one.
+
+    It is the finest: rows of a wide table share a coarse time, as whole seconds of GNSS. Of equally fine ones, dates go before counters,
+    numbers before texts, which are often cut to seconds.
+    """
+    found = dict[str, tuple[Clock, dict[str, tuple[str, str, bool]]]]()
+    date_name = next((name for name in columns if re.fullmatch("(.*_)?date", simplify_name(name))), "")
+    for name, column in columns.items():
+        clock, keys = read_clock(column), {"stamp": (name, "", True)}
+        if isinstance(clock, str) and "stamp_format" in clock:
+            keys["stamp_format"] = DAY_FIRST, clock, False
+            clock = read_clock(column, form=DAY_FIRST)
+        elif isinstance(clock, Clock) and clock.kind == "day" and clock.sample and date_name not in ("", name):
+            joined = read_clock((columns[date_name] + " " + column).alias(name))
+            if isinstance(joined, Clock):
+                clock, keys["stamp_date"] = joined, (date_name, "", True)
+        if isinstance(clock, Clock) and np.count_nonzero(clock.known) > 1:
+            found[name] = clock, {**keys, "stamp": (name, clock.sample, True)}
+    if not found:
+        return None
+    rows = {name: clock.count_stamps() for name, (clock, _) in found.items()}
+    fast = [name for name in found if rows[name] >= _MIN_FAST_SHARE * max(rows.values())]
+    clock, keys = found[max(fast, key=lambda name: (_PREFERRED.index(found[name][0].kind), not found[name][0].sample))]
+    utc = next((name for name, (other, _) in found.items() if other.kind == "utc"), "")
+    if clock.is_guessed or (clock.kind == "day" and not clock.sample):
+        keys["stamp_unit"] = ("ms_today", "", True) if clock.kind == "day" else (clock.unit, "by its steps", True)
+    if clock.kind != "utc" and utc:
+        keys["stamp_utc"] = utc, "coarser, but UTC", True
+        apart = (found[utc][0].ns - clock.ns)[clock.known & found[utc][0].known]
+        clock = replace(clock, kind="utc", ns=clock.ns + int(np.median(apart)))
+    elif clock.kind in ("local", "day"):
+        keys["stamp_zone"] = "UTC", 'or as "Europe/Vienna": the zone of times without one, of all tables', False
+    return ChosenClock(clock, keys)
