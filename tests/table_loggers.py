@@ -245,11 +245,7 @@ class Logger:
 
 LOGGERS = {
     "german": Logger(write_german, "Messfahrt.csv", {"stamp_zone": '"Europe/Vienna"'}),
-    "microcontroller": Logger(
-        write_microcontroller,
-        "log7.csv",
-        {"columns.linear_x": '"(rpm_L + rpm_R) / 2 * 0.104719755 * 0.165"'},
-    ),
+    "microcontroller": Logger(write_microcontroller, "log7.csv", {}),
     "vesc_tool": Logger(write_vesc_tool, "2025-07-09_14-03-12.csv", {"stamp_zone": '"Europe/Vienna"'}),
     "french": Logger(write_french, ".", {"stamp_zone": '"Europe/Vienna"'}),
     "spanish": Logger(write_spanish, ".", {}),

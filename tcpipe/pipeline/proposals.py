@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import tomllib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -138,10 +138,7 @@ def propose_decisions(
         yield ProposedLine("mask", "keep_reversing", True, note, is_certain=False)
 
 
-def propose_quality(table: str, key: str, source: str) -> ProposedLine:
-    """Return the line of a fix quality whose codes no name states."""
-    note = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_common or words"
-    return ProposedLine(table, key, source, note, is_certain=False)
+_CODES_NOTE = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_common or words"
 
 
 def propose_recipe(
@@ -215,7 +212,9 @@ def propose_for_log(
             lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
         if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
             fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
-            lines += [propose_quality("read.fields", "gnss.quality", field) for field in fields]
+            lines += [
+                ProposedLine("read.fields", "gnss.quality", field, _CODES_NOTE, is_certain=False) for field in fields
+            ]
     unplaced = [
         (role, frames[role])
         for role, (_, by) in places.items()
@@ -273,19 +272,19 @@ _TO_NAME = "column?"
 _STAMP = re.compile(
     r".*time(stamp|string)?(_(utc|local))?|(.*_)?(t|stamp|gpst|utc|date|epoch|millis|micros|ms_today|ms_of_day)|ms|us"
 )
-_RUN_TEXT = (r"\d+(?=\D*$)", r"\d([\d_.:T-]*\d)?", r"^[^_. -]+(?=[_ -])")
+_RUN_TEXT = (r"\d+(?=\D*$)", r"\d(?:[\d_.:T-]*\d)?", r"^[^_. -]+(?=[_ -])")
 """Parts of a file's name that differ between runs: the last number, date and time, the first word."""
-_LARGEST_GAP_NS = 14 * 3_600_000_000_000
+_LARGEST_ZONE_NS = 14 * 3_600_000_000_000
 """Largest difference of local time from UTC [ns]."""
 _TRIAL_NS = 60_000_000_000
 _SCALE_TOLERANCE = 0.03
-_CONTRADICTIONS = (
+_CONTRADICTIONS = [
     "unit-suspected",
     "distance-contradicted",
     "drives-backwards",
     "path-unlike",
     "gnss-contradicts-odometry",
-)
+]
 """Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
 _HINTS = {
     "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
@@ -305,22 +304,23 @@ class _Table:
     names: Sequence[str]
     numbers: Mapping[str, Floats]
     clock: Clock
+    rows: int
+    """Number of different stamps."""
     stamp_lines: Mapping[str, _Value]
+    words: Mapping[str, str]
+    """First text of columns of texts."""
     duplicates: Mapping[str, str]
     """Remark on each column whose name the header has several times."""
 
     def overlap_ns(self, other: _Table) -> int:
         """Return the time that two tables have in common; local time and UTC differ by an unknown zone."""
-        (start, end), (first, last) = (
-            (int(known.min()), int(known.max()))
-            for known in (table.clock.ns[table.clock.known] for table in (self, other))
-        )
+        spans = [table.clock.ns[table.clock.known] for table in (self, other)]
+        start_ns, end_ns = max(int(span.min()) for span in spans), min(int(span.max()) for span in spans)
         kinds = {self.clock.kind, other.clock.kind}
         if len(kinds) > 1 and "counter" in kinds:
             return 0
-        if len(kinds) > 1 and ("day" in kinds or abs(start - first) < _LARGEST_GAP_NS):
-            return min(end - start, last - first)
-        return max(min(end, last) - max(start, first), 0)
+        is_unknown = len(kinds) > 1 and ("day" in kinds or start_ns - end_ns < _LARGEST_ZONE_NS)
+        return min(int(np.ptp(span)) for span in spans) if is_unknown else max(end_ns - start_ns, 0)
 
 
 def propose_tables(path: Path) -> ProposedRecipe:
@@ -338,45 +338,42 @@ def propose_tables(path: Path) -> ProposedRecipe:
             columns[file] = read_column_names(file)
         except LogError as error:
             head.append(str(error))
-    roles: dict[str, list[tuple[_Table, list[ProposedLine]]]] = {}
-    tables = list[_Table]()
+    tables, roles = list[_Table](), defaultdict[str, list[tuple[_Table, list[ProposedLine]]]](list)
     for name, example in _group_files(folder, columns).items():
-        table = _read_table(name, example, columns[example])
-        found = [(role, (table, lines)) for role, lines in _iterate_roles(table)] if table else []
-        for role, candidate in found:
-            roles.setdefault(role, []).append(candidate)
-        tables += [table] if table else []
-        unused = "" if found else ", not used: no known fields" if table else ", not used: no stamps"
+        table, unused = _read_table(name, example, columns[example]), ", not used: no stamps"
+        if table is not None:
+            tables.append(table)
+            found = [*_iterate_roles(table)]
+            unused = "" if found else ", not used: no known fields"
+            for role, mine in found:
+                roles[role].append((table, mine))
         head.append(f"{name}{unused}; columns {', '.join(columns[example])}")
-    ranked = [
-        max(candidates, key=lambda candidate: candidate[0].clock.count_stamps())[0] for candidates in roles.values()
-    ]
-    lines, log, used = list[ProposedLine](), path, set[str]()
-    for role, candidates in roles.items():
-        candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(ranked[0]), -candidate[0].clock.count_stamps()))
-        table, mine = candidates[0]
-        apart = (
-            "" if table.overlap_ns(ranked[0]) else "no time in common with the others: another clock, or another drive"
-        )
-        lines += [replace(line, note=f"{line.note}: {apart}", is_certain=False) for line in mine] if apart else mine
-        used |= {line.value for line in mine if isinstance(line.value, str)}
-        log = table.path if "*" in table.file else log
-        head += [
-            f"{other.file}, {other.clock.count_stamps()} rows, could be {role} as well" for other, _ in candidates[1:]
-        ]
-    with_voltage = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
-    lines = [line for line in lines if line.note != NO_VOLTAGE or make_rail_name(line.table) not in with_voltage]
-    if not lines:
+    if not roles:
         what = f"{path}: it contains no log, and no table with stamps and columns of known names"
         raise UsageError(what, *filter(None, head))
+    reference = max(next(iter(roles.values())), key=lambda candidate: candidate[0].rows)[0]
+    lines, log, used = list[ProposedLine](), path, set[str]()
+    for role, candidates in roles.items():
+        candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(reference), -candidate[0].rows))
+        table, mine = candidates[0]
+        if not table.overlap_ns(reference):
+            apart = "no time in common with the others: another clock, or another drive"
+            mine = [replace(line, note=f"{line.note}: {apart}", is_certain=False) for line in mine]
+        lines += mine
+        used |= {line.value for line in mine if isinstance(line.value, str)}
+        log = table.path if "*" in table.file else log
+        head += [f"{other.file}, {other.rows} rows, could be {role} as well" for other, _ in candidates[1:]]
+    with_voltage = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
     zones = [line for line in lines if line.key == "stamp_zone"]
-    lines = [line for line in lines if line not in zones[1:]]
+    lines = [
+        line
+        for line in lines
+        if line not in zones[1:] and (line.note != NO_VOLTAGE or make_rail_name(line.table) not in with_voltage)
+    ]
     lines, tried = _try_lines(lines, log)
-    named = {line.value for line in lines if line.key == "role"} | {
-        line.table.removeprefix("tables.") for line in lines
-    }
     for role in ("gnss", "imu", "wheel_odometry", "power"):
-        lines += [] if role in named else _propose_rest(role, tables, " ".join(used))
+        is_found = role in roles or (role == "power" and any(line.value == "power" for line in lines))
+        lines += [] if is_found else _propose_rest(role, tables, " ".join(used))
     lines += [*tried, *propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)]
     return ProposedRecipe(head, lines, format_path(log))
 
@@ -388,29 +385,22 @@ def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[st
     all sensors; else the numbers may be those of motors.
     """
     names = {file: file.relative_to(folder).as_posix() for file in columns}
-    for pattern in _RUN_TEXT:
-        groups: dict[str, dict[str, Path]] = defaultdict(dict)
-        for file in columns:
-            starred = re.sub(pattern, "*", file.name, count=1)
-            text = re.search(pattern, file.name)
-            groups[starred][text[0] if text else ""] = file
-        alike = all(
-            len(runs) > 1 and len({tuple(columns[file]) for file in runs.values()}) == 1 for runs in groups.values()
-        )
-        if groups and alike and (len(groups) > 1 or match_field_names("gnss", next(iter(columns.values())))):
-            sizes: dict[str, int] = defaultdict(int)
-            for runs in groups.values():
-                for text_of_run, file in runs.items():
-                    sizes[text_of_run] += file.stat().st_size
-            best = max(sizes, key=lambda text_of_run: sizes[text_of_run])
-            return {starred: runs.get(best) or next(iter(runs.values())) for starred, runs in groups.items()}
-    first = min(names.values())
-    ends = [end.end() for end in re.finditer(r"\d(?=[_ -])", first)] if len(names) > 1 else []
-    common = next(
-        (end for end in reversed(ends) if all(name.startswith(first[: end + 1]) for name in names.values())), 0
-    )
     if len(names) == 1:  # the next log of this recorder has another number
         return {re.sub(_RUN_TEXT[1], "*", name, count=1): file for file, name in names.items()}
+    for pattern in _RUN_TEXT:
+        groups, sizes = defaultdict[str, dict[str, Path]](dict), Counter[str]()
+        for file in columns:
+            run = "".join(re.findall(pattern, file.name)[:1])
+            groups[re.sub(pattern, "*", file.name, count=1)][run] = file
+            sizes[run] += file.stat().st_size
+        kinds = [{tuple(columns[file]) for file in runs.values()} for runs in groups.values()]
+        is_alike = all(len(runs) > 1 and len(kind) == 1 for runs, kind in zip(groups.values(), kinds, strict=True))
+        if is_alike and (len(groups) > 1 or match_field_names("gnss", next(iter(columns.values()), ()))):
+            best = max(sizes, key=lambda run: sizes[run])
+            return {name: runs.get(best, next(iter(runs.values()))) for name, runs in groups.items()}
+    first = min(names.values(), default="")
+    ends = [0, *(end.end() for end in re.finditer(r"\d(?=[_ -])", first))]
+    common = max(end for end in ends if not end or all(name.startswith(first[: end + 1]) for name in names.values()))
     return {f"*{name[common:]}" if common else name: file for file, name in names.items()}
 
 
@@ -420,22 +410,19 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     from tcpipe.formats.logs.table_stamps import choose_clock  # noqa: PLC0415
 
     named = [name for name in names if _STAMP.fullmatch(simplify_name(name))]
-    candidates = named or ([] if _is_measured(names[0], names) else list(names[:1]))
+    is_measured = bool(match_power_fields(names[:1]) or find_quantity(names[0])) or any(
+        names[0] in columns.values() for columns, _ in match_table_roles(file, names).values()
+    )
+    candidates = named or ([] if is_measured else names[:1])
     chosen = choose_clock(read_cells(path, stamps=candidates, columns=[]).stamps) if candidates else None
     if chosen is None:
         return None
     notes = {name: note for name in names if (note := describe_duplicate(name, names))}
-    return _Table(file, path, names, read_numbers(path, names), chosen.clock, chosen.keys, notes)
-
-
-def _is_measured(name: str, names: Sequence[str]) -> bool:
-    """Return whether a column is what some role measures, by its name, and so cannot be stamps."""
-    is_power = match_power_fields([name]) is not None or find_quantity(name) is not None
-    return is_power or any(
-        name in found.values()
-        for role in ("gnss", "imu", "wheel_odometry", "pose")
-        if (found := match_field_names(role, names))
-    )
+    numbers = read_numbers(path, names)
+    quality = [source.partition(": ")[2] for source in find_quality([name for name in names if name not in numbers])]
+    texts = read_cells(path, stamps=[], columns=[], words=quality).columns if quality else {}
+    words = {name: str(values[0]) for name, values in texts.items()}
+    return _Table(file, path, names, numbers, chosen.clock, chosen.clock.count_stamps(), chosen.keys, words, notes)
 
 
 def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
@@ -476,11 +463,14 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     keys |= {"file": (table.file, doubt, True), **table.stamp_lines}
     for field, text in mapped.items():
         sample = "" if field == "quality" else format_first(values[field])
-        measured = next((note for mark, note in _TO_STATE.items() if text.endswith(mark)), "")
-        keys[f"columns.{field}"] = (text, measured or sample, not measured)
+        is_assumed = text.endswith(_OVER_TRACK)
+        keys[f"columns.{field}"] = (text, _TRACK_NOTE if is_assumed else sample, not is_assumed)
     keys |= {f"units.{field}": (units[field], "", keys[f"columns.{field}"][2]) for field in mapped if field in units}
     if role == "gnss" and "quality" not in mapped:
-        keys |= {f"columns.{key}": value for key, value in _propose_quality(table)}
+        for source in find_quality(table.names):
+            column = source.partition(": ")[2]
+            words = (f"words: {column}", table.words.get(column, ""), True)
+            keys["columns.quality"] = words if column in table.words else (source, _CODES_NOTE, False)
     if role == "power" and set(mapped) == {"current"}:
         keys |= {key: (volt, NO_VOLTAGE, False) for key, volt in NOMINAL.items()}
     return [
@@ -488,22 +478,9 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     ]
 
 
-_TO_STATE = {"/ 0.5": "state the track width in place of 0.5 m", "* 0.1": "state the wheels' radius in place of 0.1 m"}
-"""By the end of an expression what it assumes."""
-
-
-def _propose_quality(table: _Table) -> Iterator[tuple[str, _Value]]:
-    """Yield the column of a fix quality: texts are words, what numbers mean is for a person to decide."""
-    for source in find_quality(table.names):
-        column = source.partition(": ")[2]
-        if column in table.numbers:
-            line = propose_quality("", "quality", source)
-            yield "quality", (line.value, line.note, False)
-        else:
-            from tcpipe.formats.logs.table_log import read_cells  # noqa: PLC0415  as above
-
-            values = read_cells(table.path, stamps=[], columns=[], words=[column]).columns[column]
-            yield "quality", (f"words: {column}", str(values[0]), True)
+_OVER_TRACK, _TRACK_NOTE = "/ 0.5", "state the track width in place of 0.5 m"
+_TIMES_RADIUS = " * 0.1"
+"""End of a speed by revolutions, for wheels with a radius of 0.1 m."""
 
 
 def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[dict[str, Floats], dict[str, str]]:
@@ -514,16 +491,14 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[
     found, units = dict[str, Floats](), dict[str, str]()
     for field, text in columns.items():
         unit, expression = MAPPED[role][field].unit, parse_expression(text.rpartition(": ")[2], table.names)
-        if expression.column is None and (other := find_other_unit(expression, unit)):
-            units[field] = other if other in UNITS[unit] else unit
-        read = read_fields(
-            "", role, {field: text}, {name: of for name, of in units.items() if name == field}, table.names
-        )
+        other = None if expression.column else find_other_unit(expression, unit)
+        units |= {field: other if other in UNITS[unit] else unit} if other else {}
+        stated = {field: units[field]} if field in units else {}
+        read = read_fields("", role, {field: text}, stated, table.names)
         if field == "quality":
             found[field] = np.zeros(1)
-        elif isinstance(read, dict) and all(name in table.numbers for name, _ in expression.operands()):
-            rows = len(table.clock.known)
-            found[field] = read[field].evaluate(lambda name, _: table.numbers[name], rows)
+        elif isinstance(read, dict) and {name for name, _ in expression.operands()} <= table.numbers.keys():
+            found[field] = read[field].evaluate(lambda name, _: table.numbers[name], len(table.clock.known))
     return found, units
 
 
@@ -533,11 +508,9 @@ _IMPOSSIBLE = "impossible"
 def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats]) -> str:
     """Return what the values leave unclear, and correct ``mapped`` by the factors that they show."""
     if role in ("gnss", "imu"):
-        judged, doubt = judge_fields(role, mapped, values)
-        factors = {field: text.removeprefix(mapped[field]) for field, text in judged.items()}
-        held = {
-            field: f"{quote(mapped[field])}{factor}" if factor else mapped[field] for field, factor in factors.items()
-        }
+        judged, doubt = judge_fields(role, {field: quote(text) for field, text in mapped.items()}, values)
+        scaled = {field: text for field, text in judged.items() if text != quote(mapped[field])}
+        held = {field: scaled.get(field, text) for field, text in mapped.items() if field in judged}
         mapped.clear()
         mapped.update(held)
         return doubt
@@ -553,77 +526,80 @@ def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats])
 
 def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[ProposedLine]:
     """Yield the table of a role that is not found as comments, with what its columns could be and three values of each."""
+    units = {unit for field in MAPPED[role].values() if field.unit not in ("1", "m") for unit in UNITS[field.unit]}
+    needed = [field for field, known in MAPPED[role].items() if known.needed] or ["voltage", "current"]
     for table in tables:
-        free = [name for name in table.numbers if name not in used and name != table.stamp_lines["stamp"][0]]
-        units = {field.unit for field in MAPPED[role].values()} - {"1", "m"}
+        stamp = table.stamp_lines["stamp"][0]
+        free = [name for name in table.numbers if name not in used and name != stamp]
         likely = [
-            name
-            for name in free
-            if re.fullmatch(_HINTS[role], simplify_name(name))
-            or any(split_unit(name)[1] in UNITS[unit] for unit in units)
+            name for name in free if re.fullmatch(_HINTS[role], simplify_name(name)) or split_unit(name)[1] in units
         ]
-        if not likely:
-            continue
-        known = match_known_fields(role, free)
-        samples = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in likely)
-        pick = ", ".join(f"{name} ({sample})" for name, sample in zip(likely, samples, strict=True))
-        needed = [field for field, of in MAPPED[role].items() if of.needed] or ["voltage", "current"]
-        keys: dict[str, TomlValue] = {"file": table.file, "stamp": table.stamp_lines["stamp"][0]}
-        keys |= {f"columns.{field}": known.get(field, _TO_NAME) for field in dict.fromkeys([*needed, *known])}
-        for key, value in keys.items():
-            note = f"{role} is not recognised: pick from {pick}" if key == "file" else ""
-            yield ProposedLine(f"tables.{role}", key, value, note, is_certain=False)
-        return
+        if likely:
+            values = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in likely)
+            pick = ", ".join(f"{name} ({three})" for name, three in zip(likely, values, strict=True))
+            known = match_known_fields(role, free)
+            keys = {f"columns.{field}": known.get(field, _TO_NAME) for field in dict.fromkeys([*needed, *known])}
+            for key, value in {"file": table.file, "stamp": stamp, **keys}.items():
+                note = f"{role} is not recognised: pick from {pick}" if key == "file" else ""
+                yield ProposedLine(f"tables.{role}", key, value, note, is_certain=False)
+            return
 
 
 def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedLine], list[ProposedLine]]:
-    """Return the lines with those as comments that contradict others in the first minute, and lines that the trial adds."""
-    recipe_of = [line for line in lines if line.is_certain or line.key in ("stamp_zone", "stamp_format")]
-    values = tomllib.loads(ProposedRecipe([], [replace(line, is_certain=True) for line in recipe_of], "").toml())
-    if not any(line.is_certain for line in lines):
-        return [*lines], []
-    tables = {name: table for name, table in values["tables"].items() if "columns" in table}
+    """Return the lines as the first minute corrects them, and lines to add; tables that contradict others become comments."""
+    tried = [line for line in lines if line.is_certain or line.key in ("stamp_zone", "stamp_format")]
+    text = ProposedRecipe([], [replace(line, is_certain=True) for line in tried], "").toml()
+    tables = {name: of for name, of in tomllib.loads(text).get("tables", {}).items() if "columns" in of}
     recipe = from_values(Recipe, {"tables": tables}, where="proposed recipe")
-    reasons, more = dict[str, str](), list[ProposedLine]()
+    reasons, added, findings = dict[str, str](), list[ProposedLine](), tuple[Finding, ...]()
     try:
-        with open_single_log(log, tables=recipe.tables) as opened:
-            streams = read_run(opened, find_read_config(recipe, opened.topics), robot=None, known=load_profiles(recipe))
-        end = min(pc.min(table["stamp_ns"]).as_py() for table in streams.tables.values()) + _TRIAL_NS
-        cut = {role: table.filter(pc.less(table["stamp_ns"], end)) for role, table in streams.tables.items()}
-        cut = {role: table for role, table in cut.items() if table.num_rows}
-        from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only where there is work
-
-        findings: Iterable[Finding] = fuse_run(
-            replace(streams, tables=cut), recipe.fuse, run_id="trial"
-        ).info.report.findings
+        findings = _fuse_first_minute(log, recipe) if tables else ()
     except LogError as error:
-        findings = ()
-        for problem in error.problems:
-            if named := re.search(r"recipe tables\.(\w+)", problem):
-                reasons[named[1]] = problem.partition(": ")[2]
-    except TcpipeError:
-        findings = ()
+        found = ((re.search(r"recipe tables\.(\w+)", problem), problem) for problem in error.problems)
+        reasons |= {named[1]: problem.partition(": ")[2] for named, problem in found if named}
+    except TcpipeError:  # too little for a track; preflight explains it
+        pass
     for finding in findings:
-        role, why = finding.subject.name, f"in the first minute: {describe_finding(finding)}"
-        if finding.code == "imu-units":
-            added = (line for remedy in finding.remedies for line in propose_lines(remedy.recipe, {}, ""))
-            more += [replace(line, note=why) for line in added]
-        elif finding.code == "odometry-scale" and role == "wheel_odometry":
-            scale = finding.numbers["scale"]
-            unit = next(
-                (unit for unit, mps in UNITS["m/s"].items() if abs(scale * mps - 1.0) < _SCALE_TOLERANCE), "m/s"
-            )
-            line = ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)
-            more += [line] if unit != "m/s" and not any(line.key == other.key for other in lines) else []
-        elif finding.code in _CONTRADICTIONS and (of := finding.names.get("suspect", role)) in (
-            "imu",
-            "wheel_odometry",
-        ):
-            reasons[of] = why
-    more = [line for line in more if line.table.removeprefix("tables.") not in reasons]
-    return [
-        replace(line, is_certain=False, note=reasons[name] if line.key == "file" else line.note)
-        if (name := line.table.removeprefix("tables.")) in reasons
-        else line
-        for line in lines
-    ], more
+        why = f"in the first minute: {describe_finding(finding)}"
+        blamed = finding.names.get("suspect", finding.subject.name)
+        if finding.code in _CONTRADICTIONS and blamed in ("imu", "wheel_odometry"):
+            reasons[blamed] = why
+        elif finding.code == "imu-units":
+            remedies = (line for remedy in finding.remedies for line in propose_lines(remedy.recipe, {}, ""))
+            added += [replace(line, note=why) for line in remedies]
+        elif finding.code == "odometry-scale" and blamed == "wheel_odometry":
+            lines, units = _scale_speed(lines, finding.numbers["scale"], why)
+            added += units
+    if any(str(line.value).endswith(_TIMES_RADIUS) for line in lines):
+        reasons["wheel_odometry"] = "state the wheels' radius in place of 0.1 m"
+    kept = list[ProposedLine]()
+    for line in lines:
+        why = reasons.get(line.table.removeprefix("tables."), "")
+        note = why if why and line.key == "file" else line.note
+        kept.append(replace(line, is_certain=line.is_certain and not why, note=note))
+    return kept, [line for line in added if line.table.removeprefix("tables.") not in reasons]
+
+
+def _scale_speed(
+    lines: Sequence[ProposedLine], scale: float, why: str
+) -> tuple[list[ProposedLine], list[ProposedLine]]:
+    """Return the lines with the radius of wheels by the scale of their speed, and the line of a unit that the scale shows."""
+    for at, line in enumerate(lines):
+        if (text := str(line.value)).endswith(_TIMES_RADIUS):
+            text = f"{text.removesuffix(_TIMES_RADIUS)} * {0.1 / scale:.4g}"
+            return [*lines[:at], replace(line, value=text, note=f"the wheels' radius {why}"), *lines[at + 1 :]], []
+    unit = next((unit for unit, mps in UNITS["m/s"].items() if abs(scale * mps - 1.0) < _SCALE_TOLERANCE), "m/s")
+    is_stated = unit == "m/s" or any(line.key == "units.linear_x" for line in lines)
+    return [*lines], [] if is_stated else [ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)]
+
+
+def _fuse_first_minute(log: Path, recipe: Recipe) -> tuple[Finding, ...]:
+    """Return the findings of the first minute of a log."""
+    from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only where there is work
+
+    with open_single_log(log, tables=recipe.tables) as opened:
+        streams = read_run(opened, find_read_config(recipe, opened.topics), robot=None, known=load_profiles(recipe))
+    end_ns = min(pc.min(table["stamp_ns"]).as_py() for table in streams.tables.values()) + _TRIAL_NS
+    cut = {role: table.filter(pc.less(table["stamp_ns"], end_ns)) for role, table in streams.tables.items()}
+    streams = replace(streams, tables={role: table for role, table in cut.items() if table.num_rows})
+    return fuse_run(streams, recipe.fuse, run_id="trial").info.report.findings
