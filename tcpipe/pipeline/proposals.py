@@ -211,10 +211,8 @@ def propose_for_log(
         for remedy in finding.remedies:
             lines += propose_lines(remedy.recipe, notes, finding.names.get("doubt", ""))
         if finding.names.get("role") == "gnss" and not any(line.key == "gnss.quality" for line in lines):
-            fields = find_quality(list_number_fields(log.topics[finding.subject.name]))
-            lines += [
-                ProposedLine("read.fields", "gnss.quality", field, _CODES_NOTE, is_certain=False) for field in fields
-            ]
+            for field in find_quality(list_number_fields(log.topics[finding.subject.name])):
+                lines.append(ProposedLine("read.fields", "gnss.quality", field, _CODES_NOTE, is_certain=False))
     unplaced = [
         (role, frames[role])
         for role, (_, by) in places.items()
@@ -253,12 +251,10 @@ def _describe_sample(columns: Columns, topic: Topic, role: str, by: tuple[RoleAs
         return count + "".join(
             f", {format_first(rail.voltage_volt)} V, {format_first(rail.current_amp)} A" for rail in read
         )
-    needed = [
-        (name, definition.message)
-        for name, definition in MAPPED[role].items()
-        if definition.needed and definition.message in columns
-    ]
-    named = needed[-3:] if kind == MAPPED_TYPES[role] else []  # of an IMU the accelerations, which show gravity
+    needed = {name: field.message for name, field in MAPPED[role].items() if field.needed and field.message in columns}
+    named = (
+        [*needed.items()][-3:] if kind == MAPPED_TYPES[role] else []
+    )  # of an IMU the accelerations, which show gravity
     return count + "".join(f", {name} {format_first(columns[message])}" for name, message in named)
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.message_tables import Fields, TableLog, TopicMessages, make_stamp_fields, make_topic
 from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
-from tcpipe.formats.logs.table_stamps import Stamps, find_stamps
+from tcpipe.formats.logs.table_stamps import Clock, find_stamps
 from tcpipe.logs.field_mapping import FieldSource, find_mapping_problems, find_topic, make_message_fields, read_fields
 from tcpipe.logs.topics import Damage
 from tcpipe.power.sources import FLOAT_TYPES
@@ -105,7 +105,7 @@ def _read_messages(
     mapping: TableMapping,
     cells: Cells,
     values: Mapping[str, NDArray[np.float64]],
-    stamps: Stamps,
+    stamps: Clock,
 ) -> TopicMessages:
     """Return a table as the messages of its topic, type and role, in order of time, and its damage.
 

@@ -46,14 +46,10 @@ Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A column of stamps, shape (N,): [ns] since 1970 in UTC or in local time, since midnight, or since the start of a counter.
+    """Stamps of rows, shape (N,): [ns] since 1970 in UTC or in local time, since midnight, or since the start of a counter.
 
-    Attributes
-    ----------
-    ns : 0 where ``known`` is false.
-    unit : unit of numbers: s, ms, us or ns.
-    is_guessed : neither the size of a counter's values nor its name states the unit; its steps suggest it.
-    sample : first text, "" of numbers.
+    ``ns`` is 0 where not ``known``; ``unit`` is that of numbers, guessed by their steps if neither size nor name states it; ``sample`` is
+    the first text, "" of numbers; ``notes`` are assumptions.
     """
 
     kind: Kind
@@ -62,6 +58,7 @@ class Clock:
     unit: str = ""
     is_guessed: bool = False
     sample: str = ""
+    notes: tuple[str, ...] = ()
 
     def count_stamps(self) -> int:
         """Return the number of different stamps."""
@@ -76,38 +73,27 @@ class ChosenClock:
     keys: Mapping[str, tuple[str, str, bool]]
 
 
-@dataclass(frozen=True, slots=True)
-class Stamps:
-    """Stamps of a table's rows [ns], shape (N,), whether each is known, and what was assumed of them."""
-
-    ns: Integers
-    known: NDArray[np.bool_]
-    notes: tuple[str, ...] = ()
-
-
 def find_stamps(
     columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, *, zone: str, path: Path
-) -> Stamps | str:
-    """Return the stamps of a table of the recipe, or in words why they cannot be read.
+) -> Clock | str:
+    """Return the stamps of a table of the recipe in UTC, or of a counter; in words why they cannot be read.
 
     ``columns`` contains the columns that ``stamp``, ``stamp_date`` and ``stamp_utc`` name, ``zone`` that of times without one.
     """
     try:
         found = _read_stamps(columns, stamp, mapping, "UTC" if mapping.stamp_utc else zone, path)
-        if isinstance(found, Stamps) and mapping.stamp_utc:
+        if isinstance(found, Clock) and mapping.stamp_utc:
             as_utc = replace(mapping, stamp_unit="auto", stamp_format="")
             utc = _read_stamps(columns, mapping.stamp_utc, as_utc, "UTC", path)
-            found = f"{mapping.stamp_utc}: {utc} (stamp_utc)" if isinstance(utc, str) else _tie_to_utc(found, utc)
+            found = f"stamp_utc, {mapping.stamp_utc}: {utc}" if isinstance(utc, str) else _tie_to_utc(found, utc)
     except pl.exceptions.PolarsError as error:
         return str(error).splitlines()[0]
-    if isinstance(found, str):
-        return found
-    return replace(found, ns=found.ns + round(mapping.offset_s * 1e9))
+    return found if isinstance(found, str) else replace(found, ns=found.ns + round(mapping.offset_s * 1e9))
 
 
 def _read_stamps(
     columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, zone: str, path: Path
-) -> Stamps | str:
+) -> Clock | str:
     column, dates = columns[stamp], columns.get(mapping.stamp_date)
     if dates is not None:
         column = (dates.cast(pl.String) + " " + column.cast(pl.String)).alias(stamp)
@@ -118,21 +104,16 @@ def _read_stamps(
         sample = f" ({clock.sample})" if clock.sample else ""
         return f'its times{sample} have no zone; state it, as stamp_zone = "Europe/Vienna" or "UTC"'
     if clock.is_guessed:
-        first = clock.ns[clock.known][0] / STAMP_UNITS[clock.unit]
-        return (
-            f"its stamps ({first:.12g}) do not count from 1970; set their unit, one of {', '.join(STAMP_UNITS)} "
-            f"(stamp_unit; by their steps {clock.unit})"
-        )
-    ns, notes = clock.ns, tuple[str, ...]()
+        first, units = clock.ns[clock.known][0] / STAMP_UNITS[clock.unit], ", ".join(STAMP_UNITS)
+        advice = f"set their unit, one of {units} (stamp_unit; by their steps {clock.unit})"
+        return f"its stamps ({first:.12g}) do not count from 1970; {advice}"
     if clock.kind == "day":
-        ns = _unwrap_days(ns, clock.known)
+        ns = _unwrap_days(clock.ns, clock.known)
         midnight = _find_midnight(mapping.stamp_date, path, int(ns[clock.known][-1]), zone)
         if isinstance(midnight, str):
             return midnight
-        ns, notes = ns + midnight[0], midnight[1]
-    if clock.kind in ("local", "day"):
-        ns = _convert_to_utc(ns, zone)
-    return Stamps(np.where(clock.known, ns, 0), clock.known, notes)
+        clock = replace(clock, kind="local", ns=ns + midnight[0], notes=midnight[1])
+    return replace(clock, kind="utc", ns=_convert_to_utc(clock.ns, zone)) if clock.kind == "local" else clock
 
 
 def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Clock | str:
@@ -247,18 +228,18 @@ def _convert_to_utc(ns: Integers, zone: str) -> Integers:
     return local.dt.convert_time_zone("UTC").cast(pl.Int64).fill_null(0).to_numpy()
 
 
-def _tie_to_utc(stamps: Stamps, utc: Stamps) -> Stamps | str:
+def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:
     """Return stamps shifted onto UTC by a coarser column: by the median over the rows in which that column changes."""
-    both = stamps.known & utc.known & (utc.ns > YEARS_S[0] * 1e9)
+    both = clock.known & utc.known & (utc.ns > YEARS_S[0] * 1e9)
     changes = np.flatnonzero(both & (np.diff(utc.ns, prepend=utc.ns[:1]) != 0))
     rows = changes if changes.size else np.flatnonzero(both)
     if not rows.size:
         return "stamp_utc has no times since 1979"
-    apart = utc.ns[rows] - stamps.ns[rows]
+    apart = utc.ns[rows] - clock.ns[rows]
     offset = int(np.median(apart))
     share = float(np.mean(np.abs(apart - offset) > _MAX_TIE_SPREAD_NS))
     notes = (f"{share:.0%} of its UTC stamps are 2 s or more from the others",) if share > _MAX_STRAY_SHARE else ()
-    return Stamps(np.where(stamps.known, stamps.ns + offset, 0), stamps.known, (*utc.notes, *notes))
+    return replace(clock, kind="utc", ns=clock.ns + offset, notes=(*utc.notes, *notes))
 
 
 def choose_clock(columns: Mapping[str, pl.Series]) -> ChosenClock | None:
@@ -288,10 +269,8 @@ def choose_clock(columns: Mapping[str, pl.Series]) -> ChosenClock | None:
     utc = next((name for name, (other, _) in found.items() if other.kind == "utc"), "")
     if clock.is_guessed or (clock.kind == "day" and not clock.sample):
         keys["stamp_unit"] = ("ms_today", "", True) if clock.kind == "day" else (clock.unit, "by its steps", True)
-    if clock.kind != "utc" and utc:
-        keys["stamp_utc"] = utc, "coarser, but UTC", True
-        apart = (found[utc][0].ns - clock.ns)[clock.known & found[utc][0].known]
-        clock = replace(clock, kind="utc", ns=clock.ns + int(np.median(apart)))
+    if clock.kind != "utc" and utc and isinstance(tied := _tie_to_utc(clock, found[utc][0]), Clock):
+        clock, keys["stamp_utc"] = tied, (utc, "coarser, but UTC", True)
     elif clock.kind in ("local", "day"):
         keys["stamp_zone"] = "UTC", 'or as "Europe/Vienna": the zone of times without one, of all tables', False
     return ChosenClock(clock, keys)

@@ -171,7 +171,7 @@ def test_speeds_of_both_sides_in_other_units_words_and_a_counter_are_read_in_si(
     values, recipe, _ = proposed(tmp_path)
     assert values["tables"]["gnss"]["columns"]["quality"] == "words: fix type"
     assert values["tables"]["power"]["columns"] == {"energy": "energy (Wh)"}
-    assert values["tables"]["wheel_odometry"]["units"] == {"linear_x": "km/h"}
+    assert recipe.tables["wheel_odometry"].units == {"linear_x": "km/h", "angular_z": "rad/s"}
     log = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
     odometry = log.tables(["/wheel_odometry"])["/wheel_odometry"]
     assert odometry["twist.twist.linear.x"].to_numpy() == pytest.approx(1.5 + SECONDS / 3.6)
