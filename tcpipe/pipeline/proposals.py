@@ -262,9 +262,6 @@ Floats = NDArray[np.float64]
 _Value: TypeAlias = tuple[TomlValue, str, bool]
 _Values: TypeAlias = dict[str, _Value]
 """By key of a table of the recipe its value, a note, and whether it is certain."""
-_TO_NAME = "column?"
-"""In place of a column that a person has to name."""
-
 _STAMP = re.compile(
     r".*time(stamp|string)?(_(utc|local))?|(.*_)?(t|stamp|gpst|utc|date|epoch|millis|micros|ms_today|ms_of_day)|ms|us"
 )
@@ -359,13 +356,10 @@ def propose_tables(path: Path) -> ProposedRecipe:
         used |= {line.value for line in mine if isinstance(line.value, str)}
         log = table.path if "*" in table.file else log
         head += [f"{other.file}, {other.rows} rows, could be {role} as well" for other, _ in candidates[1:]]
-    with_voltage = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
-    zones = [line for line in lines if line.key == "stamp_zone"]
-    lines = [
-        line
-        for line in lines
-        if line not in zones[1:] and (line.note != NO_VOLTAGE or make_rail_name(line.table) not in with_voltage)
-    ]
+    rails = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
+    needless = [line for line in lines if line.key == "stamp_zone"][1:]
+    needless += [line for line in lines if line.note == NO_VOLTAGE and make_rail_name(line.table) in rails]
+    lines = [line for line in lines if line not in needless]
     lines, tried = _try_lines(lines, log)
     for role in ("gnss", "imu", "wheel_odometry", "power"):
         is_found = role in roles or (role == "power" and any(line.value == "power" for line in lines))
@@ -534,7 +528,7 @@ def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[Pr
             values = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in likely)
             pick = ", ".join(f"{name} ({three})" for name, three in zip(likely, values, strict=True))
             known = match_known_fields(role, free)
-            keys = {f"columns.{field}": known.get(field, _TO_NAME) for field in dict.fromkeys([*needed, *known])}
+            keys = {f"columns.{field}": known.get(field, "column?") for field in dict.fromkeys([*needed, *known])}
             for key, value in {"file": table.file, "stamp": stamp, **keys}.items():
                 note = f"{role} is not recognised: pick from {pick}" if key == "file" else ""
                 yield ProposedLine(f"tables.{role}", key, value, note, is_certain=False)

@@ -387,7 +387,7 @@ class TableMapping:
     stamp_zone: str = field(default="", metadata={"json": ("",)})
     """Time zone of stamps without one, as "Europe/Vienna" or "UTC"; also of the tables that state none."""
     stamp_date: str = field(default="", metadata={"json": ("",)})
-    """Date of times of day: a column, or as "2025-07-09"; "": that of the file's name, else of its last change (a warning)."""
+    """Date of times of day: a column, or as "2025-07-09"; "": that of the file's name, else of its last change, with a note."""
     stamp_utc: str = field(default="", metadata={"json": ("",)})
     """Column of UTC, also in whole seconds: the stamps of a faster clock are shifted onto it by one constant."""
     offset_s: Offset = 0.0

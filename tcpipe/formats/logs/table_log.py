@@ -92,7 +92,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
     stamps = find_stamps(cells.stamps, stamp, mapping, zone=zone, path=path)
     if isinstance(stamps, str):
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamps}"]
-    cells = replace(cells, notes=(*cells.notes, *twice, *stamps.notes))
+    cells = replace(cells, notes=(*cells.notes, *twice))
     if empty:
         return empty
     source = mapping.make_power_source(name)
@@ -121,6 +121,7 @@ def _read_messages(
         for column, (count, row, text) in cells.texts.items()
     ]
     damage += [Damage("table-cells", mapping.file, messages_lost=0, reason=note) for note in cells.notes]
+    damage += [Damage("stamps-assumed", mapping.file, messages_lost=0, reason=note) for note in stamps.notes]
     order = np.flatnonzero(is_used)
     stamp_ns = stamps.ns[order]
     if backward := int(np.count_nonzero(np.diff(stamp_ns) < 0)):

@@ -219,7 +219,7 @@ def _find_midnight(stated: str, path: Path, last_ns: int, zone: str) -> tuple[in
     changed_ns = int(changed.dt.convert_time_zone(zone).dt.replace_time_zone(None).cast(pl.Int64)[0])
     days = round((changed_ns - last_ns) / _DAY_NS)
     day = date(1970, 1, 1) + timedelta(days=days)
-    return days * _DAY_NS, (f"no date; {day} by the last change of the file: if that is wrong, set stamp_date",)
+    return days * _DAY_NS, (f"{day} by the last change of the file; state stamp_date if that is wrong",)
 
 
 def _convert_to_utc(ns: Integers, zone: str) -> Integers:
