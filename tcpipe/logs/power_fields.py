@@ -17,6 +17,7 @@ _QUANTITIES = {
     "current": re.compile(r"curr?(ent)?s?|amp(ere)?s?|i(bat|batt|in|bus|pack)"),
     "power": re.compile(r"power|watts?"),
 }
+_LETTERS = {"u": "voltage", "v": "voltage", "i": "current"}
 _UNITS = {
     name: (quantity, factor)
     for quantity, unit in (("voltage", "V"), ("current", "A"), ("power", "W"))
@@ -132,6 +133,8 @@ def _read_name(name: str) -> _Named | None:
     quantity = next(
         (what for word in reversed(own) for what, pattern in _QUANTITIES.items() if pattern.fullmatch(word)), None
     )
+    if quantity is None and any(_SUPPLY.fullmatch(word) for word in core):  # v_bat
+        quantity = next((_LETTERS[word] for word in own if word in _LETTERS), None)
     measured, scale = _UNITS.get(unit or "", (quantity, 1.0))
     of_rail = any(_SUPPLY.fullmatch(word) or _DRIVES.fullmatch(word) for word in core)
     is_stated = in_brackets and (of_rail or {"u", "v", "i", "p"} & set(own))  # as U_bat [V]

@@ -407,7 +407,7 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     chosen = choose_clock(read_cells(path, stamps=candidates, columns=[]).stamps) if candidates else None
     if chosen is None:
         return None
-    notes = {name: note for name in names if (note := describe_duplicate(name, names))}
+    notes = {name: note for name in names if name and (note := describe_duplicate(name, names))}
     numbers = read_numbers(path, names)
     quality = [source.partition(": ")[2] for source in find_quality([name for name in names if name not in numbers])]
     texts = read_cells(path, stamps=[], columns=[], words=quality).columns if quality else {}

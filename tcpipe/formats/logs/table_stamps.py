@@ -35,6 +35,7 @@ _COUNTERS = {"millis": "ms", "micros": "us", **{unit: unit for unit in STAMP_UNI
 _DATE_IN_NAME = re.compile(r"(?<!\d)(20\d\d)([-_.]?)([01]\d)\2([0-3]\d)(?!\d{3})")
 _DAY_NS = 86_400_000_000_000
 _SAMPLE_ROWS = 1000
+_MINUTE_S = 60.0
 _SLOWEST_STEP_S = 6.0
 """Ten rows in a minute: the unit of a counter is the coarsest with shorter steps."""
 _MIN_FAST_SHARE = 0.9
@@ -100,6 +101,7 @@ def _read_stamps(
     clock = read_clock(column, form=mapping.stamp_format, unit=mapping.stamp_unit)
     if isinstance(clock, str):
         return clock
+    zone = "UTC" if _OF_UTC.fullmatch(simplify_name(stamp)) else zone
     if clock.kind in ("local", "day") and not zone:
         sample = f" ({clock.sample})" if clock.sample else ""
         return f'its times{sample} have no zone; state it, as stamp_zone = "Europe/Vienna" or "UTC"'
@@ -140,12 +142,23 @@ def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Cloc
     stated = unit if unit != "auto" else named if named in STAMP_UNITS else ""
     ns = parse_stamps_ns(values, stated or "auto")
     is_guessed = isinstance(ns, str)
+    if unit == "auto" and is_guessed and _is_hhmmss(values):
+        seconds = values // 10_000 * 3600 + values // 100 % 100 * 60 + values % 100
+        return Clock(
+            "day", _fill_rows(np.round(seconds * 1e9).astype(np.int64), known), known, sample=f"{values[0]:.10g}"
+        )
     if isinstance(ns, str):
         step = float(np.median(np.diff(values))) if values.size > 1 else 0.0
         stated = next((name for name, one in _COARSEST if 0 < step * one / 1e9 <= _SLOWEST_STEP_S), "s")
         ns = np.asarray(parse_stamps_ns(values, stated), np.int64)
     is_utc = YEARS_S[0] < float(np.median(ns)) / 1e9 < YEARS_S[1]
     return Clock("utc" if is_utc else "counter", _fill_rows(ns, known), known, stated, is_guessed=is_guessed)
+
+
+def _is_hhmmss(values: NDArray[np.generic]) -> bool:
+    """Return whether numbers are hours, minutes and seconds in one, as in NMEA sentences: seconds use all of a minute and no more."""
+    parts = np.asarray(values, np.float64) % 100.0
+    return bool(0.5 * _MINUTE_S < np.ptp(parts) < _MINUTE_S < np.ptp(values) and np.max(values) < 240_000.0)
 
 
 def _fill_rows(ns: Integers, known: NDArray[np.bool_]) -> Integers:
@@ -156,13 +169,12 @@ def _fill_rows(ns: Integers, known: NDArray[np.bool_]) -> Integers:
 
 
 def _make_clock(kind: Kind, times: pl.Series, sample: str) -> Clock:
-    """Return the clock of dates or times; the name of the column may state UTC or GPS time."""
+    """Return the clock of dates or times; the name of the column may state GPS time."""
     counted = (times if kind == "day" else times.cast(pl.Datetime("ns"))).cast(pl.Int64)
     known, ns = counted.is_not_null().to_numpy(), counted.fill_null(0).to_numpy()
     if kind == "local" and times.name == _GPS_TIME:
         return Clock("utc", utc_from_gps_ns(ns), known, sample=sample)
-    is_utc = kind == "local" and _OF_UTC.fullmatch(simplify_name(times.name))
-    return Clock("utc" if is_utc else kind, ns, known, sample=sample)
+    return Clock(kind, ns, known, sample=sample)
 
 
 def _parse_times(column: pl.Series, form: str) -> Clock | str | None:
@@ -248,19 +260,9 @@ def choose_clock(columns: Mapping[str, pl.Series]) -> ChosenClock | None:
     It is the finest: rows of a wide table share a coarse time, as whole seconds of GNSS. Of equally fine ones, dates go before counters,
     numbers before texts, which are often cut to seconds.
     """
-    found = dict[str, tuple[Clock, dict[str, tuple[str, str, bool]]]]()
-    date_name = next((name for name in columns if re.fullmatch("(.*_)?date", simplify_name(name))), "")
-    for name, column in columns.items():
-        clock, keys = read_clock(column), {"stamp": (name, "", True)}
-        if isinstance(clock, str) and "stamp_format" in clock:
-            keys["stamp_format"] = DAY_FIRST, clock, False
-            clock = read_clock(column, form=DAY_FIRST)
-        elif isinstance(clock, Clock) and clock.kind == "day" and clock.sample and date_name not in ("", name):
-            joined = read_clock((columns[date_name] + " " + column).alias(name))
-            if isinstance(joined, Clock):
-                clock, keys["stamp_date"] = joined, (date_name, "", True)
-        if isinstance(clock, Clock) and np.count_nonzero(clock.known) > 1:
-            found[name] = clock, {**keys, "stamp": (name, clock.sample, True)}
+    dates = next((column for name, column in columns.items() if re.fullmatch("(.*_)?date", simplify_name(name))), None)
+    read = {name: _read_candidate(column, dates) for name, column in columns.items()}
+    found = {name: each for name, each in read.items() if each and np.count_nonzero(each[0].known) > 1}
     if not found:
         return None
     rows = {name: clock.count_stamps() for name, (clock, _) in found.items()}
@@ -271,6 +273,25 @@ def choose_clock(columns: Mapping[str, pl.Series]) -> ChosenClock | None:
         keys["stamp_unit"] = ("ms_today", "", True) if clock.kind == "day" else (clock.unit, "by its steps", True)
     if clock.kind != "utc" and utc and isinstance(tied := _tie_to_utc(clock, found[utc][0]), Clock):
         clock, keys["stamp_utc"] = tied, (utc, "coarser, but UTC", True)
-    elif clock.kind in ("local", "day"):
+    elif clock.kind in ("local", "day") and not _OF_UTC.fullmatch(simplify_name(keys["stamp"][0])):
         keys["stamp_zone"] = "UTC", 'or as "Europe/Vienna": the zone of times without one, of all tables', False
     return ChosenClock(clock, keys)
+
+
+def _read_candidate(
+    column: pl.Series, dates: pl.Series | None
+) -> tuple[Clock, dict[str, tuple[str, str, bool]]] | None:
+    """Return a column's clock and the keys of the recipe that it needs, None of a column that is no clock."""
+    clock, keys = read_clock(column), dict[str, tuple[str, str, bool]]()
+    if isinstance(clock, str) and "stamp_format" in clock:
+        keys["stamp_format"] = DAY_FIRST, clock, False
+        clock = read_clock(column, form=DAY_FIRST)
+    elif isinstance(clock, Clock) and clock.kind == "day" and clock.sample and dates is not None:
+        joined = read_clock((dates.cast(pl.String) + " " + column.cast(pl.String)).alias(column.name))
+        if isinstance(joined, Clock):
+            clock, keys["stamp_date"] = joined, (dates.name, "", True)
+    if isinstance(clock, str):
+        return None
+    if clock.kind == "local" and _OF_UTC.fullmatch(simplify_name(column.name)):
+        clock = replace(clock, kind="utc")
+    return clock, {"stamp": (column.name, clock.sample, True), **keys}

@@ -320,6 +320,15 @@ def test_a_time_of_day_passes_midnight(tmp_path):
     assert set(np.diff(stamps_of(tmp_path, rows, mapping))) == {20_000_000}
 
 
+def test_hours_minutes_and_seconds_in_one_number_are_a_time_of_day_of_utc(tmp_path):
+    second = 12 + np.arange(100)
+    rows = "".join(f"{120_000 + 100 * (3 + of // 60) + of % 60}.0,1.0\n" for of in second)
+    (tmp_path / "drive_2025-07-09.csv").write_text(f"utc,v\n{rows}")
+    mapping = TableMapping("drive_2025-07-09.csv", columns={"linear_x": "v"})
+    table = open_tables(tmp_path, {"wheel_odometry": mapping}).tables(["/wheel_odometry"])["/wheel_odometry"]
+    assert table["log_time_ns"].to_pylist() == (NOON_NS + np.arange(100) * 10**9).tolist()
+
+
 def test_a_counter_is_tied_to_utc_by_whole_seconds_beside_it(tmp_path):
     rows = [f"{5000 + 20 * k},,{NOON_NS // 10**9 + k // 50}" for k in range(200)]
     found = stamps_of(tmp_path, rows, TableMapping(stamp_unit="ms", stamp_utc="utc"))
