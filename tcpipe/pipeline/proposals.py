@@ -270,14 +270,9 @@ _RUN_TEXT = (r"\d+(?=\D*$)", r"\d(?:[\d_.:T-]*\d)?", r"^[^_. -]+(?=[_ -])")
 _LARGEST_ZONE_NS = 14 * 3_600_000_000_000
 """Largest difference of local time from UTC [ns]."""
 _TRIAL_NS = 60_000_000_000
+_MAX_REJECTED_SHARE = 0.2
 _SCALE_TOLERANCE = 0.03
-_CONTRADICTIONS = [
-    "unit-suspected",
-    "distance-contradicted",
-    "drives-backwards",
-    "path-unlike",
-    "gnss-contradicts-odometry",
-]
+_CONTRADICTIONS = ("unit-suspected", "distance-contradicted", "drives-backwards", "path-unlike")
 """Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
 _HINTS = {
     "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
@@ -552,7 +547,9 @@ def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedL
     for finding in findings:
         why = f"in the first minute: {describe_finding(finding)}"
         blamed = finding.names.get("suspect", finding.subject.name)
-        if finding.code in _CONTRADICTIONS and blamed in ("imu", "wheel_odometry"):
+        if finding.code == "measurements-rejected" and blamed == "gnss":  # a minute of fixes is seldom wrong
+            reasons |= {"wheel_odometry": why} if finding.numbers["rejected_fraction"] > _MAX_REJECTED_SHARE else {}
+        elif finding.code in _CONTRADICTIONS and blamed in ("imu", "wheel_odometry"):
             reasons[blamed] = why
         elif finding.code == "imu-units":
             remedies = (line for remedy in finding.remedies for line in propose_lines(remedy.recipe, {}, ""))

@@ -290,7 +290,7 @@ def test_the_first_minute_shows_a_unit_or_contradicts_a_table(tmp_path, is_noise
     values, _, text = proposed(tmp_path)
     if is_noise:
         assert set(values["tables"]) == {"gnss", "imu", "power"}
-        assert "in the first minute: gnss: contradicts the other sensors" in text
+        assert "in the first minute: gnss: the outlier gate rejected" in text
     else:
         assert values["tables"]["wheel_odometry"]["units"] == {"linear_x": "km/h"}
         assert "in the first minute: wheel_odometry: scale 3.59" in text
