@@ -8,6 +8,7 @@ import pytest
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.table_log import read_cells, read_column_names
+from tcpipe.formats.logs.table_stamps import read_clock
 
 
 def ns(*time):
@@ -29,10 +30,11 @@ def test_a_table_is_told_by_its_first_lines(tmp_path, text, names, stamps, value
     path = tmp_path / "table.csv"
     path.write_text(text)
     assert read_column_names(path) == names
-    found = read_cells(path, stamp=names[0], columns=[names[1]])
-    assert found.stamp.tolist() == stamps
+    found = read_cells(path, stamps=[names[0]], columns=[names[1]])
+    assert found.stamps[names[0]].to_list() == stamps
     np.testing.assert_array_equal(found.columns[names[1]], values)
-    assert (found.texts, found.stamp_is_time) == ({}, False)
+    assert found.texts == {}
+    assert read_clock(found.stamps[names[0]]).kind == "counter"
 
 
 def test_a_tum_trajectory_and_a_solution_of_rtklib(tmp_path):
@@ -44,9 +46,9 @@ def test_a_tum_trajectory_and_a_solution_of_rtklib(tmp_path):
         "2025/10/14 15:41:25.700   47.1234567890  -71.1   643.6   1  12   0.0100\n"
     )
     assert read_column_names(pos)[:2] == ["GPST", "latitude(deg)"]
-    found = read_cells(pos, stamp="GPST", columns=["latitude(deg)", "sdn(m)"])
-    assert found.stamp_is_time
-    assert found.stamp.tolist() == [ns(2025, 10, 14, 15, 41, 25) + 700_000_000]
+    found = read_cells(pos, stamps=["GPST"], columns=["latitude(deg)", "sdn(m)"])
+    clock = read_clock(found.stamps["GPST"])
+    assert (clock.kind, clock.ns.tolist()) == ("utc", [ns(2025, 10, 14, 15, 41, 25) - 17_300_000_000])
     assert [values.tolist() for values in found.columns.values()] == [[47.123456789], [0.01]]
 
 
@@ -54,29 +56,31 @@ def test_a_tum_trajectory_and_a_solution_of_rtklib(tmp_path):
     "text",
     ["2025-10-14 15:41:25.5", "2025-10-14T15:41:25.5", "2025-10-14T15:41:25.5Z", "2025-10-14T17:41:25.500+02:00"],
 )
-def test_stamps_in_words_are_utc_where_they_say_nothing(tmp_path, text):
+def test_stamps_in_words_are_local_times_unless_they_state_a_zone(tmp_path, text):
     path = tmp_path / "table.csv"
     path.write_text(f"time,a\n{text},1\n{text},2\nnever,3\n")
-    found = read_cells(path, stamp="time", columns=["a"])
-    assert found.stamp[:2].tolist() == [ns(2025, 10, 14, 15, 41, 25) + 500_000_000] * 2
-    assert found.stamp_known.tolist() == [True, True, False]
+    clock = read_clock(read_cells(path, stamps=["time"], columns=["a"]).stamps["time"])
+    assert clock.kind == ("utc" if text.endswith(("Z", "+02:00")) else "local")
+    assert clock.ns[:2].tolist() == [ns(2025, 10, 14, 15, 41, 25) + 500_000_000] * 2
+    assert clock.known.tolist() == [True, True, False]
 
 
 def test_text_among_numbers_is_counted_and_an_open_quote_costs_its_line(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text('t,a\n1,2\n2,fast\n3,\n4,slow\n5,6\n"6,7\n')
-    found = read_cells(path, stamp="t", columns=["a"])
+    found = read_cells(path, stamps=["t"], columns=["a"])
     np.testing.assert_array_equal(found.columns["a"][:5], [2.0, np.nan, np.nan, np.nan, 6.0])
     assert found.texts == {"a": (2, 2, "fast")}
-    assert found.stamp_known.tolist() == [True] * 5 + [False]
+    assert read_clock(found.stamps["t"]).known.tolist() == [True] * 5 + [False]
 
 
 def test_parquet_with_times_and_text(tmp_path):
     path = tmp_path / "table.parquet"
     times = pl.Series([datetime(2025, 10, 14, tzinfo=UTC)] * 2)
     pl.DataFrame({"time": times, "a": [1, 2], "b": ["3.5", "x"]}).write_parquet(path)
-    found = read_cells(path, stamp="time", columns=["a", "b"])
-    assert found.stamp.tolist() == [ns(2025, 10, 14)] * 2
+    found = read_cells(path, stamps=["time"], columns=["a", "b"])
+    clock = read_clock(found.stamps["time"])
+    assert (clock.kind, clock.ns.tolist()) == ("utc", [ns(2025, 10, 14)] * 2)
     assert found.columns["a"].tolist() == [1.0, 2.0]
     assert found.columns["b"][0] == 3.5
     assert found.texts == {"b": (1, 2, "x")}
@@ -88,7 +92,7 @@ def test_parquet_with_times_and_text(tmp_path):
 def test_what_is_no_table_is_one_plain_line(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(LogError) as caught:
-        read_cells(tmp_path / name, stamp="t", columns=["a"])
+        read_cells(tmp_path / name, stamps=["t"], columns=["a"])
     (problem,) = caught.value.problems
     assert problem.startswith(str(tmp_path / name))
     assert "\n" not in problem
