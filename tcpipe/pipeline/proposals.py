@@ -407,7 +407,8 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     quality = [source.partition(": ")[2] for source in find_quality([name for name in names if name not in numbers])]
     texts = read_cells(path, stamps=[], columns=[], words=quality).columns if quality else {}
     words = {name: str(values[0]) for name, values in texts.items()}
-    return _Table(file, path, names, numbers, chosen.clock, chosen.clock.count_stamps(), chosen.keys, words, notes)
+    clock, keys = chosen
+    return _Table(file, path, names, numbers, clock, clock.count_stamps(), keys, words, notes)
 
 
 def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:

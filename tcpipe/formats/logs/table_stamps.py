@@ -42,6 +42,8 @@ _MIN_FAST_SHARE = 0.9
 _PREFERRED = ("counter", "day", "local", "utc")
 _MAX_TIE_SPREAD_NS, _MAX_STRAY_SHARE = 2_000_000_000, 0.05
 _COARSEST = tuple(reversed(STAMP_UNITS.items()))
+RecipeKeys: TypeAlias = dict[str, tuple[str, str, bool]]
+"""By key of a table of the recipe its value, a note, and whether it is certain."""
 Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
 
 
@@ -66,14 +68,6 @@ class Clock:
         return len(np.unique(self.ns[self.known]))
 
 
-@dataclass(frozen=True, slots=True)
-class ChosenClock:
-    """The stamps that suit a table best, and by key of the recipe what states them: value, note, and whether it is certain."""
-
-    clock: Clock
-    keys: Mapping[str, tuple[str, str, bool]]
-
-
 def find_stamps(
     columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, *, zone: str, path: Path
 ) -> Clock | str:
@@ -96,9 +90,10 @@ def _read_stamps(
     columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, zone: str, path: Path
 ) -> Clock | str:
     column, dates = columns[stamp], columns.get(mapping.stamp_date)
-    if dates is not None:
-        column = (dates.cast(pl.String) + " " + column.cast(pl.String)).alias(stamp)
     clock = read_clock(column, form=mapping.stamp_format, unit=mapping.stamp_unit)
+    if dates is not None and (isinstance(clock, str) or clock.kind == "day"):
+        joined = (dates.cast(pl.String) + " " + column.cast(pl.String)).alias(stamp)
+        clock = read_clock(joined, form=mapping.stamp_format)
     if isinstance(clock, str):
         return clock
     zone = "UTC" if _OF_UTC.fullmatch(simplify_name(stamp)) else zone
@@ -115,7 +110,10 @@ def _read_stamps(
         if isinstance(midnight, str):
             return midnight
         clock = replace(clock, kind="local", ns=ns + midnight[0], notes=midnight[1])
-    return replace(clock, kind="utc", ns=_convert_to_utc(clock.ns, zone)) if clock.kind == "local" else clock
+    if clock.kind == "local":
+        ns = _convert_to_utc(clock.ns, zone)
+        clock = replace(clock, kind="utc", ns=ns, known=clock.known & (ns != 0))
+    return clock
 
 
 def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Clock | str:
@@ -235,7 +233,7 @@ def _find_midnight(stated: str, path: Path, last_ns: int, zone: str) -> tuple[in
 
 
 def _convert_to_utc(ns: Integers, zone: str) -> Integers:
-    """Return local times [ns] as UTC; of an hour that comes twice the first. `pl.exceptions.PolarsError`: there is no such zone."""
+    """Return local times [ns] as UTC, 0 where there is no such time; of an hour that comes twice the first. `PolarsError`: no such zone."""
     local = pl.Series(ns).cast(pl.Datetime("ns")).dt.replace_time_zone(zone, ambiguous="earliest", non_existent="null")
     return local.dt.convert_time_zone("UTC").cast(pl.Int64).fill_null(0).to_numpy()
 
@@ -254,8 +252,8 @@ def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:
     return replace(clock, kind="utc", ns=clock.ns + offset, notes=(*utc.notes, *notes))
 
 
-def choose_clock(columns: Mapping[str, pl.Series]) -> ChosenClock | None:
-    """Return the clock among columns that may be stamps, None without one.
+def choose_clock(columns: Mapping[str, pl.Series]) -> tuple[Clock, RecipeKeys] | None:
+    """Return the clock among columns that may be stamps, and the keys that state it, None without one.
 
     It is the finest: rows of a wide table share a coarse time, as whole seconds of GNSS. Of equally fine ones, dates go before counters,
     numbers before texts, which are often cut to seconds.
@@ -275,14 +273,12 @@ def choose_clock(columns: Mapping[str, pl.Series]) -> ChosenClock | None:
         clock, keys["stamp_utc"] = tied, (utc, "coarser, but UTC", True)
     elif clock.kind in ("local", "day") and not _OF_UTC.fullmatch(simplify_name(keys["stamp"][0])):
         keys["stamp_zone"] = "UTC", 'or as "Europe/Vienna": the zone of times without one, of all tables', False
-    return ChosenClock(clock, keys)
+    return clock, keys
 
 
-def _read_candidate(
-    column: pl.Series, dates: pl.Series | None
-) -> tuple[Clock, dict[str, tuple[str, str, bool]]] | None:
+def _read_candidate(column: pl.Series, dates: pl.Series | None) -> tuple[Clock, RecipeKeys] | None:
     """Return a column's clock and the keys of the recipe that it needs, None of a column that is no clock."""
-    clock, keys = read_clock(column), dict[str, tuple[str, str, bool]]()
+    clock, keys = read_clock(column), RecipeKeys()
     if isinstance(clock, str) and "stamp_format" in clock:
         keys["stamp_format"] = DAY_FIRST, clock, False
         clock = read_clock(column, form=DAY_FIRST)
