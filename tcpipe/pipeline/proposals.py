@@ -484,7 +484,8 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[
         if field == "quality":
             found[field] = np.zeros(1)
         elif isinstance(read, dict) and {name for name, _ in expression.operands()} <= table.numbers.keys():
-            found[field] = read[field].evaluate(lambda name, _: table.numbers[name], len(table.clock.known))
+            rows = len(next(iter(table.numbers.values())))
+            found[field] = read[field].evaluate(lambda name, _: table.numbers[name], rows)
     return found, units
 
 

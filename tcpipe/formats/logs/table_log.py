@@ -158,6 +158,7 @@ TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 _HEAD_BYTES = 1 << 16
 _INFERRED_ROWS = 100
+_SAMPLE_ROWS = 100_000
 _COMMENT = re.compile(rb"[#%]")
 _DAY_AND_TIME = re.compile(rb"^(\d{4})[/-](\d\d)[/-](\d\d)[ \t]+(?=\d\d:)", re.MULTILINE)
 _SPACES = re.compile(rb"[ \t]+")
@@ -215,17 +216,13 @@ def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], wor
 
 
 def read_numbers(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Return the columns that contain numbers, shape (rows,), NaN where a cell has none; `LogError` where it is no table."""
+    """Return the first rows of columns that contain numbers, shape (rows,), NaN where a cell has none; `LogError`: it is no table."""
     try:
-        frame = _collect_columns(path, [*names], numbers=[*names])
+        frame = _collect_columns(path, [*names], numbers=[*names], rows=_SAMPLE_ROWS)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
     numbers = {name: frame[name].cast(pl.Float64) for name in names if frame[name].dtype.is_numeric()}
-    return {
-        name: values.fill_null(np.nan).to_numpy()
-        for name, values in numbers.items()
-        if values.null_count() < len(values)
-    }
+    return {name: of.fill_null(np.nan).to_numpy() for name, of in numbers.items() if of.null_count() < len(of)}
 
 
 def read_values(
@@ -241,12 +238,14 @@ def read_values(
     }
 
 
-def _collect_columns(path: Path, columns: list[str], numbers: list[str] | None) -> pl.DataFrame:
+def _collect_columns(
+    path: Path, columns: list[str], numbers: list[str] | None, *, rows: int | None = None
+) -> pl.DataFrame:
     """Return columns of a table; a quote that nothing closes (a log that broke off) costs its own line only."""
     try:
-        return _scan(path, numbers).select(columns).collect()
+        return _scan(path, numbers).select(columns).slice(0, rows).collect()
     except pl.exceptions.ComputeError:
-        return _scan(path, numbers, quote=None).select(columns).collect()
+        return _scan(path, numbers, quote=None).select(columns).slice(0, rows).collect()
 
 
 def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:

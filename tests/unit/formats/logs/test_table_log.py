@@ -182,7 +182,7 @@ def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_pat
         odom=odometry(text="time,vx,yaw_rate\n"),
         cmd_vel=odometry(text="stamp,linear.x,angular.z\n"),
         imu="t,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z\n" + rows("0.{k},0.1{k},0.2{k},0.1{k},0.2,9.8{k}"),
-        fixes="t,Latitude (deg),Longitude (deg),height\n" + rows("47.{k},15.{k},40{k}"),
+        fixes="t,Latitude (deg),Longitude (deg),height\n" + rows("47.000000{k},15.000000{k},40{k}"),
         voltage_left="timestamp,value\n" + rows("48.{k}"),
         current_left="timestamp,value\n" + rows("4.{k}"),
         notes="a,b,c\n1,2,3\n",
