@@ -120,7 +120,8 @@ def _judge_fixes(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[d
     is_whole = not any(np.any(values[name] % 1.0) for name in ("latitude", "longitude"))
     if is_whole and 90.0 < latitude <= 90e7 and longitude <= 180e7:  # as in u-blox' messages, whose heights are in mm
         found |= {name: f"{found[name]} * 1e-7" for name in ("latitude", "longitude")}
-        found |= {"altitude": f"{found['altitude']} * 0.001"} if "altitude" in found else {}
+        in_mm = [name for name in ("altitude", "east_std", "north_std", "up_std") if name in found]
+        found |= {name: f"{found[name]} * 0.001" for name in in_mm}
         values = {**values, "altitude": values.get("altitude", np.zeros(0)) * 0.001}
     elif latitude > 90.0 or longitude > 180.0:
         doubt = f"latitudes to {latitude:.6g} are no degrees: convert them"

@@ -74,6 +74,14 @@ def test_a_receiver_s_own_message_is_proposed_with_the_lines_of_the_recipe():
     assert beside == (found,)
 
 
+def test_accuracies_of_a_receiver_in_millimetres_are_metres():
+    values = {"latitude": 470_600_000.0, "longitude": 154_500_000.0, "altitude": 430_000.0, "hAcc": 14.0, "vAcc": 20.0}
+    (found,) = proposals(topic("/rtk", f"{RTK}uint32 hAcc\nuint32 vAcc\n"), values=values)
+    mapped = found.remedies[0].recipe["read.fields"]["gnss"]
+    assert mapped["east_std"] == mapped["north_std"] == "hAcc * 0.001"
+    assert mapped["up_std"] == "vAcc * 0.001"
+
+
 @pytest.mark.parametrize(
     ("values", "fields", "doubt"),
     [
