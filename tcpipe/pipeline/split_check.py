@@ -18,7 +18,7 @@ from tcpipe.formats.covariates import read_rows
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.pipeline.options import CheckSplitOptions
 from tcpipe.report.split_page import render_split_page
-from tcpipe.splits.audit import measure_leakage
+from tcpipe.splits.audit import count_neighbours, measure_leakage
 from tcpipe.tables.arrays import to_numbers, to_texts
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.options import as_function
@@ -31,6 +31,8 @@ _SUFFIXES = (".csv", ".parquet")
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")
 _DEGREES = ({"lon", "lng", "long", "longitude"}, {"lat", "latitude"})
 """Words in the names of columns of degrees."""
+_SAME_PLACE = 1e-3
+"""Footprints are equal if their corners are, to this share of a side."""
 _MOST_APART_M = 1e6
 """Largest distance from the first sample in its plane [m]: lengths along the line of sight are 1.2 % too short there."""
 
@@ -119,19 +121,26 @@ def run_check_split(options: CheckSplitOptions) -> SplitCheck:
     run = row if options.run is None else _rank(table.column(options.run))
     chord_m = max(_compute_median_step_m(run, order, np.mean(ends_m, axis=0)), options.footprint_m)
     footprints_m = _make_footprints(ends_m, options.footprint_m)
+    is_neighbour = count_neighbours(is_train, run, order, footprints_m, chord_m=chord_m) > 0
+    # A robot at rest gives thousands of samples at one place: each place is compared once.
+    first, place = _find_places(footprints_m, options.footprint_m)
+    at_place = {name: np.bincount(place, rows) > 0 for name, rows in {"": is_train, **held}.items()}
+    ground = measure_leakage(at_place.pop(""), at_place, first, first, footprints_m[first], chord_m=chord_m)
     checked, leaking = [], [np.empty(0, np.int64)]
-    for name, found in measure_leakage(is_train, held, run, order, footprints_m, chord_m=chord_m).items():
-        is_neighbour = found.train_neighbours > 0
-        leaking.append(found.rows[found.shares_ground | is_neighbour])
+    for name, found in ground.items():
+        rows = np.flatnonzero(held[name])
+        at = np.searchsorted(found.rows, place[rows])
+        shares_ground, nearest_m = found.shares_ground[at], found.nearest_m[at]
+        leaking.append(rows[shares_ground | is_neighbour[rows]])
         of_split = SplitLeakage(
             split=name,
-            samples=len(found.rows),
+            samples=len(rows),
             leaking_samples=len(leaking[-1]),
-            overlapping_samples=int(found.shares_ground.sum()),
-            neighbour_samples=None if options.run is None else int(is_neighbour.sum()),
-            nearest_train_median_m=float(np.median(found.nearest_m)),
-            nearest_train_min_m=float(found.nearest_m.min()),
-            near_fraction=float((found.nearest_m <= options.footprint_m).mean()),
+            overlapping_samples=int(shares_ground.sum()),
+            neighbour_samples=None if options.run is None else int(is_neighbour[rows].sum()),
+            nearest_train_median_m=float(np.median(nearest_m)),
+            nearest_train_min_m=float(nearest_m.min()),
+            near_fraction=float((nearest_m <= options.footprint_m).mean()),
         )
         checked.append(of_split)
     result = SplitCheck(
@@ -145,13 +154,20 @@ def run_check_split(options: CheckSplitOptions) -> SplitCheck:
         held_out=tuple(checked),
     )
     if options.html is not None:
-        rows = {options.train: is_train, **held, "leaking samples": np.concatenate(leaking)}
-        places_m = {name: np.mean(ends_m, axis=0)[of] for name, of in rows.items()}
+        shown = {options.train: is_train, **held, "leaking samples": np.concatenate(leaking)}
+        places_m = {name: np.mean(ends_m, axis=0)[of] for name, of in shown.items()}
         write_text(Path(options.html), render_split_page(result.describe(), result.make_table(), places_m))
     return result
 
 
 check_split = as_function(CheckSplitOptions, run_check_split)
+
+
+def _find_places(footprints_m: Floats, side_m: float) -> tuple[Ints, Ints]:
+    """Return the first sample at each place, (P,), and the number of each sample's place, (N,); footprints of one place are equal."""
+    corners = np.round(footprints_m.reshape(-1, 8) / (_SAME_PLACE * side_m))
+    _, first, place = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    return first, place.reshape(-1)
 
 
 def _rank(column: pa.ChunkedArray) -> Ints:

@@ -86,12 +86,12 @@ def measure_leakage(
     corners_xy_m : corners of the footprints [m], shape (N, 4, 2).
     chord_m : segment length [m]; samples follow one another if their centres are at most 1.5 chords apart.
     """
-    neighbours = _count_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
+    neighbours = count_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
     ground = Ground(corners_xy_m, np.flatnonzero(train))
     return {name: _measure_split(np.flatnonzero(is_held), run, ground, neighbours) for name, is_held in held.items()}
 
 
-def _count_neighbours(train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float) -> Ints:
+def count_neighbours(train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float) -> Ints:
     """Return how many training samples follow or precede each sample on its track, shape (N,)."""
     order, found = np.lexsort((start_ns, run)), np.zeros(len(run), np.int8)
     for first in range(0, len(order) - 1, _CHUNK):

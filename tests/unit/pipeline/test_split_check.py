@@ -57,6 +57,14 @@ def test_a_random_split_of_one_track_is_caught(tmp_path, kind):
     assert count(judged) == {"buffer": (1, 1, 0, 1)}
 
 
+def test_a_robot_at_rest_is_judged_in_no_time_and_counts_sample_by_sample(tmp_path):
+    count_at_rest = 20_000
+    x = np.r_[np.zeros(count_at_rest), np.zeros(count_at_rest), 50.0]
+    split = ["train"] * count_at_rest + ["test"] * count_at_rest + ["test"]
+    check = check_split(write(tmp_path / "rest.parquet", x=x, split=split), xy="x_m,y_m")
+    assert count(check) == {"test": (count_at_rest + 1, count_at_rest, count_at_rest, None)}
+
+
 def test_samples_follow_one_another_in_time_and_on_one_run(tmp_path):
     order = np.random.default_rng(1).permutation(len(TRACK))
     path = write(
