@@ -1,11 +1,11 @@
 """What hours of driving cost as there are more of them, and what the measured figures say of 100,000 hours and 10⁹ samples.
 
-    python benchmarks/scale.py hours DIRECTORY [HOURS] [JOBS]    write that many hours of logs, and ingest them by one call
+    python benchmarks/scale.py hours DIRECTORY [HOURS] [JOBS] [SCENARIO]   write that many hours of logs, and ingest them by one call
     python benchmarks/scale.py memory LOG [LOG ...]              the most memory that ingesting each log takes, and its CPU
     python benchmarks/scale.py paper                             the second table of docs/explanation/scale.md, from the first
 
-One simulated drive of twelve minutes is repeated, each time later, every measurement with noise of its own. CPU is that of the process
-and its workers, memory the largest of the calling process at any time.
+One simulated drive of twelve minutes (or that of another scenario) is repeated, each time later, every measurement with noise of its own.
+CPU is that of the process and its workers, memory the largest of the calling process at any time.
 """
 
 from __future__ import annotations
@@ -42,25 +42,25 @@ SMALL = 1e-4
 """Of a value's spread: makes another measurement of it, and no other drive."""
 
 
-def write_logs(directory: Path, hours: int) -> list[Path]:
+def write_logs(directory: Path, hours: int, scenario: str) -> list[Path]:
     """Return logs of so many hours; those that are not there yet are written, at ten CPU seconds an hour."""
     from tcpipe.formats.logs.writing import write_mcap
 
     paths = [directory / "hours" / NAME.format(number) for number in range(hours * LOGS_PER_HOUR)]
     paths[0].parent.mkdir(parents=True, exist_ok=True)
-    drive = [] if all(path.exists() for path in paths) else drive_streams()
+    drive = [] if all(path.exists() for path in paths) else drive_streams(scenario)
     for number, path in enumerate(paths):
         if not path.exists():
             write_mcap(path, [later(stream, 1_800 * number, seed=number) for stream in drive])
     return paths
 
 
-def drive_streams() -> list[MessageStream]:
+def drive_streams(scenario: str) -> list[MessageStream]:
     """Return what is recorded of the drive, at most `MOST_HZ` of each topic: hours are to be had in minutes."""
     from tcpipe.simulation.scenarios import find_scenario
     from tcpipe.simulation.site_files import simulate_messages
 
-    return [thinned(stream) for stream in simulate_messages(find_scenario("hills12"))[1]]
+    return [thinned(stream) for stream in simulate_messages(find_scenario(scenario))[1]]
 
 
 def thinned(stream: MessageStream) -> MessageStream:
@@ -84,12 +84,15 @@ def later(stream: MessageStream, seconds: int, *, seed: int) -> MessageStream:
     return replace(stream, columns=columns, log_time_ns=at, publish_time_ns=said)
 
 
-def ingest_hours(directory: Path, hours: int = 20, jobs: int = 2) -> None:
+def ingest_hours(directory: Path, hours: int = 20, jobs: int = 2, scenario: str = "hills12") -> None:
     """Ingest that many hours, and print what each took."""
     with ProcessPoolExecutor(
         1, mp_context=get_context("spawn")
     ) as other:  # whose memory is not that of the process that is measured
-        paths, store = other.submit(write_logs, directory, hours).result(), directory / f"store-of-{hours}-hours"
+        paths, store = (
+            other.submit(write_logs, directory, hours, scenario).result(),
+            directory / f"store-of-{hours}-hours",
+        )
     shutil.rmtree(store, ignore_errors=True)
     results, marks = list[IngestResult](), list[float]()
 
@@ -194,7 +197,7 @@ def write_page(page: Path) -> None:
 
 def main(what: str, arguments: Sequence[str]) -> None:
     if what == "hours":
-        ingest_hours(Path(arguments[0]), *map(int, arguments[1:]))
+        ingest_hours(Path(arguments[0]), *map(int, arguments[1:3]), *arguments[3:])
     elif what == "memory":
         print_memory(arguments)
     else:

@@ -68,7 +68,7 @@ SMALLEST = {
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
     "map_shift": Smallest("--sites 1", r"alone[\s\S]*shared"),
     "many_runs": Smallest("{out} 3", rf"build-dataset, cold +{NUMBER} s wall"),
-    "own_layers": Smallest("{out} --drives 6", rf"noise +: E +{NUMBER} J, T {NUMBER} s on"),
+    "own_layers": Smallest("{out} --drives 4", rf"noise +: E +{NUMBER} J, T {NUMBER} s on"),
     "path_coverage": Smallest("--train 2 --metres 60 --further 1 --models 1", rf"energy +1 m: +{NUMBER} %"),
     "peers": Smallest(
         "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"
@@ -78,7 +78,7 @@ SMALLEST = {
     "read_logs": Smallest("--minutes 0.05", rf"{NUMBER} of {NUMBER} figures met"),
     "real_data": Smallest("drive={log}", rf"drive, .*blocks .* {NUMBER} J"),
     "sample_patches": Smallest("50", rf"nearest gather +{NUMBER} us a patch +{NUMBER} x"),
-    "scale": Smallest("hours {out} 3 1", rf"the last half against the first: {NUMBER} x"),
+    "scale": Smallest("hours {out} 3 1 tiny", rf"the last half against the first: {NUMBER} x"),
     "start_up": Smallest("--quick --turns 1", rf"ingest +{NUMBER} s +{NUMBER} x the floor"),
     "table_digests": Smallest("write {out}/made {out}/digests.json --quick", r"3 runs and 1 datasets .*: \d+ tables"),
     "table_model": Smallest("200", rf"{NUMBER} s for trees[\s\S]*\d predictions/s"),
