@@ -383,8 +383,9 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
         )
     column = read_samples(directory, [energy.power]).column(energy.power)
     if card.samples and label != "total" and column.null_count == len(column):
+        cause = "the robot was never stationary for long; take the label total"
         raise DatasetError(
-            f"{directory}: no sample has {energy.power}: the robot was never stationary for long; take the label total"
+            f"{directory}: no sample has {energy.power}: {cause if card.labels['energy'] else 'the runs have no power'}"
         )
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers

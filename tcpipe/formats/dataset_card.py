@@ -274,7 +274,7 @@ class DatasetCard:
 
     @property
     def absent_labels(self) -> tuple[str, ...]:
-        """Labels that no sample has, or that were not asked for."""
+        """Labels that no sample has."""
         return tuple(name for name in LABELS if not self.labels[name])
 
     @property

@@ -206,6 +206,8 @@ def evaluate_adaptation(
         raise ModelError(
             f"{model}: has too few held-out samples to state errors, which an adaptation weighs; train on more"
         )
+    if ours.card.inputs.is_time_alone:
+        raise ModelError(f"{model}: predicts time alone; an adaptation needs a model of energy, too")
     if runs is None:
         check_fit(ours.card, data, str(model), any_robot=True)
         runs = collect_runs(ours, data)

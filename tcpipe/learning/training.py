@@ -178,8 +178,8 @@ def train(
     data = open_dataset(dataset, label=rules.label)
     if not data.card.layers:
         raise DatasetError(
-            f"{data.path}: has no patches, which a model is trained on; add a map (tcpipe add-map) and build it again, "
-            "or train your own model on its samples.parquet"
+            f"{data.path}: has no patches, which a model is trained on; build it with a map (tcpipe add-map) and without "
+            "--without-patches, or train your own model on its samples.parquet"
         )
     other = replace(other, channels=other.channels or rules.layers)
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})

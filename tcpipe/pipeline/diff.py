@@ -192,7 +192,9 @@ def _find_differing_patches(
     in_a: Ints,
     in_b: Ints,
 ) -> Mask:
-    """Mark the samples of both, (N,), that have other pixels; all of them if layers or size differ."""
+    """Mark the samples of both, (N,), that have other pixels: all if layers or size differ, none if a dataset has no patches."""
+    if not (cards[0].layers and cards[1].layers):
+        return np.zeros(len(in_a), np.bool_)
     if set(cards[0].layers) != set(cards[1].layers) or cards[0].patch_px != cards[1].patch_px:
         return np.ones(len(in_a), np.bool_)
     ours, theirs = (
@@ -256,7 +258,8 @@ def _describe_file(word: str, kind: str) -> Describe:
 
     def describe(change: Change, _a: DatasetCard, _b: DatasetCard) -> Iterator[str]:
         which = "added" if change.was is None else "removed" if change.now is None else ""
-        yield f"{word}: {f'{which} {change.name}' if which else f'{change.name} is another {kind}'}".rstrip()
+        name = f"{change.name} is " if change.name else ""
+        yield f"{word}: {f'{which} {change.name}' if which else f'{name}another {kind}'}".rstrip()
 
     return describe
 
@@ -359,6 +362,7 @@ def _iterate_lines(found: Difference) -> Iterator[str]:
             count = f"{change['samples']:.0f} samples"
             yield f"{name} of {count}: changed by {change['median']:.3g} in the median, by {change['largest']:.3g} at most"
     for name, label in found.labels.items():
-        if not np.allclose((label["mean_a"], label["std_a"]), (label["mean_b"], label["std_b"])):
+        figures = (label["mean_a"], label["std_a"]), (label["mean_b"], label["std_b"])
+        if not np.allclose(*figures, equal_nan=True):
             means = f"{label['mean_a']:.4g} → {label['mean_b']:.4g}"
             yield f"{name} of all samples: mean {means}, deviation {label['std_a']:.4g} → {label['std_b']:.4g}"

@@ -107,7 +107,8 @@ class History:
     """By role."""
     masks: tuple[NearbyMask, ...]
     rejected: tuple[NearbyRefusal, ...]
-    map: MapSource
+    map: MapSource | None
+    """None without patches."""
     """The map from which its patch was sampled, as the card of the dataset has it."""
     recipe_differs_in: Mapping[str, Setting]
     """Keys of the recipe that differ from their default."""
@@ -152,7 +153,7 @@ def _read_history(card: DatasetCard, sample: Row, run: StoredRun) -> History:
         messages={} if streams is None else dict(_find_messages(streams, *window)),
         masks=tuple(_iterate_masks(run, *window)),
         rejected=tuple(_iterate_rejections(run, *window)),
-        map=next(source for source in card.maps if source.name == sample["map"]),
+        map=next((source for source in card.maps if source.name == sample["map"]), None),
         recipe_differs_in={
             key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
         },
@@ -249,16 +250,27 @@ def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
 _DEFAULTS = flatten_recipe(Recipe())
 
 
+_SHOWN_LABELS = (
+    ("power", "power_watt", "power_std_watt", 1, "W"),
+    ("velocity", "velocity_mps", "velocity_std_mps", 3, "m/s"),
+    ("duration", "duration_s", "duration_std_s", 3, "s"),
+    ("energy", "energy_joule", "energy_std_joule", 1, "J"),
+    ("slip", "slip_fraction", "slip_std_fraction", 3, ""),
+    ("vibration", "vibration_mps2", "vibration_std_mps2", 2, "m/s²"),
+)
+"""Label, column, column of its standard deviation, decimals and unit."""
+
+
 def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
     sample, run, ground = facts.sample, facts.run, facts.map
     fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
     yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"
-    yield (
-        f"labels   power {sample['power_watt']:.1f} ± {sample['power_std_watt']:.1f} W, "
-        f"velocity {sample['velocity_mps']:.3f} ± {sample['velocity_std_mps']:.3f} m/s, "
-        f"duration {sample['duration_s']:.3f} s, energy {sample['energy_joule']:.1f} J; "
-        f"quality {', '.join(facts.quality) or 'clean'}"
-    )
+    labels = [
+        f"{name} {sample[column]:.{digits}f} ± {sample[std] or 0.0:.{digits}f} {unit}".rstrip()
+        for name, column, std, digits, unit in _SHOWN_LABELS
+        if sample[column] is not None
+    ]
+    yield f"labels   {', '.join(labels)}; quality {', '.join(facts.quality) or 'clean'}"
     there = [path if is_url(path) or Path(path).exists() else f"{path} (now missing)" for path in run.log.paths]
     yield f"log      {', '.join(there)} (sha256 {run.log.sha256[:12]}…), run {run.run_id}, robot {run.robot}"
     yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
@@ -270,8 +282,9 @@ def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
         yield f"masked   {mask.apart_s:.2f} s {mask.where}: {', '.join(mask.why)}, {mask.rows} rows"
     for rejected in facts.rejected:
         yield f"rejected {rejected.count} of {rejected.role} ({rejected.reason}) within {_NEARBY_NS / 1e9:g} s"
-    made_of = ", ".join(f"{layer} {name}" for layer, name in sorted((ground.sources or {}).items()))
-    yield f"map      {ground.name} in {ground.crs} from {made_of}"
+    if ground is not None:
+        made_of = ", ".join(f"{layer} {name}" for layer, name in sorted((ground.sources or {}).items()))
+        yield f"map      {ground.name} in {ground.crs} from {made_of}"
     changed = (
         ", ".join(f"{key} = {value}" for key, value in facts.recipe_differs_in.items()) or "all keys at their defaults"
     )

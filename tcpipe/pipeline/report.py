@@ -137,6 +137,8 @@ def _report_dataset(path: Path | str, *, patches: bool) -> Page:
     directory, fetched = fetch_directory_by_range(path, by_range=lambda _: False)
     place = open_place(path) if fetched is None else fetched.place
     card = read_intact_card(directory)
+    if patches and not card.layers:
+        raise UsageError(f"{path}: has no patches to draw; remove --patches")
     folder, count = find_picture_folder(card)
     for name, data in iterate_pictures(directory, card) if patches else ():
         place.put(f"{folder}/{name}", data)

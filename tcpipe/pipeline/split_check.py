@@ -111,6 +111,9 @@ def run_check_split(options: CheckSplitOptions) -> SplitCheck:
     table cannot be judged, with a problem for each wrong column.
     """
     path, xy = Path(options.table), options.xy.split(",") if isinstance(options.xy, str) else [*options.xy]
+    xy = [name.strip() for name in xy]
+    if options.html is not None and Path(options.html).resolve() == path.resolve():
+        raise UsageError(f"--html {options.html}: is the table itself; give another file")
     if len(xy) not in (2, 4):
         raise UsageError(f"--xy {','.join(xy)}: expected two columns, X,Y, or four, X0,Y0,X1,Y1")
     table, split, is_used = _read_samples(options, path, xy)

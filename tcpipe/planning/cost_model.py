@@ -42,7 +42,7 @@ def check_model(model: Model, source: MapReader, *, needs_energy: bool = True) -
     if needs_energy and model.card.inputs.is_time_alone:
         problems.append(
             f"{model.name}: predicts time alone, because its dataset has no label energy; expected a model of energy "
-            "(only predict-path takes this one)"
+            "(evaluate and predict-path take this one, without --drive and --adapt)"
         )
     needed = model.card.layout.layers
     there = list_layers(source, model.card.inputs.patch_m, model.card.inputs.patch_px)

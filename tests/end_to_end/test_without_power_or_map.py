@@ -64,7 +64,8 @@ def test_power_changes_neither_ids_nor_times_nor_slip(datasets):
 def test_without_patches_samples_are_a_table_with_an_audited_split(datasets):
     with_all, without = (read_rows(datasets[name]) for name in ("with-all", "without-map"))
     assert with_all.keys() <= without.keys()  # what the map loses is in the table
-    assert datasets["without-map"].labels == ("time", "slip")
+    assert datasets["without-map"].labels == ("energy", "time", "slip", "vibration")
+    assert all(row["slip_fraction"] is not None for row in without.values())
     assert {row["split"] for row in without.values()} == {"train", "test"}
     assert all(row["slip_std_fraction"] > 0.0 and row["vibration_std_mps2"] > 0.0 for row in without.values())
     audit, ours = (datasets[name].card.split.audit for name in ("with-all", "without-map"))

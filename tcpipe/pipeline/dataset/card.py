@@ -115,7 +115,7 @@ def make_dataset_card(
         tensor=_describe_tensor(layers, classes) if layers else {},
         classes=classes.classes if has_terrain else (),
         label=_label(recipe, inputs),
-        labels=_count_labels(samples, options.labels),
+        labels={name: int(np.isfinite(to_floats(samples, column)).sum()) for name, column in LABELS.items()},
         plane="" if content.sources else content.plane,
         energy_budget=pool_budgets(run.energy_budget for run in inputs.sources),
         split=content.split,
@@ -141,14 +141,6 @@ def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
     includes = tuple(sorted({load for power in powers if power is not None for load in power.includes}))
     velocity = recipe.label.velocity
     return LabelColumns(("power_watt", VELOCITY_COLUMN[velocity]), velocity, includes)
-
-
-def _count_labels(samples: pa.Table, asked: Sequence[str]) -> dict[str, int]:
-    """Return the number of samples with each label; a label that was not asked for is absent, unless the default was taken."""
-    return {
-        name: int(np.isfinite(to_floats(samples, column)).sum()) if name in (asked or LABELS) else 0
-        for name, column in LABELS.items()
-    }
 
 
 def _describe_tensor(layers: Mapping[str, Layer], classes: ClassTable) -> dict[str, str | tuple[str, ...]]:
@@ -250,7 +242,7 @@ def count_flagged(quality: pa.ChunkedArray) -> FlaggedSamples:
 def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
     """Yield findings on samples: too few, flagged ones, empty splits, leakage, no repetitions."""
     dataset = Subject("dataset", card.name)
-    if card.absent_labels and not card.made_from.labels:
+    if card.absent_labels:
         yield make_finding("labels-absent", dataset, names={"labels": ", ".join(card.absent_labels)})
     if card.samples < read_threshold("few-samples", "min_sample_count"):
         yield make_finding("few-samples", dataset, sample_count=card.samples)

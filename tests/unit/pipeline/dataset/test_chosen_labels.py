@@ -7,13 +7,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from synthetic_store import add_run, add_world, box, lanes, open_world, region_file, segments
+from synthetic_store import add_run, add_world, box, driven, lanes, open_world, region_file, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.dataset_card import LOCAL
 from tcpipe.formats.dataset_files import read_samples
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.diff import diff
+from tcpipe.pipeline.explain import explain
+from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import separate_frames
@@ -103,7 +106,7 @@ def test_samples_need_the_labels_that_were_asked_for(store, tmp_path):
     assert build(store, tmp_path / "default").card.samples == 28 - 7
     result = build(store, tmp_path / "time", labels="time")
     assert result.card.samples == 28
-    assert result.card.labels == {"energy": 0, "time": 28, "slip": 0, "vibration": 0}
+    assert result.card.labels == {"energy": 21, "time": 28, "slip": 23, "vibration": 28}
     result = build(store, tmp_path / "both", labels=["slip", "energy"])
     assert result.card.samples == 28 - 10
     assert result.card.distance_by_reason_m["no_label"] == pytest.approx(3.0)  # five lack slip, two of them power, too
@@ -226,3 +229,24 @@ def test_frames_are_placed_side_by_side_whatever_their_origins():
     assert ((moved - points)[:, 0] % 100.0 == 0.0).all()
     assert np.diff(moved[:, 0])[[0, 2]].tolist() == [200.0, 10.0]
     assert (np.diff(moved[:, 0])[[1, 3]] > 50.0).all()
+
+
+def test_every_command_on_a_dataset_does_without_patches_and_power(bare, tmp_path):
+    start, end = lanes(np.array([1.0, 12.0]), -14.0, 14.0)
+    table = segments("a", start, end, powered=False)
+    add_run(bare, "a", table, track=driven(table, powered=False))
+    for name in ("one", "two"):
+        build(bare, tmp_path / name)
+    assert "the same 56 samples" in str(diff(tmp_path / "one", tmp_path / "two"))
+    build(bare, tmp_path / "fewer", labels="time", holdout="sample")
+    assert "nan" not in str(diff(tmp_path / "one", tmp_path / "fewer"))
+    name = next(iter(read(tmp_path / "one")))
+    lines = str(explain(name, dataset=tmp_path / "one", store=bare.root)).splitlines()
+    (labels,) = [line for line in lines if line.startswith("labels")]
+    assert "velocity" in labels
+    assert "power" not in labels
+    assert not any(line.startswith("map ") for line in lines)
+    (page,) = report(tmp_path / "one")
+    assert page.changed
+    with pytest.raises(UsageError, match="has no patches to draw"):
+        report(tmp_path / "one", patches=True)
