@@ -59,7 +59,7 @@ class Rebuilt:
     def __str__(self) -> str:
         """Return one line."""
         if self.is_identical:
-            return f"identical: {self.samples} samples with their patches"
+            return f"identical: {self.samples} samples"
         causes = "; ".join(self.causes) or "not recorded (another processor or other library versions)"
         counts = f"{self.differing} of {self.samples} samples, max |Δ|/σ {self.largest_in_std:.2g}"
         return clean_line(f"changed: {counts}; cause: {causes}")

@@ -210,8 +210,10 @@ def _read_samples(options: CheckSplitOptions, path: Path, xy: Sequence[str]) -> 
     if options.split in there and frame.height:
         split = to_texts(table.column(options.split).cast(pa.string()).fill_null(""))
         unused = [options.unused] if isinstance(options.unused, str) else [*options.unused]
+        if options.train in unused:
+            problems.append(f"--unused {options.train}: is the value of training samples (--train); remove it")
         is_used = (split == options.train) | ~np.isin(split, ["", *unused])
-        values = f"column {options.split} has {', '.join(np.unique(split[split != '']))}"
+        values = f"column {options.split} has {', '.join(np.unique(split[split != ''])) or 'no value'}"
         if not (split == options.train).any():
             problems.append(f"no training samples, {options.train!r}: {values}; name their value (--train)")
         if not (is_used & (split != options.train)).any():
