@@ -267,8 +267,6 @@ _STAMP = re.compile(
 )
 _RUN_TEXT = (r"\d+(?=\D*$)", r"\d(?:[\d_.:T-]*\d)?", r"^[^_. -]+(?=[_ -])")
 """Parts of a file's name that differ between runs: the last number, date and time, the first word."""
-_LARGEST_ZONE_NS = 14 * 3_600_000_000_000
-"""Largest difference of local time from UTC [ns]."""
 _TRIAL_NS = 60_000_000_000
 _MAX_REJECTED_SHARE = 0.2
 _SCALE_TOLERANCE = 0.03
@@ -301,14 +299,13 @@ class _Table:
     """Remark on each column whose name the header has several times."""
 
     def overlap_ns(self, other: _Table) -> int:
-        """Return the time that two tables have in common; local time and UTC differ by an unknown zone."""
-        spans = [table.clock.ns[table.clock.known] for table in (self, other)]
-        start_ns, end_ns = max(int(span.min()) for span in spans), min(int(span.max()) for span in spans)
+        """Return the time that two tables have in common; that of stamps of different kinds, but for counters, is unknown."""
+        known = (table.clock.ns.drop_nulls().to_numpy() for table in (self, other))
+        spans = [(int(ns.min()), int(ns.max())) for ns in known]
         kinds = {self.clock.kind, other.clock.kind}
-        if len(kinds) > 1 and "counter" in kinds:
-            return 0
-        is_unknown = len(kinds) > 1 and ("day" in kinds or start_ns - end_ns < _LARGEST_ZONE_NS)
-        return min(int(np.ptp(span)) for span in spans) if is_unknown else max(end_ns - start_ns, 0)
+        if len(kinds) > 1:
+            return 0 if "counter" in kinds else min(end_ns - start_ns for start_ns, end_ns in spans)
+        return max(min(end_ns for _, end_ns in spans) - max(start_ns for start_ns, _ in spans), 0)
 
 
 def propose_tables(path: Path) -> ProposedRecipe:

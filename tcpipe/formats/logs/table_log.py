@@ -113,8 +113,8 @@ def _read_messages(
     """
     topic, kind, role = read_as
     has_value = np.any([np.isfinite(value) for value in values.values()], axis=0)
-    is_used = stamps.known & (has_value if has_value.any() else True)
-    lost = int(np.count_nonzero(~stamps.known))
+    is_used = stamps.ns.is_not_null().to_numpy() & (has_value if has_value.any() else True)
+    lost = stamps.ns.null_count()
     damage = [Damage("time-invalid", mapping.file, messages_lost=lost)] if lost else []
     damage += [
         Damage("table-cells", mapping.file, messages_lost=count, reason=f"column {column}, row {row}: {text!r}")
@@ -123,7 +123,7 @@ def _read_messages(
     damage += [Damage("table-cells", mapping.file, messages_lost=0, reason=note) for note in cells.notes]
     damage += [Damage("stamps-assumed", mapping.file, messages_lost=0, reason=note) for note in stamps.notes]
     order = np.flatnonzero(is_used)
-    stamp_ns = stamps.ns[order]
+    stamp_ns = stamps.ns.fill_null(0).to_numpy()[order]
     if backward := int(np.count_nonzero(np.diff(stamp_ns) < 0)):
         damage.append(Damage("messages-unordered", mapping.file, messages_lost=0, places=backward))
         by_time = np.argsort(stamp_ns, kind="stable")

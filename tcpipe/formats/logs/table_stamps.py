@@ -11,13 +11,10 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from tcpipe.logs.expressions import simplify_name, split_unit
 from tcpipe.logs.field_mapping import STAMP_UNITS, YEARS_S, parse_stamps_ns, utc_from_gps_ns
 from tcpipe.recipe import TableMapping
-
-Integers = NDArray[np.int64]
 
 DAY_FIRST, _MONTH_FIRST = "%d/%m/%Y %H:%M:%S%.f", "%m/%d/%Y %H:%M:%S%.f"
 _FORMS = (
@@ -35,7 +32,6 @@ _COUNTERS = {"millis": "ms", "micros": "us", **{unit: unit for unit in STAMP_UNI
 _DATE_IN_NAME = re.compile(r"(?<!\d)(20\d\d)([-_.]?)([01]\d)\2([0-3]\d)(?!\d{3})")
 _DAY_NS = 86_400_000_000_000
 _SAMPLE_ROWS = 1000
-_MINUTE_S = 60.0
 _SLOWEST_STEP_S = 6.0
 """Ten rows in a minute: the unit of a counter is the coarsest with shorter steps."""
 _MIN_FAST_SHARE = 0.9
@@ -49,23 +45,21 @@ Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Stamps of rows, shape (N,): [ns] since 1970 in UTC or in local time, since midnight, or since the start of a counter.
+    """Stamps of rows, shape (N,), null where unknown: [ns] since 1970 in UTC or in local time, since midnight, or of a counter.
 
-    ``ns`` is 0 where not ``known``; ``unit`` is that of numbers, guessed by their steps if neither size nor name states it; ``sample`` is
-    the first text, "" of numbers; ``notes`` are assumptions.
+    ``unit`` is that of numbers whose size and name state none, by their steps; ``sample`` is the first text, "" of numbers; ``notes`` are
+    assumptions.
     """
 
     kind: Kind
-    ns: Integers
-    known: NDArray[np.bool_]
+    ns: pl.Series
     unit: str = ""
-    is_guessed: bool = False
     sample: str = ""
     notes: tuple[str, ...] = ()
 
     def count_stamps(self) -> int:
         """Return the number of different stamps."""
-        return len(np.unique(self.ns[self.known]))
+        return self.ns.drop_nulls().n_unique()
 
 
 def find_stamps(
@@ -89,31 +83,29 @@ def find_stamps(
 def _read_stamps(
     columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, zone: str, path: Path
 ) -> Clock | str:
-    column, dates = columns[stamp], columns.get(mapping.stamp_date)
-    clock = read_clock(column, form=mapping.stamp_format, unit=mapping.stamp_unit)
-    if dates is not None and (isinstance(clock, str) or clock.kind == "day"):
-        joined = (dates.cast(pl.String) + " " + column.cast(pl.String)).alias(stamp)
-        clock = read_clock(joined, form=mapping.stamp_format)
+    dates = columns.get(mapping.stamp_date)
+    clock = _read_dated(columns[stamp], dates, form=mapping.stamp_format, unit=mapping.stamp_unit)
     if isinstance(clock, str):
         return clock
-    zone = "UTC" if _OF_UTC.fullmatch(simplify_name(stamp)) else zone
-    if clock.kind in ("local", "day") and not zone:
+    if clock.kind in ("local", "day") and not zone and not _is_utc(stamp):
         sample = f" ({clock.sample})" if clock.sample else ""
         return f'its times{sample} have no zone; state it, as stamp_zone = "Europe/Vienna" or "UTC"'
-    if clock.is_guessed:
-        first, units = clock.ns[clock.known][0] / STAMP_UNITS[clock.unit], ", ".join(STAMP_UNITS)
+    if clock.unit:
+        first, units = clock.ns.drop_nulls()[0] / STAMP_UNITS[clock.unit], ", ".join(STAMP_UNITS)
         advice = f"set their unit, one of {units} (stamp_unit; by their steps {clock.unit})"
         return f"its stamps ({first:.12g}) do not count from 1970; {advice}"
-    if clock.kind == "day":
-        ns = _unwrap_days(clock.ns, clock.known)
-        midnight = _find_midnight(mapping.stamp_date, path, int(ns[clock.known][-1]), zone)
-        if isinstance(midnight, str):
-            return midnight
-        clock = replace(clock, kind="local", ns=ns + midnight[0], notes=midnight[1])
-    if clock.kind == "local":
-        ns = _convert_to_utc(clock.ns, zone)
-        clock = replace(clock, kind="utc", ns=ns, known=clock.known & (ns != 0))
+    if clock.kind in ("local", "day"):
+        return _convert_to_utc(clock, "UTC" if _is_utc(stamp) else zone, mapping.stamp_date, path)
     return clock
+
+
+def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", unit: str = "auto") -> Clock | str:
+    """Return what a column counts, together with the dates beside it if it has times of day alone; in words why it is no clock."""
+    clock = read_clock(column, form=form, unit=unit)
+    if dates is None or (isinstance(clock, Clock) and clock.kind != "day"):
+        return clock
+    joined = read_clock((dates.cast(pl.String) + " " + column.cast(pl.String)).alias(column.name), form=form)
+    return clock if isinstance(joined, str) and "stamp_format" not in joined else joined
 
 
 def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Clock | str:
@@ -130,49 +122,30 @@ def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Cloc
         kind: Kind = "utc" if _has_zone(column.dtype) else "day" if column.dtype == pl.Time else "local"
         return _make_clock(kind, column, str(column.drop_nulls().first()))
     numbers = column if column.dtype.is_integer() else column.cast(pl.Float64, strict=False)
-    known = (numbers.is_not_null() & numbers.is_finite()).to_numpy()
-    values = numbers.filter(pl.Series(known)).to_numpy()
+    numbers = numbers.set(~numbers.is_finite(), None)
+    values = numbers.drop_nulls().to_numpy()
     if not values.size:
         return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
+    filled, unknown = numbers.fill_null(numbers.drop_nulls()[0]).to_numpy(), numbers.is_null()
     if unit == "ms_today" or (unit == "auto" and _OF_DAY.fullmatch(simplify_name(column.name))):
-        return Clock("day", _fill_rows(np.round(values * 1e6).astype(np.int64), known), known)
+        return Clock("day", _unwrap_days(pl.Series(parse_stamps_ns(filled, "ms")).set(unknown, None)))
     named = split_unit(column.name)[1] or _COUNTERS.get(simplify_name(column.name), "")
-    stated = unit if unit != "auto" else named if named in STAMP_UNITS else ""
-    ns = parse_stamps_ns(values, stated or "auto")
-    is_guessed = isinstance(ns, str)
-    if unit == "auto" and is_guessed and _is_hhmmss(values):
-        seconds = values // 10_000 * 3600 + values // 100 % 100 * 60 + values % 100
-        return Clock(
-            "day", _fill_rows(np.round(seconds * 1e9).astype(np.int64), known), known, sample=f"{values[0]:.10g}"
-        )
+    ns, guessed = parse_stamps_ns(filled, named if unit == "auto" and named in STAMP_UNITS else unit), ""
     if isinstance(ns, str):
         step = float(np.median(np.diff(values))) if values.size > 1 else 0.0
-        stated = next((name for name, one in _COARSEST if 0 < step * one / 1e9 <= _SLOWEST_STEP_S), "s")
-        ns = np.asarray(parse_stamps_ns(values, stated), np.int64)
+        guessed = next((name for name, one in _COARSEST if 0 < step * one / 1e9 <= _SLOWEST_STEP_S), "s")
+        ns = np.asarray(parse_stamps_ns(filled, guessed), np.int64)
     is_utc = YEARS_S[0] < float(np.median(ns)) / 1e9 < YEARS_S[1]
-    return Clock("utc" if is_utc else "counter", _fill_rows(ns, known), known, stated, is_guessed=is_guessed)
-
-
-def _is_hhmmss(values: NDArray[np.generic]) -> bool:
-    """Return whether numbers are hours, minutes and seconds in one, as in NMEA sentences: seconds use all of a minute and no more."""
-    parts = np.asarray(values, np.float64) % 100.0
-    return bool(0.5 * _MINUTE_S < np.ptp(parts) < _MINUTE_S < np.ptp(values) and np.max(values) < 240_000.0)
-
-
-def _fill_rows(ns: Integers, known: NDArray[np.bool_]) -> Integers:
-    """Return the stamps of known rows at their rows, 0 elsewhere."""
-    found = np.zeros(len(known), np.int64)
-    found[known] = ns
-    return found
+    return Clock("utc" if is_utc else "counter", pl.Series(ns).set(unknown, None), guessed)
 
 
 def _make_clock(kind: Kind, times: pl.Series, sample: str) -> Clock:
     """Return the clock of dates or times; the name of the column may state GPS time."""
-    counted = (times if kind == "day" else times.cast(pl.Datetime("ns"))).cast(pl.Int64)
-    known, ns = counted.is_not_null().to_numpy(), counted.fill_null(0).to_numpy()
+    ns = (times if kind == "day" else times.cast(pl.Datetime("ns"))).cast(pl.Int64)
     if kind == "local" and times.name == _GPS_TIME:
-        return Clock("utc", utc_from_gps_ns(ns), known, sample=sample)
-    return Clock(kind, ns, known, sample=sample)
+        utc = pl.Series(utc_from_gps_ns(ns.fill_null(0).to_numpy()))
+        return Clock("utc", utc.set(ns.is_null(), None), sample=sample)
+    return Clock(kind, _unwrap_days(ns) if kind == "day" else ns, sample=sample)
 
 
 def _parse_times(column: pl.Series, form: str) -> Clock | str | None:
@@ -205,49 +178,47 @@ def _has_zone(kind: pl.DataType) -> bool:
     return isinstance(kind, pl.Datetime) and kind.time_zone is not None
 
 
-def _unwrap_days(ns: Integers, known: NDArray[np.bool_]) -> Integers:
+def _is_utc(name: str) -> bool:
+    return _OF_UTC.fullmatch(simplify_name(name)) is not None
+
+
+def _unwrap_days(ns: pl.Series) -> pl.Series:
     """Return times of day [ns] with a day added at each midnight that the rows pass."""
-    found = ns.copy()
-    found[known] += _DAY_NS * np.cumsum(np.diff(ns[known], prepend=ns[known][:1]) < -_DAY_NS // 2)
-    return found
+    return ns + _DAY_NS * (ns.forward_fill().diff() < -_DAY_NS // 2).fill_null(value=False).cum_sum().cast(pl.Int64)
 
 
-def _find_midnight(stated: str, path: Path, last_ns: int, zone: str) -> tuple[int, tuple[str, ...]] | str:
-    """Return the midnight [ns, local time] from which times of day count, and a note where it is assumed.
+def _convert_to_utc(clock: Clock, zone: str, stated: str, path: Path) -> Clock | str:
+    """Return local times, or times of day, in UTC, null where there is no such time; of an hour that comes twice the first.
 
-    The date is the recipe's, else that in the file's name, else the one at which the last row is nearest to the file's last change.
+    The date of times of day is the ``stated`` one, else that in the file's name, else the one at which the last row is nearest to the
+    file's last change. `PolarsError`: there is no such zone.
     """
-    named = _DATE_IN_NAME.search(path.stem)
-    text = stated or ("-".join(named.group(1, 3, 4)) if named else "")
-    if text:
+    notes, ns = clock.notes, clock.ns
+    if clock.kind == "day":
+        named = _DATE_IN_NAME.search(path.stem)
         try:
-            return (date.fromisoformat(text) - date(1970, 1, 1)).days * _DAY_NS, ()
+            day = date.fromisoformat(stated or ("-".join(named.group(1, 3, 4)) if named else ""))
         except ValueError:
             if stated:
-                return f"stamp_date is {stated!r}; expected a column of {path.name}, or a date, as 2025-07-09"
-    changed = pl.Series([datetime.fromtimestamp(path.stat().st_mtime, UTC)]).dt.cast_time_unit("ns")
-    changed_ns = int(changed.dt.convert_time_zone(zone).dt.replace_time_zone(None).cast(pl.Int64)[0])
-    days = round((changed_ns - last_ns) / _DAY_NS)
-    day = date(1970, 1, 1) + timedelta(days=days)
-    return days * _DAY_NS, (f"{day} by the last change of the file; state stamp_date if that is wrong",)
-
-
-def _convert_to_utc(ns: Integers, zone: str) -> Integers:
-    """Return local times [ns] as UTC, 0 where there is no such time; of an hour that comes twice the first. `PolarsError`: no such zone."""
-    local = pl.Series(ns).cast(pl.Datetime("ns")).dt.replace_time_zone(zone, ambiguous="earliest", non_existent="null")
-    return local.dt.convert_time_zone("UTC").cast(pl.Int64).fill_null(0).to_numpy()
+                return f"stamp_date is {stated!r}; expected a column of dates of {path.name}, or a date, as 2025-07-09"
+            changed = pl.Series([datetime.fromtimestamp(path.stat().st_mtime, UTC)]).dt.convert_time_zone(zone)
+            middle = changed.dt.replace_time_zone(None)[0] - timedelta(microseconds=ns.drop_nulls()[-1] // 1000)
+            day = (middle + timedelta(hours=12)).date()
+            notes = (f"{day} by the last change of the file; state stamp_date if that is wrong",)
+        ns = ns + (day - date(1970, 1, 1)).days * _DAY_NS
+    local = ns.cast(pl.Datetime("ns")).dt.replace_time_zone(zone, ambiguous="earliest", non_existent="null")
+    return replace(clock, kind="utc", ns=local.dt.convert_time_zone("UTC").cast(pl.Int64), notes=notes)
 
 
 def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:
     """Return stamps shifted onto UTC by a coarser column: by the median over the rows in which that column changes."""
-    both = clock.known & utc.known & (utc.ns > YEARS_S[0] * 1e9)
-    changes = np.flatnonzero(both & (np.diff(utc.ns, prepend=utc.ns[:1]) != 0))
-    rows = changes if changes.size else np.flatnonzero(both)
-    if not rows.size:
+    apart = (utc.ns - clock.ns).set(utc.ns <= int(YEARS_S[0] * 1e9), None)
+    at_changes = apart.filter((utc.ns.diff() != 0) & apart.is_not_null())
+    apart = at_changes if len(at_changes) else apart.drop_nulls()
+    if not len(apart):
         return "stamp_utc has no times since 1979"
-    apart = utc.ns[rows] - clock.ns[rows]
-    offset = int(np.median(apart))
-    share = float(np.mean(np.abs(apart - offset) > _MAX_TIE_SPREAD_NS))
+    offset = int(np.median(apart.to_numpy()))
+    share = float(np.mean(np.abs(apart.to_numpy() - offset) > _MAX_TIE_SPREAD_NS))
     notes = (f"{share:.0%} of its UTC stamps are 2 s or more from the others",) if share > _MAX_STRAY_SHARE else ()
     return replace(clock, kind="utc", ns=clock.ns + offset, notes=(*utc.notes, *notes))
 
@@ -260,34 +231,32 @@ def choose_clock(columns: Mapping[str, pl.Series]) -> tuple[Clock, RecipeKeys] |
     """
     dates = next((column for name, column in columns.items() if re.fullmatch("(.*_)?date", simplify_name(name))), None)
     read = {name: _read_candidate(column, dates) for name, column in columns.items()}
-    found = {name: each for name, each in read.items() if each and np.count_nonzero(each[0].known) > 1}
+    found = {name: each for name, each in read.items() if each and each[0].ns.count() > 1}
     if not found:
         return None
     rows = {name: clock.count_stamps() for name, (clock, _) in found.items()}
     fast = [name for name in found if rows[name] >= _MIN_FAST_SHARE * max(rows.values())]
     clock, keys = found[max(fast, key=lambda name: (_PREFERRED.index(found[name][0].kind), not found[name][0].sample))]
     utc = next((name for name, (other, _) in found.items() if other.kind == "utc"), "")
-    if clock.is_guessed or (clock.kind == "day" and not clock.sample):
-        keys["stamp_unit"] = ("ms_today", "", True) if clock.kind == "day" else (clock.unit, "by its steps", True)
+    if clock.unit or (clock.kind == "day" and not clock.sample):
+        keys["stamp_unit"] = (clock.unit, "by its steps", True) if clock.unit else ("ms_today", "", True)
     if clock.kind != "utc" and utc and isinstance(tied := _tie_to_utc(clock, found[utc][0]), Clock):
         clock, keys["stamp_utc"] = tied, (utc, "coarser, but UTC", True)
-    elif clock.kind in ("local", "day") and not _OF_UTC.fullmatch(simplify_name(keys["stamp"][0])):
+    elif clock.kind in ("local", "day") and not _is_utc(keys["stamp"][0]):
         keys["stamp_zone"] = "UTC", 'or as "Europe/Vienna": the zone of times without one, of all tables', False
     return clock, keys
 
 
 def _read_candidate(column: pl.Series, dates: pl.Series | None) -> tuple[Clock, RecipeKeys] | None:
     """Return a column's clock and the keys of the recipe that it needs, None of a column that is no clock."""
-    clock, keys = read_clock(column), RecipeKeys()
+    clock, keys = _read_dated(column, dates), RecipeKeys()
     if isinstance(clock, str) and "stamp_format" in clock:
         keys["stamp_format"] = DAY_FIRST, clock, False
-        clock = read_clock(column, form=DAY_FIRST)
-    elif isinstance(clock, Clock) and clock.kind == "day" and clock.sample and dates is not None:
-        joined = read_clock((dates.cast(pl.String) + " " + column.cast(pl.String)).alias(column.name))
-        if isinstance(joined, Clock):
-            clock, keys["stamp_date"] = joined, (dates.name, "", True)
+        clock = _read_dated(column, dates, form=DAY_FIRST)
     if isinstance(clock, str):
         return None
-    if clock.kind == "local" and _OF_UTC.fullmatch(simplify_name(column.name)):
+    if dates is not None and clock.kind != "day" and getattr(read_clock(column), "kind", "") == "day":
+        keys["stamp_date"] = dates.name, "", True
+    if clock.kind == "local" and _is_utc(column.name):
         clock = replace(clock, kind="utc")
     return clock, {"stamp": (column.name, clock.sample, True), **keys}

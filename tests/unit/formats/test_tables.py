@@ -48,7 +48,7 @@ def test_a_tum_trajectory_and_a_solution_of_rtklib(tmp_path):
     assert read_column_names(pos)[:2] == ["GPST", "latitude(deg)"]
     found = read_cells(pos, stamps=["GPST"], columns=["latitude(deg)", "sdn(m)"])
     clock = read_clock(found.stamps["GPST"])
-    assert (clock.kind, clock.ns.tolist()) == ("utc", [ns(2025, 10, 14, 15, 41, 25) - 17_300_000_000])
+    assert (clock.kind, clock.ns.to_list()) == ("utc", [ns(2025, 10, 14, 15, 41, 25) - 17_300_000_000])
     assert [values.tolist() for values in found.columns.values()] == [[47.123456789], [0.01]]
 
 
@@ -61,8 +61,8 @@ def test_stamps_in_words_are_local_times_unless_they_state_a_zone(tmp_path, text
     path.write_text(f"time,a\n{text},1\n{text},2\nnever,3\n")
     clock = read_clock(read_cells(path, stamps=["time"], columns=["a"]).stamps["time"])
     assert clock.kind == ("utc" if text.endswith(("Z", "+02:00")) else "local")
-    assert clock.ns[:2].tolist() == [ns(2025, 10, 14, 15, 41, 25) + 500_000_000] * 2
-    assert clock.known.tolist() == [True, True, False]
+    assert clock.ns.head(2).to_list() == [ns(2025, 10, 14, 15, 41, 25) + 500_000_000] * 2
+    assert clock.ns.is_null().to_list() == [False, False, True]
 
 
 def test_text_among_numbers_is_counted_and_an_open_quote_costs_its_line(tmp_path):
@@ -71,7 +71,7 @@ def test_text_among_numbers_is_counted_and_an_open_quote_costs_its_line(tmp_path
     found = read_cells(path, stamps=["t"], columns=["a"])
     np.testing.assert_array_equal(found.columns["a"][:5], [2.0, np.nan, np.nan, np.nan, 6.0])
     assert found.texts == {"a": (2, 2, "fast")}
-    assert read_clock(found.stamps["t"]).known.tolist() == [True] * 5 + [False]
+    assert read_clock(found.stamps["t"]).ns.is_null().to_list() == [False] * 5 + [True]
 
 
 def test_parquet_with_times_and_text(tmp_path):
@@ -80,7 +80,7 @@ def test_parquet_with_times_and_text(tmp_path):
     pl.DataFrame({"time": times, "a": [1, 2], "b": ["3.5", "x"]}).write_parquet(path)
     found = read_cells(path, stamps=["time"], columns=["a", "b"])
     clock = read_clock(found.stamps["time"])
-    assert (clock.kind, clock.ns.tolist()) == ("utc", [ns(2025, 10, 14)] * 2)
+    assert (clock.kind, clock.ns.to_list()) == ("utc", [ns(2025, 10, 14)] * 2)
     assert found.columns["a"].tolist() == [1.0, 2.0]
     assert found.columns["b"][0] == 3.5
     assert found.texts == {"b": (1, 2, "x")}

@@ -320,15 +320,6 @@ def test_a_time_of_day_passes_midnight(tmp_path):
     assert set(np.diff(stamps_of(tmp_path, rows, mapping))) == {20_000_000}
 
 
-def test_hours_minutes_and_seconds_in_one_number_are_a_time_of_day_of_utc(tmp_path):
-    second = 12 + np.arange(100)
-    rows = "".join(f"{120_000 + 100 * (3 + of // 60) + of % 60}.0,1.0\n" for of in second)
-    (tmp_path / "drive_2025-07-09.csv").write_text(f"utc,v\n{rows}")
-    mapping = TableMapping("drive_2025-07-09.csv", columns={"linear_x": "v"})
-    table = open_tables(tmp_path, {"wheel_odometry": mapping}).tables(["/wheel_odometry"])["/wheel_odometry"]
-    assert table["log_time_ns"].to_pylist() == (NOON_NS + np.arange(100) * 10**9).tolist()
-
-
 def test_a_counter_is_tied_to_utc_by_whole_seconds_beside_it(tmp_path):
     rows = [f"{5000 + 20 * k},,{NOON_NS // 10**9 + k // 50}" for k in range(200)]
     found = stamps_of(tmp_path, rows, TableMapping(stamp_unit="ms", stamp_utc="utc"))
@@ -341,7 +332,7 @@ def test_wrong_keys_of_stamps_are_named(tmp_path):
         (TableMapping(stamp_zone="Europe/Wien"), "Europe/Wien"),
         (
             TableMapping(stamp_zone="UTC", stamp_date="yesterday"),
-            "expected a column of odom.csv, or a date, as 2025-07-09",
+            "expected a column of dates of odom.csv, or a date, as 2025-07-09",
         ),
         (TableMapping(stamp_utc="gps"), "stamp_utc: odom.csv has no column gps"),
         (
