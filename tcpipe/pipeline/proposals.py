@@ -272,13 +272,6 @@ _MAX_REJECTED_SHARE = 0.2
 _SCALE_TOLERANCE = 0.03
 _CONTRADICTIONS = ("unit-suspected", "distance-contradicted", "drives-backwards", "path-unlike")
 """Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
-_HINTS = {
-    "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
-    "imu": r"(.*_)?(a|g|w|acc|gyr|imu|omega|rot)([a-z]*_?[xyz]|\w{2,})",
-    "wheel_odometry": r".*(speed|vel|rpm|wheel|odo|enc|tach).*",
-    "power": r".*(volt|curr|amp|power|watt|bat|energy|^[uiv]).*",
-}
-"""Names in English of columns that may be of a role, in lower case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,13 +283,7 @@ class _Table:
     names: Sequence[str]
     numbers: Mapping[str, Floats]
     clock: Clock
-    rows: int
-    """Number of different stamps."""
     stamp_lines: Mapping[str, _Value]
-    words: Mapping[str, str]
-    """First text of columns of texts."""
-    duplicates: Mapping[str, str]
-    """Remark on each column whose name the header has several times."""
 
     def overlap_ns(self, other: _Table) -> int:
         """Return the time that two tables have in common; that of stamps of different kinds, but for counters, is unknown."""
@@ -336,10 +323,10 @@ def propose_tables(path: Path) -> ProposedRecipe:
     if not roles:
         what = f"{path}: it contains no log, and no table with stamps and columns of known names"
         raise UsageError(what, *filter(None, head))
-    reference = max(next(iter(roles.values())), key=lambda candidate: candidate[0].rows)[0]
+    reference = max(next(iter(roles.values())), key=lambda candidate: candidate[0].clock.count_stamps())[0]
     lines, log, used = list[ProposedLine](), path, set[str]()
     for role, candidates in roles.items():
-        candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(reference), -candidate[0].rows))
+        candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(reference), -candidate[0].clock.count_stamps()))
         table, mine = candidates[0]
         if not table.overlap_ns(reference):
             apart = "no time in common with the others: another clock, or another drive"
@@ -347,15 +334,15 @@ def propose_tables(path: Path) -> ProposedRecipe:
         lines += mine
         used |= {line.value for line in mine if isinstance(line.value, str)}
         log = table.path if "*" in table.file else log
-        head += [f"{other.file}, {other.rows} rows, could be {role} as well" for other, _ in candidates[1:]]
+        head += [f"{other.file} could be {role} as well" for other, _ in candidates[1:]]
     rails = {make_rail_name(line.table) for line in lines if line.key == "columns.voltage"}
     needless = [line for line in lines if line.key == "stamp_zone"][1:]
     needless += [line for line in lines if line.note == NO_VOLTAGE and make_rail_name(line.table) in rails]
     lines = [line for line in lines if line not in needless]
     lines, tried = _try_lines(lines, log)
+    found_roles = {*roles, *(line.value for line in lines if line.key == "role")}
     for role in ("gnss", "imu", "wheel_odometry", "power"):
-        is_found = role in roles or (role == "power" and any(line.value == "power" for line in lines))
-        lines += [] if is_found else _propose_rest(role, tables, " ".join(used))
+        lines += [] if role in found_roles else _propose_rest(role, tables, " ".join(used))
     lines += [*tried, *propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)]
     return ProposedRecipe(head, lines, format_path(log))
 
@@ -388,24 +375,16 @@ def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[st
 
 def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     """Return a table with the stamps that suit best, None without stamps."""
-    from tcpipe.formats.logs.table_log import describe_duplicate, read_cells, read_numbers  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.formats.logs.table_log import read_cells, read_numbers  # noqa: PLC0415  polars only where a table is read
     from tcpipe.formats.logs.table_stamps import choose_clock  # noqa: PLC0415
 
-    named = [name for name in names if _STAMP.fullmatch(simplify_name(name))]
     is_measured = bool(match_power_fields(names[:1]) or find_quantity(names[0])) or any(
         names[0] in columns.values() for columns, _ in match_table_roles(file, names).values()
     )
+    named = [name for name in names if _STAMP.fullmatch(simplify_name(name))]
     candidates = named or ([] if is_measured else names[:1])
     chosen = choose_clock(read_cells(path, stamps=candidates, columns=[]).stamps) if candidates else None
-    if chosen is None:
-        return None
-    notes = {name: note for name in names if name and (note := describe_duplicate(name, names))}
-    numbers = read_numbers(path, names)
-    quality = [source.partition(": ")[2] for source in find_quality([name for name in names if name not in numbers])]
-    texts = read_cells(path, stamps=[], columns=[], words=quality).columns if quality else {}
-    words = {name: str(values[0]) for name, values in texts.items()}
-    clock, keys = chosen
-    return _Table(file, path, names, numbers, clock, clock.count_stamps(), keys, words, notes)
+    return _Table(file, path, names, read_numbers(path, names), *chosen) if chosen else None
 
 
 def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
@@ -417,14 +396,14 @@ def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
     live = [name for name in names if np.any(np.nan_to_num(table.numbers.get(name, np.zeros(1))))]
     matched = match_power_fields([quote(name) for name in live])
     rails, doubt = (matched.rails, matched.doubt) if matched else ((), "")
-    named = find_quantity(table.path.stem) if len(table.names) == 2 else None
+    quantity = find_quantity(table.path.stem) if len(table.names) == 2 else None
+    counters = [name for name in table.names if split_unit(name)[1] in UNITS["J"]]
     found: dict[str, Mapping[str, str]] = {
         f"power_{number}" if len(rails) > 1 else "power": rail for number, rail in enumerate(rails, 1)
     }
-    if named and not found:
-        found = {re.sub(r"\W+", "_", table.path.stem): {named: table.names[1]}}
-    counters = [name for name in table.names if split_unit(name)[1] in UNITS["J"]]
-    if counters and not found:
+    if quantity and not found:
+        found = {re.sub(r"\W+", "_", table.path.stem): {quantity: table.names[1]}}
+    elif counters and not found:
         found = {"power": {"energy": counters[0]}}
     for name, rail in found.items():
         if lines := _make_lines(table, name, "power", rail, doubt):
@@ -435,30 +414,36 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     """Return the lines of a table's mapping; [] where its values cannot be what its columns are called."""
     values, units = _read_values(table, role, columns)
     mapped = {field: text for field, text in columns.items() if field in values}
-    if not mapped or any(field not in mapped for field, known in MAPPED[role].items() if known.needed):
+    judged = None if _list_lacking(role, mapped) else _judge_values(role, mapped, values)
+    if judged is None:
         return []
-    twice = next((note for column, note in table.duplicates.items() if column in " ".join(mapped.values())), "")
-    doubt = doubt or _find_doubt(role, mapped, values) or twice
-    if doubt == _IMPOSSIBLE:
-        return []
-    head, certain = f"tables.{name}", not doubt
+    mapped, unclear = judged
+    twice = [column for column in table.names if f"{column}_duplicated_0" in table.names]
+    used_twice = [column for column in twice if column and column in " ".join(mapped.values())]
+    doubt = doubt or unclear or "".join(f"several columns are called {column}" for column in used_twice[:1])
     keys: _Values = {"role": ("power", "", True)} if name != role else {}
     keys |= {"file": (table.file, doubt, True), **table.stamp_lines}
     for field, text in mapped.items():
-        sample = "" if field == "quality" else format_first(values[field])
         is_assumed = text.endswith(_OVER_TRACK)
+        sample = format_first(values[field]) if field != "quality" else ""
         keys[f"columns.{field}"] = (text, _TRACK_NOTE if is_assumed else sample, not is_assumed)
     keys |= {f"units.{field}": (units[field], "", keys[f"columns.{field}"][2]) for field in mapped if field in units}
-    if role == "gnss" and "quality" not in mapped:
-        for source in find_quality(table.names):
-            column = source.partition(": ")[2]
-            words = (f"words: {column}", table.words.get(column, ""), True)
-            keys["columns.quality"] = words if column in table.words else (source, _CODES_NOTE, False)
+    for source in find_quality(table.names) if role == "gnss" and "quality" not in mapped else ():
+        column = source.partition(": ")[2]
+        is_text = column not in table.numbers
+        keys["columns.quality"] = (f"words: {column}", "", True) if is_text else (source, _CODES_NOTE, False)
     if role == "power" and set(mapped) == {"current"}:
         keys |= {key: (volt, NO_VOLTAGE, False) for key, volt in NOMINAL.items()}
     return [
-        ProposedLine(head, key, value, note, is_certain=certain and sure) for key, (value, note, sure) in keys.items()
+        ProposedLine(f"tables.{name}", key, value, note, is_certain=not doubt and sure)
+        for key, (value, note, sure) in keys.items()
     ]
+
+
+def _list_lacking(role: str, fields: Collection[str]) -> list[str]:
+    """Return the fields that a role needs and does not have; of power one of two."""
+    needed = [field for field, known in MAPPED[role].items() if known.needed and field not in fields]
+    return needed if fields or needed else ["voltage", "current"]
 
 
 _OVER_TRACK, _TRACK_NOTE = "/ 0.5", "state the track width in place of 0.5 m"
@@ -486,47 +471,39 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[
     return found, units
 
 
-_IMPOSSIBLE = "impossible"
-
-
-def _find_doubt(role: str, mapped: dict[str, str], values: Mapping[str, Floats]) -> str:
-    """Return what the values leave unclear, and correct ``mapped`` by the factors that they show."""
+def _judge_values(
+    role: str, mapped: Mapping[str, str], values: Mapping[str, Floats]
+) -> tuple[dict[str, str], str] | None:
+    """Return the columns with the factors that their values show, and what these leave unclear; None where they are no power."""
     if role in ("gnss", "imu"):
         judged, doubt = judge_fields(role, {field: quote(text) for field, text in mapped.items()}, values)
-        scaled = {field: text for field, text in judged.items() if text != quote(mapped[field])}
-        held = {field: scaled.get(field, text) for field, text in mapped.items() if field in judged}
-        mapped.clear()
-        mapped.update(held)
-        return doubt
-    if "energy" in values and np.ptp(values["energy"]) == 0.0:
-        return _IMPOSSIBLE
+        return {field: mapped[field] if text == quote(mapped[field]) else text for field, text in judged.items()}, doubt
     if role == "power" and not {"power", "energy"} & set(values):
         volt, amp = (values.get(field, np.full(1, np.nan)) for field in ("voltage", "current"))
-        return _IMPOSSIBLE if find_rejection(RailReadings("", volt, amp), "", {}) else ""
-    speed = values.get("linear_x", np.zeros(1))
-    is_fast = float(np.nanquantile(np.abs(speed), 0.99)) > MAX_PLAUSIBLE_MPS
-    return "its largest values are no m/s: state the unit" if is_fast else ""
+        return None if find_rejection(RailReadings("", volt, amp), "", {}) else (dict(mapped), "")
+    if "energy" in values and np.ptp(values["energy"]) == 0.0:
+        return None
+    fastest = np.nanquantile(np.abs(values.get("linear_x", np.zeros(1))), 0.99)
+    return dict(mapped), "its largest values are no m/s: state the unit" if fastest > MAX_PLAUSIBLE_MPS else ""
 
 
 def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[ProposedLine]:
-    """Yield the table of a role that is not found as comments, with what its columns could be and three values of each."""
+    """Yield the table of a role that is not found as comments, for the first that names or units of columns suggest, with three values of each."""
     units = {unit for field in MAPPED[role].values() if field.unit not in ("1", "m") for unit in UNITS[field.unit]}
-    needed = [field for field, known in MAPPED[role].items() if known.needed] or ["voltage", "current"]
     for table in tables:
         stamp = table.stamp_lines["stamp"][0]
         free = [name for name in table.numbers if name not in used and name != stamp]
-        likely = [
-            name for name in free if re.fullmatch(_HINTS[role], simplify_name(name)) or split_unit(name)[1] in units
-        ]
-        if likely:
-            values = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in likely)
-            pick = ", ".join(f"{name} ({three})" for name, three in zip(likely, values, strict=True))
-            known = match_known_fields(role, free)
-            keys = {f"columns.{field}": known.get(field, "column?") for field in dict.fromkeys([*needed, *known])}
-            for key, value in {"file": table.file, "stamp": stamp, **keys}.items():
-                note = f"{role} is not recognised: pick from {pick}" if key == "file" else ""
-                yield ProposedLine(f"tables.{role}", key, value, note, is_certain=False)
-            return
+        known = match_known_fields(role, free)
+        if not known and not any(split_unit(name)[1] in units for name in free):
+            continue
+        values = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in free)
+        pick = ", ".join(f"{name} ({three})" for name, three in zip(free, values, strict=True))
+        fields = {**dict.fromkeys(_list_lacking(role, ()), "column?"), **known}
+        note = f"{role} is not recognised: pick from {pick}"
+        yield ProposedLine(f"tables.{role}", "file", table.file, note, is_certain=False)
+        for key, value in {"stamp": stamp, **{f"columns.{field}": name for field, name in fields.items()}}.items():
+            yield ProposedLine(f"tables.{role}", key, value, is_certain=False)
+        return
 
 
 def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedLine], list[ProposedLine]]:
@@ -554,8 +531,7 @@ def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedL
             remedies = (line for remedy in finding.remedies for line in propose_lines(remedy.recipe, {}, ""))
             added += [replace(line, note=why) for line in remedies]
         elif finding.code == "odometry-scale" and blamed == "wheel_odometry":
-            lines, units = _scale_speed(lines, finding.numbers["scale"], why)
-            added += units
+            lines = _scale_speed(lines, finding.numbers["scale"], why)
     if any(str(line.value).endswith(_TIMES_RADIUS) for line in lines):
         reasons["wheel_odometry"] = "state the wheels' radius in place of 0.1 m"
     kept = list[ProposedLine]()
@@ -566,17 +542,16 @@ def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedL
     return kept, [line for line in added if line.table.removeprefix("tables.") not in reasons]
 
 
-def _scale_speed(
-    lines: Sequence[ProposedLine], scale: float, why: str
-) -> tuple[list[ProposedLine], list[ProposedLine]]:
-    """Return the lines with the radius of wheels by the scale of their speed, and the line of a unit that the scale shows."""
-    for at, line in enumerate(lines):
-        if (text := str(line.value)).endswith(_TIMES_RADIUS):
-            text = f"{text.removesuffix(_TIMES_RADIUS)} * {0.1 / scale:.4g}"
-            return [*lines[:at], replace(line, value=text, note=f"the wheels' radius {why}"), *lines[at + 1 :]], []
+def _scale_speed(lines: Sequence[ProposedLine], scale: float, why: str) -> list[ProposedLine]:
+    """Return the lines with the radius of wheels by the scale of their speed, or with the unit that the scale shows."""
+    of_revolutions = [line for line in lines if str(line.value).endswith(_TIMES_RADIUS)]
+    if of_revolutions:
+        text = str(of_revolutions[0].value).removesuffix(_TIMES_RADIUS)
+        scaled = replace(of_revolutions[0], value=f"{text} * {0.1 / scale:.4g}", note=f"the wheels' radius {why}")
+        return [scaled if line in of_revolutions else line for line in lines]
     unit = next((unit for unit, mps in UNITS["m/s"].items() if abs(scale * mps - 1.0) < _SCALE_TOLERANCE), "m/s")
     is_stated = unit == "m/s" or any(line.key == "units.linear_x" for line in lines)
-    return [*lines], [] if is_stated else [ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)]
+    return [*lines, *([] if is_stated else [ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)])]
 
 
 def _fuse_first_minute(log: Path, recipe: Recipe) -> tuple[Finding, ...]:
