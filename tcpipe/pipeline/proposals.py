@@ -284,6 +284,7 @@ class _Table:
     numbers: Mapping[str, Floats]
     clock: Clock
     stamp_lines: Mapping[str, _Value]
+    duplicates: Sequence[str]
 
     def overlap_ns(self, other: _Table) -> int:
         """Return the time that two tables have in common; that of stamps of different kinds, but for counters, is unknown."""
@@ -375,7 +376,7 @@ def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[st
 
 def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     """Return a table with the stamps that suit best, None without stamps."""
-    from tcpipe.formats.logs.table_log import read_cells, read_numbers  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.formats.logs.table_log import find_duplicates, read_cells, read_numbers  # noqa: PLC0415  polars only where a table is read
     from tcpipe.formats.logs.table_stamps import choose_clock  # noqa: PLC0415
 
     is_measured = bool(match_power_fields(names[:1]) or find_quantity(names[0])) or any(
@@ -384,7 +385,7 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     named = [name for name in names if _STAMP.fullmatch(simplify_name(name))]
     candidates = named or ([] if is_measured else names[:1])
     chosen = choose_clock(read_cells(path, stamps=candidates, columns=[]).stamps) if candidates else None
-    return _Table(file, path, names, read_numbers(path, names), *chosen) if chosen else None
+    return _Table(file, path, names, read_numbers(path, names), *chosen, find_duplicates(names)) if chosen else None
 
 
 def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
@@ -418,9 +419,8 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     if judged is None:
         return []
     mapped, unclear = judged
-    twice = [column for column in table.names if f"{column}_duplicated_0" in table.names]
-    used_twice = [column for column in twice if column and column in " ".join(mapped.values())]
-    doubt = doubt or unclear or "".join(f"several columns are called {column}" for column in used_twice[:1])
+    twice = [column for column in table.duplicates if column and column in " ".join(mapped.values())]
+    doubt = doubt or unclear or "".join(f"several columns are called {column}" for column in twice[:1])
     keys: _Values = {"role": ("power", "", True)} if name != role else {}
     keys |= {"file": (table.file, doubt, True), **table.stamp_lines}
     for field, text in mapped.items():
@@ -488,7 +488,7 @@ def _judge_values(
 
 
 def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[ProposedLine]:
-    """Yield the table of a role that is not found as comments, for the first that names or units of columns suggest, with three values of each."""
+    """Yield the table of a role that is not found as comments, for the first that names or units suggest, with three values of each."""
     units = {unit for field in MAPPED[role].values() if field.unit not in ("1", "m") for unit in UNITS[field.unit]}
     for table in tables:
         stamp = table.stamp_lines["stamp"][0]

@@ -11,9 +11,9 @@ no header), what is comment. A cell that is no number where one is wanted is cou
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -88,26 +88,32 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
         for column, (_, row, text) in cells.texts.items()
         if not np.isfinite(cells.columns[column]).any()
     ]
-    twice = [note for column in (stamp, *cells.columns) if (note := describe_duplicate(column, names))]
     stamps = find_stamps(cells.stamps, stamp, mapping, zone=zone, path=path)
     if isinstance(stamps, str):
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamps}"]
-    cells = replace(cells, notes=(*cells.notes, *twice))
     if empty:
         return empty
     source = mapping.make_power_source(name)
     read_as = find_topic(name, role, mapping.columns, source.type if source else None)
-    return _read_messages((*read_as, role), mapping, cells, values, stamps)
+    damage = [
+        Damage("table-cells", mapping.file, messages_lost=count, reason=f"column {column}, row {row}: {text!r}")
+        for column, (count, row, text) in cells.texts.items()
+    ]
+    for column in find_duplicates(names):
+        if column in (stamp, *cells.columns):
+            note = f"several columns are called {column}: the first is read, {column}_duplicated_0 is the next"
+            damage.append(Damage("table-cells", mapping.file, messages_lost=0, reason=note))
+    return _read_messages((*read_as, role), mapping.file, values, stamps, damage)
 
 
 def _read_messages(
     read_as: tuple[str, str, str],
-    mapping: TableMapping,
-    cells: Cells,
+    file: str,
     values: Mapping[str, NDArray[np.float64]],
     stamps: Clock,
+    damage: Sequence[Damage],
 ) -> TopicMessages:
-    """Return a table as the messages of its topic, type and role, in order of time, and its damage.
+    """Return a table as the messages of its topic, type and role, in order of time, and its damage with that of its cells.
 
     Rows without any of the values are no messages: several sensors share a table, and each row is of one of them.
     """
@@ -115,17 +121,12 @@ def _read_messages(
     has_value = np.any([np.isfinite(value) for value in values.values()], axis=0)
     is_used = stamps.ns.is_not_null().to_numpy() & (has_value if has_value.any() else True)
     lost = stamps.ns.null_count()
-    damage = [Damage("time-invalid", mapping.file, messages_lost=lost)] if lost else []
-    damage += [
-        Damage("table-cells", mapping.file, messages_lost=count, reason=f"column {column}, row {row}: {text!r}")
-        for column, (count, row, text) in cells.texts.items()
-    ]
-    damage += [Damage("table-cells", mapping.file, messages_lost=0, reason=note) for note in cells.notes]
-    damage += [Damage("stamps-assumed", mapping.file, messages_lost=0, reason=note) for note in stamps.notes]
+    damage = [*([Damage("time-invalid", file, messages_lost=lost)] if lost else []), *damage]
+    damage += [Damage("stamps-assumed", file, messages_lost=0, reason=note) for note in stamps.notes]
     order = np.flatnonzero(is_used)
     stamp_ns = stamps.ns.fill_null(0).to_numpy()[order]
     if backward := int(np.count_nonzero(np.diff(stamp_ns) < 0)):
-        damage.append(Damage("messages-unordered", mapping.file, messages_lost=0, places=backward))
+        damage.append(Damage("messages-unordered", file, messages_lost=0, places=backward))
         by_time = np.argsort(stamp_ns, kind="stable")
         order, stamp_ns = order[by_time], stamp_ns[by_time]
     values = {field: value[order] for field, value in values.items()}
@@ -169,25 +170,31 @@ _EDGES = re.compile(rb"^ | (?=\r?$)", re.MULTILINE)
 class Cells:
     """Columns that were read, shape (N,): ``columns`` as numbers, NaN where there is none, ``stamps`` as they are in the file.
 
-    ``texts`` has by column the number of cells that are no number, and row (from 1) and text of the first; ``notes`` are remarks on the
-    file's form.
+    ``texts`` has by column the number of cells that are no number, and row (from 1) and text of the first.
     """
 
     stamps: dict[str, pl.Series]
     columns: dict[str, NDArray[np.float64]]
     texts: dict[str, tuple[int, int, str]]
-    notes: tuple[str, ...] = ()
+
+
+@contextmanager
+def _report_unreadable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
 
 
 def read_column_names(path: Path) -> list[str]:
     """Return what the columns of a table are called; `LogError` where it cannot be read."""
-    return _scan(path).collect_schema().names()
+    with _report_unreadable(path):
+        return _scan(path).collect_schema().names()
 
 
-def describe_duplicate(column: str, names: Sequence[str]) -> str:
-    """Return what a header that has a column's name several times means; "" where it has not."""
-    second = f"{column}_duplicated_0"
-    return f"several columns are called {column}: the first is read, {second} is the next" if second in names else ""
+def find_duplicates(names: Sequence[str]) -> list[str]:
+    """Return the columns whose name the header has several times: the first is read, the next is ``<name>_duplicated_0``."""
+    return [name for name in names if f"{name}_duplicated_0" in names]
 
 
 def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], words: Sequence[str] = ()) -> Cells:
@@ -196,31 +203,19 @@ def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], wor
     `LogError`: the file cannot be read as a table.
     """
     wanted = [name for name in dict.fromkeys(columns) if name not in words]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            frame = _collect_columns(path, [*dict.fromkeys([*stamps, *wanted, *words])], numbers=wanted)
-            numbers = {name: frame[name].cast(pl.Float64, strict=False) for name in wanted}
-            texts = {
-                name: odd for name in wanted if numbers[name].null_count() and (odd := _find_non_number(path, name))
-            }
-        except (pl.exceptions.PolarsError, OSError) as error:
-            raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
-    return Cells(
-        {name: frame[name] for name in stamps},
-        {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()}
-        | {name: frame[name].to_numpy() for name in words},
-        texts,
-        tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in caught)),
-    )
+    with _report_unreadable(path):
+        frame = _collect_columns(path, [*dict.fromkeys([*stamps, *wanted, *words])], numbers=wanted)
+        numbers = {name: frame[name].cast(pl.Float64, strict=False) for name in wanted}
+        texts = {name: odd for name in wanted if numbers[name].null_count() and (odd := _find_non_number(path, name))}
+    read = {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()}
+    read |= {name: frame[name].to_numpy() for name in words}
+    return Cells({name: frame[name] for name in stamps}, read, texts)
 
 
 def read_numbers(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Return the first rows of columns that contain numbers, shape (rows,), NaN where a cell has none; `LogError`: it is no table."""
-    try:
+    with _report_unreadable(path):
         frame = _collect_columns(path, [*names], numbers=[*names], rows=_SAMPLE_ROWS)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
     numbers = {name: frame[name].cast(pl.Float64) for name in names if frame[name].dtype.is_numeric()}
     return {name: of.fill_null(np.nan).to_numpy() for name, of in numbers.items() if of.null_count() < len(of)}
 
@@ -260,11 +255,8 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
     """Return a table's lazy frame, with ``numbers`` read as such; None reads every cell of a text as it stands."""
     if path.suffix == ".parquet":
         return pl.scan_parquet(path)
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except OSError as error:
-        raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
     comments, lines = _split_comment_lines(head)
     if not lines:
         raise LogError(f"{path}: it contains no table: it is empty")

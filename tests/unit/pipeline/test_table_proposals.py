@@ -142,6 +142,12 @@ def test_what_a_role_measures_is_no_stamp(tmp_path, columns):
         propose_recipe(tmp_path)
 
 
+def test_a_file_that_is_no_table_is_named_beside_the_others(tmp_path):
+    write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES)
+    (tmp_path / "broken.parquet").write_bytes(b"no parquet")
+    assert "broken.parquet: it cannot be read as a table" in propose_recipe(tmp_path).toml()
+
+
 def test_what_tcpipe_wrote_is_no_table(tmp_path):
     write(tmp_path / "samples.csv", time=SECONDS + UTC_S, **FIXES)
     (tmp_path / "dataset.json").write_text("{}")
