@@ -44,15 +44,13 @@ from tcpipe.power.sources import (
     RailReadings,
     find_quantity,
     find_rejection,
-    find_sources,
     list_power_lists,
     make_rail_name,
-    read_rails,
 )
 from tcpipe.recipe import Recipe, Role
 from tcpipe.recipe.checking import as_toml, from_values
 from tcpipe.recipe.suggestions import Keys, TomlValue, format_first, make_place_to_measure
-from tcpipe.robots import MAX_PLAUSIBLE_MPS, Profiles
+from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, find_proposals, judge_fields
 from tcpipe.stages.read import decide_roles, find_read_config, read_run
@@ -200,7 +198,7 @@ def propose_for_log(
         pose, by = places.get(cast("Role", role.name), (None, ""))
         place = f"; at {np.round(pose.xyz_m, 3).tolist()} m ({by})" if pose and by in ("tf_static", "recipe") else ""
         for name in role.topics:
-            sample = _describe_sample(columns.get(name, {}), log.topics[name], role.name, (assigned, known))
+            sample = _describe_sample(columns.get(name, {}), log.topics[name], role.name)
             head.append(f"{role.name}: {name}{sample}{place}")
     decided = {*assigned.roles, *assigned.choices, *config.topics}
     lacking = [role for role in ("gnss", "imu", "wheel_odometry", "power", "command") if role not in decided]
@@ -239,23 +237,15 @@ def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterato
         yield ProposedLine("read.topics", "command", twists[:1], "if it commands the velocity", is_certain=False)
 
 
-def _describe_sample(columns: Columns, topic: Topic, role: str, by: tuple[RoleAssignment, Profiles]) -> str:
-    """Return how many messages a topic has, and values by what its role needs."""
-    (assigned, known), kind = by, topic.type_name
+def _describe_sample(columns: Columns, topic: Topic, role: str) -> str:
+    """Return how many messages a topic has, and values of a message that is usual for its role."""
     count = "" if topic.message_count is None else f", {topic.message_count} messages"
-    if role == "power":
-        platform = known.robots[assigned.robot].platform
-        choices = find_sources(kind, topic.name, known.power_sources, platform=platform, husky_power="battery")
-        rails = [] if isinstance(choices, Finding) else read_rails(columns, choices[0], topic.name)
-        read = [] if isinstance(rails, Finding) else rails
-        return count + "".join(
-            f", {format_first(rail.voltage_volt)} V, {format_first(rail.current_amp)} A" for rail in read
-        )
-    needed = {name: field.message for name, field in MAPPED[role].items() if field.needed and field.message in columns}
-    named = (
-        [*needed.items()][-3:] if kind == MAPPED_TYPES[role] else []
-    )  # of an IMU the accelerations, which show gravity
-    return count + "".join(f", {name} {format_first(columns[message])}" for name, message in named)
+    shown = [
+        (name, field.message)
+        for name, field in MAPPED[role].items()
+        if (field.needed or role == "power") and field.message in columns and topic.type_name == MAPPED_TYPES[role]
+    ]  # of an IMU the last three are accelerations, which show gravity
+    return count + "".join(f", {name} {format_first(columns[message])}" for name, message in shown[-3:])
 
 
 Floats = NDArray[np.float64]
@@ -458,7 +448,7 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[
     """
     found, units = dict[str, Floats](), dict[str, str]()
     for field, text in columns.items():
-        unit, expression = MAPPED[role][field].unit, parse_expression(text.rpartition(": ")[2], table.names)
+        unit, expression = MAPPED[role][field].unit, parse_expression(text, table.names)
         other = None if expression.column else find_other_unit(expression, unit)
         units |= {field: other if other in UNITS[unit] else unit} if other else {}
         stated = {field: units[field]} if field in units else {}

@@ -26,7 +26,6 @@ from tcpipe.power.sources import (
     is_of_drives,
     make_rail_name,
     read_rails,
-    reject_power,
 )
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import Keys, format_first, suggest
@@ -51,7 +50,7 @@ def find_proposals(
     known_types = {*known.types(), *(type_name for types in ROLE_TYPES.values() for type_name in types)}
     of_role = {
         (role, topic): fields
-        for role in _PROPOSED
+        for role in ("gnss", "imu")  # whose fields are called so that nothing else is taken for them
         if role not in settled and not types & set(ROLE_TYPES[role])
         for topic in free
         if (fields := match_field_names(role, [field for field in list_number_fields(topic) if "[]" not in field]))
@@ -76,10 +75,6 @@ def _may_be_power(topic: Topic, known_types: Collection[str]) -> bool:
         return bool(_find_bare_quantity(topic.name))
     is_own = topic.type_name not in known_types
     return topic.type_name == JOINT_STATE or (is_own and match_power_fields(list_number_fields(topic)) is not None)
-
-
-_PROPOSED = ("gnss", "imu")
-"""Roles whose fields are called so that nothing else is taken for them."""
 
 
 def _propose_roles(
@@ -140,15 +135,15 @@ def _judge_imu(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dic
         return float(np.linalg.norm(axes))
 
     force = measure("linear")
-    if abs(force - 1.0) < 0.1:
-        turn = np.pi / 180.0 if measure("angular_velocity") > _FASTEST_MEDIAN_RADPS else 1.0
-        factors = {"linear_acceleration": _GRAVITY_MPS2, "angular_velocity": turn}
-        scaled = {name: (text, factors.get(name[:-2], 1.0)) for name, text in found.items()}
-        return {
-            name: text if factor == 1.0 else f"{text} * {factor:.9g}" for name, (text, factor) in scaled.items()
-        }, ""
-    near = abs(force - _GRAVITY_MPS2) < 1.0
-    return found, "" if near else f"the acceleration at rest is {force:.3g}, not 9.81 m/s²: check axes and units"
+    if abs(force - 1.0) >= 0.1:
+        is_near = abs(force - _GRAVITY_MPS2) < 1.0
+        return found, "" if is_near else f"the acceleration at rest is {force:.3g}, not 9.81 m/s²: check axes and units"
+    factors = {"linear_acceleration": _GRAVITY_MPS2}
+    if measure("angular_velocity") > _FASTEST_MEDIAN_RADPS:
+        factors["angular_velocity"] = np.pi / 180.0
+    for name, factor in ((name, factors.get(name[:-2])) for name in found):
+        found[name] += f" * {factor:.9g}" if factor else ""
+    return found, ""
 
 
 _FASTEST_MEDIAN_RADPS = 0.3
@@ -199,20 +194,22 @@ def _judge_source(columns: Columns, topic: str, keys: Keys, numbers: dict[str, f
         found = read_rails(columns, [PowerSource(**made)], topic)
         if isinstance(found, Finding):
             return None
-        rail = found[0]
+        (rail,) = found
         why = find_rejection(rail, topic, columns)
         scale = _THOUSANDTHS.get(why.names["reason"], "") if why else ""
         if scale in {"", *made}:
             break
         made[scale] = 0.001
-    drawn = ("current_amp", "watt" if "power" in made else "amp")
-    for values, unit in ((getattr(rail, name), unit) for name, unit in (("voltage_volt", "volt"), drawn)):
+    if why is not None:
+        return None
+    for values, unit in ((rail.voltage_volt, "volt"), (rail.current_amp, "watt" if "power" in made else "amp")):
         known = values[np.isfinite(values)]
-        if why is None and known.size and ("voltage" in made or unit != "volt"):
-            why = None if known.any() else reject_power(topic, "no-numbers")
+        if known.size and ("voltage" in made or unit != "volt"):
+            if not known.any():
+                return None
             numbers[f"low_{unit}"] = min(numbers.get(f"low_{unit}", np.inf), float(known.min()))
             numbers[f"high_{unit}"] = max(numbers.get(f"high_{unit}", -np.inf), float(known.max()))
-    return made if why is None else None
+    return made
 
 
 def _find_bare_quantity(topic: str) -> str:
