@@ -34,10 +34,6 @@ _FOREIGN = re.compile(rf"(?<![^\W_])(?:{'|'.join(sorted(_ENGLISH, key=len, rever
 
 def translate(name: str) -> str:
     """Return a column's name without accents and with the words of the table above in English; other words stay as they are."""
-    if name.isascii():
-        plain = name
-    else:
-        plain = "".join(
-            sign for sign in unicodedata.normalize("NFKD", name.replace("µ", "u")) if not unicodedata.combining(sign)
-        )
+    signs = unicodedata.normalize("NFKD", name.replace("µ", "u"))
+    plain = "".join(sign for sign in signs if not unicodedata.combining(sign))
     return _FOREIGN.sub(lambda found: _ENGLISH[found[0].lower()], plain)

@@ -8,6 +8,7 @@ import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os.path import commonprefix
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, cast
 
@@ -40,13 +41,7 @@ from tcpipe.logs.messages import count_frames
 from tcpipe.logs.power_fields import match_power_fields, quote
 from tcpipe.logs.roles import TWIST, TWIST_STAMPED, RoleAssignment
 from tcpipe.logs.topics import Topic
-from tcpipe.power.sources import (
-    RailReadings,
-    find_quantity,
-    find_rejection,
-    list_power_lists,
-    make_rail_name,
-)
+from tcpipe.power.sources import RailReadings, find_quantity, find_rejection, make_rail_name
 from tcpipe.recipe import Recipe, Role
 from tcpipe.recipe.checking import as_toml, from_values
 from tcpipe.recipe.suggestions import Keys, TomlValue, format_first, make_place_to_measure
@@ -117,11 +112,9 @@ def propose_lines(
             yield ProposedLine("", table, keys, "; ".join(filter(None, [notes.get(table), doubt])), not doubt)
             continue
         for key, value in keys.items():
-            inner = (
-                {f"{key}.{name}": text for name, text in value.items()} if isinstance(value, Mapping) else {key: value}
-            )
-            for name, text in inner.items():
-                yield ProposedLine(table, name, text, notes.get(name.rpartition(".")[2], doubt), not doubt)
+            for name, text in value.items() if isinstance(value, Mapping) else [("", value)]:
+                dotted = f"{key}.{name}" if name else key
+                yield ProposedLine(table, dotted, text, notes.get(name or key, doubt), not doubt)
 
 
 def propose_decisions(
@@ -173,26 +166,23 @@ def propose_for_log(
     ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first messages, and what only
     moving transforms could tell of a sensor's place is left out.
     """
-    config, known = find_read_config(recipe, log.topics), load_profiles(recipe)
+    config = find_read_config(recipe, log.topics)
     used = {name: role for role, names in assigned.choices.items() for name in names}
     used |= {name: role.name for role in assigned.roles.values() for name in role.topics}
     used |= {
         proposal.subject.name: proposal.names["role"] for proposal in proposals if proposal.code == "role-proposed"
     }
-    types = {name: log.topics[name].type_name for name in used}
-    unread = set[str]()
+    static = assigned.static_transforms
     if is_complete:
-        tables = log.tables(list(dict.fromkeys([*used, *assigned.static_transforms])))
+        tables, placing = log.tables(list(dict.fromkeys([*used, *static]))), assigned
     else:
-        tables = {**log.first_rows(used), **log.tables(assigned.static_transforms)}
-        unread = {*assigned.transforms} - {*assigned.static_transforms}
-        assigned = replace(assigned, transforms=assigned.static_transforms)
-    lists = {name: list_power_lists(kind, known.power_sources) for name, kind in types.items()}
-    columns = {name: make_message_arrays(tables[name], lists[name]) for name in used if name in tables}
+        tables, placing = {**log.first_rows(used), **log.tables(static)}, replace(assigned, transforms=static)
+    columns = {name: make_message_arrays(tables[name]) for name in used if name in tables}
     frames: dict[Role, str] = {}
     for name, arrays in columns.items():
-        frames.setdefault(cast("Role", used[name]), next(iter(count_frames(arrays, types[name])), ""))
-    places = place_frames(log, tables, assigned, frames, config)
+        frame = next(iter(count_frames(arrays, log.topics[name].type_name)), "")
+        frames.setdefault(cast("Role", used[name]), frame)
+    places = place_frames(log, tables, placing, frames, config)
     head = ["", f"robot: {assigned.robot}, {assigned.robot_why}"]
     for role in assigned.roles.values():
         pose, by = places.get(cast("Role", role.name), (None, ""))
@@ -212,19 +202,20 @@ def propose_for_log(
             for field in find_quality(list_number_fields(log.topics[finding.subject.name])):
                 lines.append(ProposedLine("read.fields", "gnss.quality", field, _CODES_NOTE, is_certain=False))
     unplaced = [
-        (role, frames[role])
-        for role, (_, by) in places.items()
-        if by == "assumed" and role != "wheel_odometry" and not unread
+        (role, frames[role]) for role, (_, by) in places.items() if by == "assumed" and role != "wheel_odometry"
     ]
-    lines += propose_decisions(unplaced, {*used.values()}, keeps_reversing=recipe.mask.keep_reversing)
+    is_placed = is_complete or {*assigned.transforms} <= {*static}
+    lines += propose_decisions(
+        unplaced if is_placed else (), {*used.values()}, keeps_reversing=recipe.mask.keep_reversing
+    )
     return ProposedRecipe([*head, "", "These need no line."], lines, str(log.path))
 
 
 def _format_ranges(numbers: Mapping[str, float]) -> str:
     """Return the lowest to the highest value of each unit, as ``24.1 V to 25.2 V``."""
     units = [name.removeprefix("low_") for name in numbers if name.startswith("low_")]
-    ends = {unit: [(name, numbers[name]) for name in (f"low_{unit}", f"high_{unit}")] for unit in units}
-    return ", ".join(" to ".join(format_number(*end) for end in range_ends) for range_ends in ends.values())
+    ends = ([f"low_{unit}", f"high_{unit}"] for unit in units)
+    return ", ".join(" to ".join(format_number(name, numbers[name]) for name in both) for both in ends)
 
 
 def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterator[ProposedLine]:
@@ -274,7 +265,7 @@ class _Table:
     numbers: Mapping[str, Floats]
     clock: Clock
     stamp_lines: Mapping[str, _Value]
-    duplicates: Sequence[str]
+    duplicates: Mapping[str, str]
 
     def overlap_ns(self, other: _Table) -> int:
         """Return the time that two tables have in common; that of stamps of different kinds, but for counters, is unknown."""
@@ -358,15 +349,13 @@ def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[st
         if is_alike and (len(groups) > 1 or match_field_names("gnss", next(iter(columns.values()), ()))):
             best = max(sizes, key=lambda run: sizes[run])
             return {name: runs.get(best, next(iter(runs.values()))) for name, runs in groups.items()}
-    first = min(names.values(), default="")
-    ends = [0, *(end.end() for end in re.finditer(r"\d(?=[_ -])", first))]
-    common = max(end for end in ends if not end or all(name.startswith(first[: end + 1]) for name in names.values()))
-    return {f"*{name[common:]}" if common else name: file for file, name in names.items()}
+    shared = re.match(r".*\d(?=[_ -])", commonprefix([*names.values()]))  # noqa: RUF071  of characters, not of folders
+    return {f"*{name[shared.end() :]}" if shared else name: file for file, name in names.items()}
 
 
 def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     """Return a table with the stamps that suit best, None without stamps."""
-    from tcpipe.formats.logs.table_log import find_duplicates, read_cells, read_numbers  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.formats.logs.table_log import describe_duplicates, read_cells, read_numbers  # noqa: PLC0415  polars only where a table is read
     from tcpipe.formats.logs.table_stamps import choose_clock  # noqa: PLC0415
 
     is_measured = bool(match_power_fields(names[:1]) or find_quantity(names[0])) or any(
@@ -375,7 +364,7 @@ def _read_table(file: str, path: Path, names: Sequence[str]) -> _Table | None:
     named = [name for name in names if _STAMP.fullmatch(simplify_name(name))]
     candidates = named or ([] if is_measured else names[:1])
     chosen = choose_clock(read_cells(path, stamps=candidates, columns=[]).stamps) if candidates else None
-    return _Table(file, path, names, read_numbers(path, names), *chosen, find_duplicates(names)) if chosen else None
+    return _Table(file, path, names, read_numbers(path, names), *chosen, describe_duplicates(names)) if chosen else None
 
 
 def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
@@ -409,8 +398,8 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
     if judged is None:
         return []
     mapped, unclear = judged
-    twice = [column for column in table.duplicates if column and column in " ".join(mapped.values())]
-    doubt = doubt or unclear or "".join(f"several columns are called {column}" for column in twice[:1])
+    twice = [note for column, note in table.duplicates.items() if column in " ".join(mapped.values())]
+    doubt = doubt or unclear or "".join(twice[:1])
     keys: _Values = {"role": ("power", "", True)} if name != role else {}
     keys |= {"file": (table.file, doubt, True), **table.stamp_lines}
     for field, text in mapped.items():
@@ -451,8 +440,7 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[
         unit, expression = MAPPED[role][field].unit, parse_expression(text, table.names)
         other = None if expression.column else find_other_unit(expression, unit)
         units |= {field: other if other in UNITS[unit] else unit} if other else {}
-        stated = {field: units[field]} if field in units else {}
-        read = read_fields("", role, {field: text}, stated, table.names)
+        read = read_fields("", role, {field: text}, units, table.names)
         if field == "quality":
             found[field] = np.zeros(1)
         elif isinstance(read, dict) and {name for name, _ in expression.operands()} <= table.numbers.keys():

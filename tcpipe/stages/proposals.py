@@ -19,14 +19,7 @@ from tcpipe.logs.field_mapping import Columns, list_number_fields, match_field_n
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic
-from tcpipe.power.sources import (
-    FLOAT_TYPES,
-    find_quantity,
-    find_rejection,
-    is_of_drives,
-    make_rail_name,
-    read_rails,
-)
+from tcpipe.power.sources import FLOAT_TYPES, find_quantity, find_rejection, is_of_drives, make_rail_name, read_rails
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import Keys, format_first, suggest
 from tcpipe.robots import PowerSource, Profiles
@@ -45,7 +38,8 @@ def find_proposals(
     log: LogReader, assignment: RoleAssignment, config: ReadConfig, known: Profiles
 ) -> tuple[Finding, ...]:
     """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of. The log is read once."""
-    free = [topic for topic in log.topics.values() if _is_free(topic, config)]
+    readable = [topic for topic in log.topics.values() if topic.problem is None and topic.message_count != 0]
+    free = [of for of in readable if of.name not in config.ignore_topics and not of.name.startswith(OVERLAY)]
     settled, types = {*assignment.roles, *config.topics}, {topic.type_name for topic in free}
     known_types = {*known.types(), *(type_name for types in ROLE_TYPES.values() for type_name in types)}
     of_role = {
@@ -61,13 +55,8 @@ def find_proposals(
     }
     tables = log.tables(list(dict.fromkeys([*(topic.name for _, topic in of_role), *lists])))
     columns = {name: make_message_arrays(table, lists.get(name, ())) for name, table in tables.items()}
-    readable = [topic for topic in of_power if topic.name in columns]
-    return (*_propose_roles(of_role, columns), *_propose_power(readable, columns))
-
-
-def _is_free(topic: Topic, config: ReadConfig) -> bool:
-    readable = topic.problem is None and topic.message_count != 0
-    return readable and topic.name not in config.ignore_topics and not topic.name.startswith(OVERLAY)
+    read = [topic for topic in of_power if topic.name in columns]
+    return (*_propose_roles(of_role, columns), *_propose_power(read, columns))
 
 
 def _may_be_power(topic: Topic, known_types: Collection[str]) -> bool:
@@ -92,17 +81,13 @@ def _propose_roles(
 
 
 def judge_fields(role: str, found: Mapping[str, str], columns: Columns) -> tuple[dict[str, str], str]:
-    """Return what each field is taken from, with the factor that its values show, and what they leave open.
+    """Return what each field of ``gnss`` or ``imu`` is taken from, with the factor that its values show, and what they leave open.
 
     ``found`` are the names that are matched, ``columns`` their values by field.
     """
     values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
     values = {name: value[np.isfinite(value) & (value != 0.0)] for name, value in values.items()}
-    if role == "gnss":
-        return _judge_fixes(dict(found), values)
-    if role == "imu":
-        return _judge_imu(dict(found), values)
-    return dict(found), ""
+    return _judge_fixes(dict(found), values) if role == "gnss" else _judge_imu(dict(found), values)
 
 
 def _largest(values: Floats) -> float:
@@ -160,28 +145,25 @@ class _Candidate:
     doubt: str = ""
 
 
-def _propose_power(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[Finding]:
-    """Yield what could be power in a log without a power topic: bare numbers, then messages of the user's own, then torques."""
+def _propose_power(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> list[Finding]:
+    """Return what could be power in a log without a power topic: bare numbers, then messages of the user's own, then torques."""
     bare = [topic for topic in topics if topic.type_name in FLOAT_TYPES]
     own = [topic for topic in topics if topic.type_name not in (*FLOAT_TYPES, JOINT_STATE)]
     found = [*_find_bare(bare, columns)] or [*_find_own(own, columns)] or [*_find_joints(topics, columns)]
-    found.sort(key=lambda proposal: bool(proposal.doubt))
-    for best in found[:1]:
-        rivals = [name for proposal in found[1:] if not proposal.doubt for name in proposal.topics]
-        doubt = best.doubt or (f"{', '.join(rivals)} could be meant as well" if rivals else "")
-        listed = [name for proposal in found for name in proposal.topics]
-        names = {"topics": ", ".join(listed), **({"doubt": doubt} if doubt else {})}
-        used = list(dict.fromkeys(str(keys["topic"]) for keys in best.sources if "topic" in keys))
-        used = used or (
-            [*best.topics] if len(best.topics) > 1 else []
-        )  # one topic of a type that is known needs no name
-        chosen: dict[str, Keys | Sequence[Keys]] = {"read.topics": {"power": used}} if used else {}
-        recipe = {**chosen, "power_sources": best.sources}
-        remedies = suggest("use", recipe) if best.sources else ()
-        subject = Subject("role", "power")
-        yield make_finding(
-            "power-candidates", subject, names=names, remedies=remedies, topics_count=len(listed), **best.numbers
-        )
+    if not found:
+        return []
+    best, *others = sorted(found, key=lambda candidate: bool(candidate.doubt))
+    rivals = [name for other in others if not other.doubt for name in other.topics]
+    doubt = best.doubt or (f"{', '.join(rivals)} could be meant as well" if rivals else "")
+    listed = [name for candidate in (best, *others) for name in candidate.topics]
+    names = {"topics": ", ".join(listed), **({"doubt": doubt} if doubt else {})}
+    used = list(dict.fromkeys(str(keys["topic"]) for keys in best.sources if "topic" in keys))
+    if not used and len(best.topics) > 1:  # one topic of a type that is known needs no name
+        used = [*best.topics]
+    chosen: dict[str, Keys | Sequence[Keys]] = {"read.topics": {"power": used}} if used else {}
+    remedies = suggest("use", {**chosen, "power_sources": best.sources}) if best.sources else ()
+    numbers = {"topics_count": len(listed), **best.numbers}
+    return [make_finding("power-candidates", Subject("role", "power"), names=names, remedies=remedies, **numbers)]
 
 
 _THOUSANDTHS = {"voltage-in-millivolts": "voltage_scale", "current-in-milliamperes": "current_scale"}

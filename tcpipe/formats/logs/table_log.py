@@ -99,10 +99,11 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
         Damage("table-cells", mapping.file, messages_lost=count, reason=f"column {column}, row {row}: {text!r}")
         for column, (count, row, text) in cells.texts.items()
     ]
-    for column in find_duplicates(names):
-        if column in (stamp, *cells.columns):
-            note = f"several columns are called {column}: the first is read, {column}_duplicated_0 is the next"
-            damage.append(Damage("table-cells", mapping.file, messages_lost=0, reason=note))
+    damage += [
+        Damage("table-cells", mapping.file, messages_lost=0, reason=note)
+        for column, note in describe_duplicates(names).items()
+        if column in (stamp, *cells.columns)
+    ]
     return _read_messages((*read_as, role), mapping.file, values, stamps, damage)
 
 
@@ -192,9 +193,13 @@ def read_column_names(path: Path) -> list[str]:
         return _scan(path).collect_schema().names()
 
 
-def find_duplicates(names: Sequence[str]) -> list[str]:
-    """Return the columns whose name the header has several times: the first is read, the next is ``<name>_duplicated_0``."""
-    return [name for name in names if f"{name}_duplicated_0" in names]
+def describe_duplicates(names: Sequence[str]) -> dict[str, str]:
+    """Return a remark on each column whose name the header has several times."""
+    seconds = {name: f"{name}_duplicated_0" for name in names if name and f"{name}_duplicated_0" in names}
+    return {
+        name: f"several columns are called {name}: the first is read, {second} is the next"
+        for name, second in seconds.items()
+    }
 
 
 def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], words: Sequence[str] = ()) -> Cells:
