@@ -56,7 +56,7 @@ from tcpipe.tables.findings import Finding
 if TYPE_CHECKING:
     from tcpipe.formats.logs.log_file import Log
     from tcpipe.formats.logs.message_tables import TableLog
-    from tcpipe.formats.logs.table_stamps import Clock
+    from tcpipe.formats.logs.table_stamps import Clock, RecipeKeys
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,8 +240,7 @@ def _describe_sample(columns: Columns, topic: Topic, role: str) -> str:
 
 
 Floats = NDArray[np.float64]
-_Value: TypeAlias = tuple[TomlValue, str, bool]
-_Values: TypeAlias = dict[str, _Value]
+_Values: TypeAlias = dict[str, tuple[TomlValue, str, bool]]
 """By key of a table of the recipe its value, a note, and whether it is certain."""
 _STAMP = re.compile(
     r".*time(stamp|string)?(_(utc|local))?|(.*_)?(t|stamp|gpst|utc|date|epoch|millis|micros|ms_today|ms_of_day)|ms|us"
@@ -264,7 +263,7 @@ class _Table:
     names: Sequence[str]
     numbers: Mapping[str, Floats]
     clock: Clock
-    stamp_lines: Mapping[str, _Value]
+    stamp_lines: RecipeKeys
     duplicates: Mapping[str, str]
 
     def overlap_ns(self, other: _Table) -> int:
@@ -306,13 +305,12 @@ def propose_tables(path: Path) -> ProposedRecipe:
         what = f"{path}: it contains no log, and no table with stamps and columns of known names"
         raise UsageError(what, *filter(None, head))
     reference = max(next(iter(roles.values())), key=lambda candidate: candidate[0].clock.count_stamps())[0]
-    lines, log, used = list[ProposedLine](), path, set[str]()
+    lines, log, used, reasons = list[ProposedLine](), path, set[str](), dict[str, str]()
     for role, candidates in roles.items():
         candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(reference), -candidate[0].clock.count_stamps()))
         table, mine = candidates[0]
         if not table.overlap_ns(reference):
-            apart = "no time in common with the others: another clock, or another drive"
-            mine = [replace(line, note=f"{line.note}: {apart}", is_certain=False) for line in mine]
+            reasons[role] = "no time in common with the others: another clock, or another drive"
         lines += mine
         used |= {line.value for line in mine if isinstance(line.value, str)}
         log = table.path if "*" in table.file else log
@@ -321,11 +319,11 @@ def propose_tables(path: Path) -> ProposedRecipe:
     needless = [line for line in lines if line.key == "stamp_zone"][1:]
     needless += [line for line in lines if line.note == NO_VOLTAGE and make_rail_name(line.table) in rails]
     lines = [line for line in lines if line not in needless]
-    lines, tried = _try_lines(lines, log)
+    lines = _try_lines(lines, log, reasons)
     found_roles = {*roles, *(line.value for line in lines if line.key == "role")}
     for role in ("gnss", "imu", "wheel_odometry", "power"):
         lines += [] if role in found_roles else _propose_rest(role, tables, " ".join(used))
-    lines += [*tried, *propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)]
+    lines += propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)
     return ProposedRecipe(head, lines, format_path(log))
 
 
@@ -477,24 +475,29 @@ def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[Pr
         values = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in free)
         pick = ", ".join(f"{name} ({three})" for name, three in zip(free, values, strict=True))
         fields = {**dict.fromkeys(_list_lacking(role, ()), "column?"), **known}
-        note = f"{role} is not recognised: pick from {pick}"
-        yield ProposedLine(f"tables.{role}", "file", table.file, note, is_certain=False)
-        for key, value in {"stamp": stamp, **{f"columns.{field}": name for field, name in fields.items()}}.items():
-            yield ProposedLine(f"tables.{role}", key, value, is_certain=False)
+        keys = {"file": table.file, "stamp": stamp, **{f"columns.{field}": name for field, name in fields.items()}}
+        for key, value in keys.items():
+            note = f"{role} is not recognised: pick from {pick}" if key == "file" else ""
+            yield ProposedLine(f"tables.{role}", key, value, note, is_certain=False)
         return
 
 
-def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedLine], list[ProposedLine]]:
-    """Return the lines as the first minute corrects them, and lines to add; tables that contradict others become comments."""
+def _try_lines(lines: Sequence[ProposedLine], log: Path, reasons: Mapping[str, str]) -> list[ProposedLine]:
+    """Return the lines as the first minute corrects and completes them; tables that contradict others become comments.
+
+    So do those of ``reasons``, by name of the table; they are not tried.
+    """
+    reasons = {f"tables.{name}": why for name, why in reasons.items()}
     tried = [line for line in lines if line.is_certain or line.key in ("stamp_zone", "stamp_format")]
+    tried = [line for line in tried if line.table not in reasons]
     text = ProposedRecipe([], [replace(line, is_certain=True) for line in tried], "").toml()
     tables = {name: of for name, of in tomllib.loads(text).get("tables", {}).items() if "columns" in of}
     recipe = from_values(Recipe, {"tables": tables}, where="proposed recipe")
-    reasons, added, findings = dict[str, str](), list[ProposedLine](), tuple[Finding, ...]()
+    findings: Sequence[Finding] = ()
     try:
         findings = _fuse_first_minute(log, recipe) if tables else ()
     except LogError as error:
-        found = ((re.search(r"recipe tables\.(\w+)", problem), problem) for problem in error.problems)
+        found = ((re.search(r"recipe (tables\.\w+)", problem), problem) for problem in error.problems)
         reasons |= {named[1]: problem.partition(": ")[2] for named, problem in found if named}
     except TcpipeError:  # too little for a track; preflight explains it
         pass
@@ -502,22 +505,23 @@ def _try_lines(lines: Sequence[ProposedLine], log: Path) -> tuple[list[ProposedL
         why = f"in the first minute: {describe_finding(finding)}"
         blamed = finding.names.get("suspect", finding.subject.name)
         if finding.code == "measurements-rejected" and blamed == "gnss":  # a minute of fixes is seldom wrong
-            reasons |= {"wheel_odometry": why} if finding.numbers["rejected_fraction"] > _MAX_REJECTED_SHARE else {}
+            is_wrong = finding.numbers["rejected_fraction"] > _MAX_REJECTED_SHARE
+            reasons |= {"tables.wheel_odometry": why} if is_wrong else {}
         elif finding.code in _CONTRADICTIONS and blamed in ("imu", "wheel_odometry"):
-            reasons[blamed] = why
+            reasons[f"tables.{blamed}"] = why
         elif finding.code == "imu-units":
             remedies = (line for remedy in finding.remedies for line in propose_lines(remedy.recipe, {}, ""))
-            added += [replace(line, note=why) for line in remedies]
+            lines = [*lines, *(replace(line, note=why) for line in remedies)]
         elif finding.code == "odometry-scale" and blamed == "wheel_odometry":
             lines = _scale_speed(lines, finding.numbers["scale"], why)
     if any(str(line.value).endswith(_TIMES_RADIUS) for line in lines):
-        reasons["wheel_odometry"] = "state the wheels' radius in place of 0.1 m"
-    kept = list[ProposedLine]()
-    for line in lines:
-        why = reasons.get(line.table.removeprefix("tables."), "")
-        note = why if why and line.key == "file" else line.note
-        kept.append(replace(line, is_certain=line.is_certain and not why, note=note))
-    return kept, [line for line in added if line.table.removeprefix("tables.") not in reasons]
+        reasons["tables.wheel_odometry"] = "state the wheels' radius in place of 0.1 m"
+    return [
+        replace(line, is_certain=False, note=reasons[line.table] if line.key == "file" else line.note)
+        if line.table in reasons
+        else line
+        for line in lines
+    ]
 
 
 def _scale_speed(lines: Sequence[ProposedLine], scale: float, why: str) -> list[ProposedLine]:
@@ -529,7 +533,7 @@ def _scale_speed(lines: Sequence[ProposedLine], scale: float, why: str) -> list[
         return [scaled if line in of_revolutions else line for line in lines]
     unit = next((unit for unit, mps in UNITS["m/s"].items() if abs(scale * mps - 1.0) < _SCALE_TOLERANCE), "m/s")
     is_stated = unit == "m/s" or any(line.key == "units.linear_x" for line in lines)
-    return [*lines, *([] if is_stated else [ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)])]
+    return [*lines] if is_stated else [*lines, ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)]
 
 
 def _fuse_first_minute(log: Path, recipe: Recipe) -> tuple[Finding, ...]:
