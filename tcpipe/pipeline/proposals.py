@@ -252,6 +252,13 @@ _MAX_REJECTED_SHARE = 0.2
 _SCALE_TOLERANCE = 0.03
 _CONTRADICTIONS = ("unit-suspected", "distance-contradicted", "drives-backwards", "path-unlike")
 """Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
+_HINTS = {
+    "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
+    "imu": r"(.*_)?(a|g|w|acc|gyr|imu|omega|rot)([a-z]*_?[xyz]|\w{2,})",
+    "wheel_odometry": r".*(speed|vel|rpm|wheel|odo|enc|tach).*",
+    "power": r".*(volt|curr|amp|power|watt|bat|energy|^[uiv]).*",
+}
+"""Names in English of columns that may be of a role, in lower case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -469,12 +476,12 @@ def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[Pr
     for table in tables:
         stamp = table.stamp_lines["stamp"][0]
         free = [name for name in table.numbers if name not in used and name != stamp]
-        known = match_known_fields(role, free)
-        if not known and not any(split_unit(name)[1] in units for name in free):
+        likely = [of for of in free if re.fullmatch(_HINTS[role], simplify_name(of)) or split_unit(of)[1] in units]
+        if not likely:
             continue
-        values = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in free)
-        pick = ", ".join(f"{name} ({three})" for name, three in zip(free, values, strict=True))
-        fields = {**dict.fromkeys(_list_lacking(role, ()), "column?"), **known}
+        values = (", ".join(f"{value:.4g}" for value in table.numbers[name][:3]) for name in likely)
+        pick = ", ".join(f"{name} ({three})" for name, three in zip(likely, values, strict=True))
+        fields = {**dict.fromkeys(_list_lacking(role, ()), "column?"), **match_known_fields(role, free)}
         keys = {"file": table.file, "stamp": stamp, **{f"columns.{field}": name for field, name in fields.items()}}
         for key, value in keys.items():
             note = f"{role} is not recognised: pick from {pick}" if key == "file" else ""

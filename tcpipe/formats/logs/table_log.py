@@ -142,11 +142,9 @@ def _read_messages(
 def _find_clock_mismatch(read: Iterable[TopicMessages]) -> Iterator[str]:
     """Yield a line for tables that have no time in common with the longest: they are on another clock, or of another drive."""
     spans = {found.topic.name: (found.topic.start_ns or 0, found.topic.end_ns or 0) for found in read}
-    if not spans:
-        return
-    longest = max(spans, key=lambda name: spans[name][1] - spans[name][0])
-    start_ns, end_ns = spans[longest]
+    longest = max(spans, key=lambda name: spans[name][1] - spans[name][0], default="")
     for name, (first_ns, last_ns) in spans.items():
+        start_ns, end_ns = spans[longest]
         if first_ns > end_ns or last_ns < start_ns:
             apart_s = (start_ns - first_ns) / 1e9
             yield (

@@ -87,16 +87,15 @@ def _read_stamps(
     clock = _read_dated(columns[stamp], dates, form=mapping.stamp_format, unit=mapping.stamp_unit)
     if isinstance(clock, str):
         return clock
-    if clock.kind in ("local", "day") and not zone and not _is_utc(stamp):
+    zone = "UTC" if _is_utc(stamp) else zone
+    if clock.kind in ("local", "day") and not zone:
         sample = f" ({clock.sample})" if clock.sample else ""
         return f'its times{sample} have no zone; state it, as stamp_zone = "Europe/Vienna" or "UTC"'
     if clock.unit:
         first, units = clock.ns.drop_nulls()[0] / STAMP_UNITS[clock.unit], ", ".join(STAMP_UNITS)
         advice = f"set their unit, one of {units} (stamp_unit; by their steps {clock.unit})"
         return f"its stamps ({first:.12g}) do not count from 1970; {advice}"
-    if clock.kind in ("local", "day"):
-        return _convert_to_utc(clock, "UTC" if _is_utc(stamp) else zone, mapping.stamp_date, path)
-    return clock
+    return _convert_to_utc(clock, zone, mapping.stamp_date, path) if clock.kind in ("local", "day") else clock
 
 
 def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", unit: str = "auto") -> Clock | str:
