@@ -38,6 +38,7 @@ _MIN_FAST_SHARE = 0.9
 _PREFERRED = ("counter", "day", "local", "utc")
 _MAX_TIE_SPREAD_NS, _MAX_STRAY_SHARE = 2_000_000_000, 0.05
 _COARSEST = tuple(reversed(STAMP_UNITS.items()))
+_NO_STAMPS = "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
 RecipeKeys: TypeAlias = dict[str, tuple[str, str, bool]]
 """By key of a table of the recipe its value, a note, and whether it is certain."""
 Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
@@ -101,7 +102,7 @@ def _read_stamps(
 def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", unit: str = "auto") -> Clock | str:
     """Return what a column counts, together with the dates beside it if it has times of day alone; in words why it is no clock."""
     clock = read_clock(column, form=form, unit=unit)
-    if dates is None or (isinstance(clock, Clock) and clock.kind != "day"):
+    if dates is None or column.dtype not in (pl.String, pl.Time) or getattr(clock, "kind", "day") != "day":
         return clock
     joined = read_clock((dates.cast(pl.String) + " " + column.cast(pl.String)).alias(column.name), form=form)
     return clock if isinstance(joined, str) and "stamp_format" not in joined else joined
@@ -112,6 +113,8 @@ def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Cloc
 
     ``form`` is the recipe's ``stamp_format`` of texts, ``unit`` its ``stamp_unit`` of numbers.
     """
+    if not column.count() or column.dtype.is_nested() or column.dtype == pl.Duration:
+        return _NO_STAMPS
     if column.dtype == pl.String:
         times = _parse_times(column, form)
         if times is not None:
@@ -124,7 +127,7 @@ def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Cloc
     numbers = numbers.set(~numbers.is_finite(), None)
     values = numbers.drop_nulls().to_numpy()
     if not values.size:
-        return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
+        return _NO_STAMPS
     filled, unknown = numbers.fill_null(numbers.drop_nulls()[0]).to_numpy(), numbers.is_null()
     if unit == "ms_today" or (unit == "auto" and _OF_DAY.fullmatch(simplify_name(column.name))):
         return Clock("day", _unwrap_days(pl.Series(parse_stamps_ns(filled, "ms")).set(unknown, None)))
