@@ -208,8 +208,23 @@ def _convert_to_utc(clock: Clock, zone: str, stated: str, path: Path) -> Clock |
             day = (middle + timedelta(hours=12)).date()
             notes = (f"{day} by the last change of the file; state stamp_date if that is wrong",)
         ns = ns + (day - date(1970, 1, 1)).days * _DAY_NS
-    local = ns.cast(pl.Datetime("ns")).dt.replace_time_zone(zone, ambiguous="earliest", non_existent="null")
-    return replace(clock, kind="utc", ns=local.dt.convert_time_zone("UTC").cast(pl.Int64), notes=notes)
+    local = ns.cast(pl.Datetime("ns"))
+    first, second = (
+        local.dt.replace_time_zone(zone, ambiguous=which, non_existent="null")
+        .dt.convert_time_zone("UTC")
+        .cast(pl.Int64)
+        for which in _REPEATED_HOUR
+    )
+    if first.null_count() == len(first):
+        return f"no time of it exists in {zone}, whose clocks skip an hour then; correct stamp_zone"
+    is_repeated = (local.diff() < -_LONGEST_STEP_BACK).fill_null(value=False).cum_sum() > 0
+    return replace(clock, kind="utc", ns=second.zip_with(is_repeated, first), notes=notes)
+
+
+_REPEATED_HOUR: tuple[Literal["earliest", "latest"], ...] = ("earliest", "latest")
+"""Which of two equal local times is meant at the end of summer time, before and after the clock was set back."""
+_LONGEST_STEP_BACK = timedelta(minutes=30)
+"""A larger step back in a table sets the clock back."""
 
 
 def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:

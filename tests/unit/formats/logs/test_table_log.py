@@ -320,6 +320,21 @@ def test_a_time_of_day_passes_midnight(tmp_path):
     assert set(np.diff(stamps_of(tmp_path, rows, mapping))) == {20_000_000}
 
 
+def test_local_times_go_on_rising_when_summer_time_ends(tmp_path):
+    rows = [f"2025-10-26 {hour}:{second // 60:02d}:{second % 60:02d},," for hour, second in (
+        *(("02", 3540 + k) for k in range(60)), *(("02", k) for k in range(60))
+    )]  # fmt: skip
+    found = stamps_of(tmp_path, rows, TableMapping(stamp_zone="Europe/Vienna"))
+    assert found[0] == 1_761_440_340_000_000_000  # 2025-10-26T00:59:00Z
+    assert set(np.diff(found)) == {1_000_000_000}
+
+
+def test_times_that_no_clock_of_the_zone_showed_are_an_error(tmp_path):
+    rows = [f"2025-03-30 02:30:{second:06.3f},," for second in SECONDS]
+    with pytest.raises(LogError, match="no time of it exists in Europe/Vienna, whose clocks skip an hour then"):
+        stamps_of(tmp_path, rows, TableMapping(stamp_zone="Europe/Vienna"))
+
+
 def test_a_counter_is_tied_to_utc_by_whole_seconds_beside_it(tmp_path):
     rows = [f"{5000 + 20 * k},,{NOON_NS // 10**9 + k // 50}" for k in range(200)]
     found = stamps_of(tmp_path, rows, TableMapping(stamp_unit="ms", stamp_utc="utc"))
