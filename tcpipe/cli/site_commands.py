@@ -66,7 +66,7 @@ def init(directory: str, *, source: str | None, robot: str | None, msgdef: str |
         write_text(path, text)
         print_line(f"wrote {path}")
     if proposed:
-        print_lines(proposed)
+        print_lines(proposed.describe_next_step(path))
 
 
 @click.command()

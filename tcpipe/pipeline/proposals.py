@@ -81,11 +81,12 @@ class ProposedRecipe:
     lines: Sequence[ProposedLine]
     log: str
 
-    def __str__(self) -> str:
-        """Return what is left to do."""
+    def describe_next_step(self, path: Path) -> str:
+        """Return what is left to do when the recipe is at a path."""
         decisions = sum(not line.is_certain for line in self.lines)
         left = f"{decisions} comments in it are yours to decide; " if decisions else ""
-        return f"{left}then: tcpipe preflight {shlex.quote(self.log)}"
+        stated = "" if path.parent.resolve() == Path.cwd() else f" --recipe {shlex.quote(str(path))}"
+        return f"{left}then: tcpipe preflight {shlex.quote(self.log)}{stated}"
 
     def toml(self) -> str:
         """Return the file. The head of a table of decisions alone is a comment too; those of ``read`` and ``mask`` may be empty."""

@@ -114,7 +114,9 @@ def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | No
     else:
         held = "" if path == given else "what it holds, decompressed: "
         wanted = (
-            f"'tcpipe init --from {quote(str(given))}' writes a recipe for a table" if is_table(given.name) else WANTED
+            f"a table needs a recipe (--recipe FILE); tcpipe init --from {quote(str(given))} writes one"
+            if is_table(given.name)
+            else WANTED
         )
         raise LogError(f"{given}: not a log: {held}{_describe_other_file(path, magic)}; {wanted}")
     stack.callback(part.close)
