@@ -174,7 +174,8 @@ def _print_dataset(found: InspectedDataset) -> None:
     ]
     _print_table(["split", "samples", *names], rows)
     print_line("")
-    print_line(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
+    labels = [name for name in found.labels if name not in found.absent_labels]
+    print_line(f"layers: {', '.join(found.layers) or 'none'}; labels: {', '.join(labels)}")
     print_line(
         f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps) or 'not stated'}"
     )

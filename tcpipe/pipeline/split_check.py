@@ -230,7 +230,8 @@ def _find_column_problems(table: pa.Table, name: str, is_used: Mask, *, is_numbe
     """Yield a line if a column is no number but should be, or if samples that are judged have no value."""
     column = table.column(name)
     if is_number and not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
-        yield f"column {name} is {column.type}; expected numbers"
+        example = next(iter(column.drop_null()), None)
+        yield f"column {name} is {column.type}, as {str(example)!r}; expected numbers with a decimal point"
         return
     is_known = np.isfinite(to_floats(table, name)) if is_number else to_numbers(column.is_valid())
     if (lost := is_used & ~is_known).any():

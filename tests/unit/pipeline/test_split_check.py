@@ -187,7 +187,7 @@ BAD = {
     "columns": ({}, {"xy": "lon,y_m", "run": "track", "time": "t"}, ["no column 'lon' (--xy); there are x_m", "'track'", "'t'"]),
     "no training": ({}, {"train": "tr"}, ["no training samples, 'tr': column split has buffer, test, train, val"]),
     "nothing held out": ({}, {"unused": ["buffer", "test", "val"]}, ["no held-out samples: column split has"]),
-    "text": ({}, {"xy": "split,y_m", "train": "t"}, ["no training samples", "column split is large_string; expected numbers"]),
+    "text": ({}, {"xy": "split,y_m", "train": "t"}, ["no training samples", "column split is large_string, as '"]),
     "NaN": ({"x": [*range(5), *[np.nan] * 3, 8, 9, 10]}, {}, ["column x_m has no value in 2 rows, first in row 6; fill them"]),
     "no run": ({"run": [*"aaa", None, *"aaaaaaa"]}, {"run": "run"}, ["column run has no value in 1 rows, first in row 4"]),
     "latitude first": ({"lat": [47.0] * 11, "lon": [15.0] * 11}, {"xy": "lat,lon"}, LATITUDE_FIRST),
