@@ -77,6 +77,7 @@ class Split:
     name : ``train``, ``test``, ``unseen`` or ``buffer``; ``selection`` of a selection from all of them.
     view : its samples among the stored pixels.
     energy : which of the two energies its labels are of.
+    has_energy : whether any sample of the dataset has that energy.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Split:
     _columns: SampleColumns
     view: SampleView
     energy: Energy = ENERGIES["total"]
+    has_energy: bool = True
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -134,7 +136,7 @@ class Split:
     def label_columns(self) -> tuple[str, ...]:
         """Columns of samples.parquet that train: the power of its energy, and the velocity of the card; without energy, velocity alone."""
         velocity = self._card.label.columns[1]
-        return (self.energy.power, velocity) if self._card.labels["energy"] else (velocity,)
+        return (self.energy.power, velocity) if self.has_energy else (velocity,)
 
     @cached_property
     def labels(self) -> Floats:
@@ -347,7 +349,7 @@ class Dataset(Mapping[str, Split]):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels that its samples have: some of energy, time, slip, vibration."""
-        return tuple(name for name in LABELS if self.card.labels[name])
+        return tuple(name for name in LABELS if name not in self.card.absent_labels)
 
     def select(self, ids: str | Path | Iterable[str]) -> Split:
         """Return samples of any split, in the order given, as `Split.select` does."""
@@ -382,10 +384,11 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
             f"{directory}: samples.parquet has {len(split)} rows, its card says {card.samples}; build it again"
         )
     column = read_samples(directory, [energy.power]).column(energy.power)
-    if card.samples and label != "total" and column.null_count == len(column):
+    has_energy = not card.samples or column.null_count < len(column)
+    if not has_energy and label != "total":
         cause = "the robot was never stationary for long; take the label total"
         raise DatasetError(
-            f"{directory}: no sample has {energy.power}: {cause if card.labels['energy'] else 'the runs have no power'}"
+            f"{directory}: no sample has {energy.power}: {cause if card.labels.get('energy') else 'the runs have no power'}"
         )
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
@@ -394,7 +397,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
 
     def make_split(name: str, rows: Ints) -> Split:
         view = SampleView(StoredPixels(files, places[rows]), np.arange(len(rows)), form)
-        return Split(name, card, SampleColumns(directory, rows), view, energy)
+        return Split(name, card, SampleColumns(directory, rows), view, energy, has_energy)
 
     parts = {name: make_split(name, np.flatnonzero(split == name)) for name in SPLITS}
     return Dataset(directory, card, parts, make_split("selection", np.arange(len(split))))

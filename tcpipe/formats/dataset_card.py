@@ -275,7 +275,7 @@ class DatasetCard:
     @property
     def absent_labels(self) -> tuple[str, ...]:
         """Labels that no sample has."""
-        return tuple(name for name in LABELS if not self.labels[name])
+        return tuple(name for name in LABELS if not self.labels.get(name))
 
     @property
     def plane_crs(self) -> str:

@@ -410,11 +410,11 @@ def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | No
     """
     px, samples = card.patch_px, card.samples
     layers = sort_layers(read_layers(card.layers, card.classes, directory / CARD))
-    if not layers:
+    if not (layers or card.maps):
         return PatchFiles(directory, {}, px, np.array([0, samples]))
     known = card.format in get_args(FileFormat)
     uneven = any(layer.bands and (not layer.own_px or px % layer.own_px) for layer in layers.values())
-    if not (known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES) or uneven:
+    if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES) or uneven:
         raise DatasetError(
             f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: expected up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"

@@ -188,7 +188,7 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
-    expected = dataset_card.label.columns if dataset_card.labels["energy"] else dataset_card.label.columns[1:]
+    expected = dataset_card.label.columns if data["train"].has_energy else dataset_card.label.columns[1:]
     if len(card.inputs.outputs) != len(expected) or card.inputs.is_time_alone != (len(expected) == 1):
         problems.append(f"it predicts only {', '.join(card.inputs.outputs)}, expected {' and '.join(expected)}")
     absent = [name for name in card.layout.layers if name not in dataset_card.layers]

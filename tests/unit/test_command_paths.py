@@ -19,7 +19,7 @@ from tcpipe.store import open_store
 TEXTS = {
     "name", "robot", "cluster", "map_name", "tags", "sample_id", "scenario", "names", "topics", "crs",
     "start", "goal", "holdout", "strays", "shard", "min_age_s", "forget", "drives",
-    "adapt", "budget_joule", "layers", "predictor", "reason", "run", "runs",
+    "adapt", "budget_joule", "labels", "layers", "predictor", "reason", "run", "runs",
     "split", "time", "train", "unused", "xy",
 }  # fmt: skip
 """Parameters of commands that are text and no path."""

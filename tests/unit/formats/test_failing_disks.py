@@ -167,7 +167,7 @@ def test_a_db3_that_is_cut_while_it_is_read_leaves_damage(tmp_path):
 
 def test_a_log_whose_end_the_disk_does_not_give_has_no_hash(tmp_path):
     with open_log(LOGS["zstd.mcap"](tmp_path / "a.mcap")) as log:
-        log._files = (Path("/proc/self/mem"),)
+        log.files = (Path("/proc/self/mem"),)
         with pytest.raises(
             LogError, match=r"/proc/self/mem: it cannot be read to its end \(Input/output error\); rescue"
         ):

@@ -22,6 +22,7 @@ from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.problems import acknowledge, forget_tables
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.levels import RESULTS_VERSION
 
 OLD_NS = 10**18
 
@@ -326,7 +327,7 @@ def test_a_version_with_other_results_makes_all_runs_again_and_says_how_many_and
     found = where(night)
     assert found.counts == {"outdated": 3, "failed_permanent": 1}
     assert {group.cause for group in found.groups if group.state == "outdated"} == {
-        "made with version 1 of the results, which now are version 7"
+        f"made with version {RESULTS_VERSION} of the results, which now are version 7"
     }
     caplog.clear()
     summary = ingest([logs], store=store, recipe=Recipe())
