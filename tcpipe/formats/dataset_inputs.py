@@ -70,7 +70,7 @@ class DatasetInputs:
     labels: tuple[str, ...] = ()
     """Labels that every sample needs; none: the default."""
     without_patches: bool = False
-    """Whether patches were declined; without a map there are none in any case."""
+    """Whether the user declined patches (``--without-patches``)."""
     without_coordinates: bool
 
     @property

@@ -330,7 +330,9 @@ def _find_large_errors(part: SplitErrors, subject: Subject) -> Iterator[Finding]
         error = (part.errors[quantity][ALL].mape_percent or 0.0) / 100.0
         if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
             yield make_finding(f"{name}-far-off", subject, error_fraction=error)
-    energy = part.errors.get("E", {ALL: compute_errors(np.empty(0), np.empty(0))})
+    energy = part.errors.get("E")
+    if energy is None:
+        return
     overall = (energy[ALL].mape_percent or 0.0) / 100.0
     for class_name, scores in energy.items():
         error, names = (scores.mape_percent or 0.0) / 100.0, {"split": subject.name}

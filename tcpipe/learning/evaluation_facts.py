@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeAlias, get_args
+from typing import Annotated, Literal, TypeAlias
 
 from tcpipe.cost.coverage import Coverage
 from tcpipe.dataset.energies import EnergyName
@@ -160,7 +160,8 @@ class Evaluation:
     def costs(self) -> tuple[Literal["E", "T"], ...]:
         """Return which of energy and time were evaluated."""
         known = {quantity for part in self.splits.values() for quantity in part.errors}
-        return tuple(quantity for quantity in get_args(Literal["E", "T"]) if quantity in known)
+        both: tuple[Literal["E", "T"], ...] = ("E", "T")
+        return tuple(quantity for quantity in both if quantity in known)
 
     @property
     def judged(self) -> tuple[Affected, ...]:

@@ -89,14 +89,14 @@ class ProposedRecipe:
         return f"{left}then: tcpipe preflight {shlex.quote(self.log)}{stated}"
 
     def toml(self) -> str:
-        """Return the file. The head of a table of decisions alone is a comment too; those of ``read`` and ``mask`` may be empty."""
+        """Return the file. The head of a table of decisions alone is a comment too; those below ``read`` may be empty."""
         is_open = any(not line.is_certain for line in self.lines)
         what = " Comments below it need a decision: remove the # and correct the value." if is_open else ""
         text = [f"# Proposed by tcpipe init --from.{what}", *(f"# {clean_line(line)}".rstrip() for line in self.head)]
         tables = dict.fromkeys(line.table for line in sorted(self.lines, key=lambda line: bool(line.table)))
         for table in tables:
             mine = [line for line in self.lines if line.table == table]
-            is_head = any(line.is_certain for line in mine) or table.startswith(("read.", "mask"))
+            is_head = any(line.is_certain for line in mine) or table.startswith("read.")
             text += ["", *([f"{'' if is_head else '# '}[{table}]"] if table else [])]
             for line in mine:
                 note = f"  # {' '.join(line.note.split())}" if line.note else ""
@@ -118,16 +118,11 @@ def propose_lines(
                 yield ProposedLine(table, dotted, text, notes.get(name or key, doubt), not doubt)
 
 
-def propose_decisions(
-    frames: Iterable[tuple[str, str]], roles: Collection[str], *, keeps_reversing: bool = False
-) -> Iterator[ProposedLine]:
-    """Yield what only a person knows: where sensors are mounted, by role and frame, and whether a robot with fixes alone reversed."""
+def propose_places(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLine]:
+    """Yield a line for each sensor whose place on the robot must be measured; ``frames`` are pairs of role and frame."""
     for role, frame in frames:
         note = f"measure it from base_link: nothing places {frame or 'it'}"
         yield ProposedLine("read.extrinsics", role, make_place_to_measure(role), note, is_certain=False)
-    if not keeps_reversing and "gnss" in roles and not {"wheel_odometry", "visual_odometry"} & {*roles}:
-        note = "if it never reversed: fixes alone do not tell forward from backward"
-        yield ProposedLine("mask", "keep_reversing", True, note, is_certain=False)
 
 
 _CODES_NOTE = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_common or words"
@@ -206,9 +201,7 @@ def propose_for_log(
         (role, frames[role]) for role, (_, by) in places.items() if by == "assumed" and role != "wheel_odometry"
     ]
     is_placed = is_complete or {*assigned.transforms} <= {*static}
-    lines += propose_decisions(
-        unplaced if is_placed else (), {*used.values()}, keeps_reversing=recipe.mask.keep_reversing
-    )
+    lines += propose_places(unplaced if is_placed else ())
     return ProposedRecipe([*head, "", "These need no line."], lines, str(log.path))
 
 
@@ -331,12 +324,12 @@ def propose_tables(path: Path) -> ProposedRecipe:
     found_roles = {*roles, *(line.value for line in lines if line.key == "role")}
     for role in ("gnss", "imu", "wheel_odometry", "power"):
         lines += [] if role in found_roles else _propose_rest(role, tables, " ".join(used))
-    lines += propose_decisions([(role, "") for role in roles if role in ("gnss", "imu", "pose")], roles)
+    lines += propose_places((role, "") for role in roles if role in ("gnss", "imu", "pose"))
     return ProposedRecipe(head, lines, format_path(log))
 
 
 def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[str, Path]:
-    """Return by the name for the recipe the files of the largest run, with a * where names of runs differ.
+    """Return the files of the largest run; keys are their names in the recipe, with a * where the names of runs differ.
 
     A part of a name tells runs apart if every table has several such files, with the same columns. Of one kind of table these are logs of
     all sensors; else the numbers may be those of motors.

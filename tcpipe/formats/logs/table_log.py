@@ -167,9 +167,10 @@ _EDGES = re.compile(rb"^ | (?=\r?$)", re.MULTILINE)
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """Columns that were read, shape (N,): ``columns`` as numbers, NaN where there is none, ``stamps`` as they are in the file.
+    """The columns of a table, each of shape (N,).
 
-    ``texts`` has by column the number of cells that are no number, and row (from 1) and text of the first.
+    ``stamps`` contains the columns of stamps as the file stores them. ``columns`` contains numbers; a cell without a number is NaN.
+    ``texts`` gives, for each column with such text, the number of cells that are text, and the row (from 1) and text of the first.
     """
 
     stamps: dict[str, pl.Series]

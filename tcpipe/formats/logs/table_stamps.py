@@ -38,6 +38,10 @@ _MIN_FAST_SHARE = 0.9
 _PREFERRED = ("counter", "day", "local", "utc")
 _MAX_TIE_SPREAD_NS, _MAX_STRAY_SHARE = 2_000_000_000, 0.05
 _COARSEST = tuple(reversed(STAMP_UNITS.items()))
+_REPEATED_HOUR: tuple[Literal["earliest", "latest"], ...] = ("earliest", "latest")
+"""Which of two equal local times is meant at the end of summer time, before and after the clock was set back."""
+_LONGEST_STEP_BACK = timedelta(minutes=30)
+"""A larger step back in a table sets the clock back."""
 _NO_STAMPS = "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
 RecipeKeys: TypeAlias = dict[str, tuple[str, str, bool]]
 """By key of a table of the recipe its value, a note, and whether it is certain."""
@@ -151,7 +155,10 @@ def _make_clock(kind: Kind, times: pl.Series, sample: str) -> Clock:
 
 
 def _parse_times(column: pl.Series, form: str) -> Clock | str | None:
-    """Return the clock of texts, None where most of them are no times; in words where days and months cannot be told apart."""
+    """Return the clock that texts state, or None if most texts are not times.
+
+    If the order of day and month is ambiguous, return a message that asks for ``stamp_format``.
+    """
     texts = column.str.strip_chars().str.replace(r",(\d+)", ".${1}")
     sample = texts.filter(texts.is_not_null() & (texts != "")).head(_SAMPLE_ROWS)
     tried = {each: _parse(sample, each) for each in ([form] if form else _FORMS)}
@@ -169,7 +176,7 @@ def _parse_times(column: pl.Series, form: str) -> Clock | str | None:
 
 
 def _parse(texts: pl.Series, form: str) -> pl.Series:
-    """Return texts as times, null where they are none; a format without a year is a time of day."""
+    """Parse texts by a format; a text that does not match becomes null. A format without a year gives times of day."""
     if not re.search("%[YyGFDcs+]", form):
         return texts.str.to_time(form, strict=False)
     times = texts.str.to_datetime(form, time_unit="ns", strict=False)
@@ -190,10 +197,11 @@ def _unwrap_days(ns: pl.Series) -> pl.Series:
 
 
 def _convert_to_utc(clock: Clock, zone: str, stated: str, path: Path) -> Clock | str:
-    """Return local times, or times of day, in UTC, null where there is no such time; of an hour that comes twice the first.
+    """Convert local times, or times of day, to UTC; a time that the zone's clocks skip becomes null.
 
-    The date of times of day is the ``stated`` one, else that in the file's name, else the one at which the last row is nearest to the
-    file's last change. `PolarsError`: there is no such zone.
+    A time in the hour that the clocks repeat means its first pass, and after a row that steps back its second pass. The date of times of
+    day is ``stated``, else in the file's name, else the one that brings the last row nearest to the file's last change. Return a message
+    if the date is wrong or every time is skipped. Raise `PolarsError` if the zone does not exist.
     """
     notes, ns = clock.notes, clock.ns
     if clock.kind == "day":
@@ -219,12 +227,6 @@ def _convert_to_utc(clock: Clock, zone: str, stated: str, path: Path) -> Clock |
         return f"no time of it exists in {zone}, whose clocks skip an hour then; correct stamp_zone"
     is_repeated = (local.diff() < -_LONGEST_STEP_BACK).fill_null(value=False).cum_sum() > 0
     return replace(clock, kind="utc", ns=second.zip_with(is_repeated, first), notes=notes)
-
-
-_REPEATED_HOUR: tuple[Literal["earliest", "latest"], ...] = ("earliest", "latest")
-"""Which of two equal local times is meant at the end of summer time, before and after the clock was set back."""
-_LONGEST_STEP_BACK = timedelta(minutes=30)
-"""A larger step back in a table sets the clock back."""
 
 
 def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:
