@@ -59,6 +59,10 @@ SMALLEST = {
     "fuse": Smallest(
         "--hours 0.01 --paired-seconds 5", rf"15-state filterpy +{NUMBER} us/event[\s\S]*peak memory {NUMBER} MB"
     ),
+    "fusion_worlds": Smallest(
+        "--kinds '^step of fixes 0.20' --seeds 1 --length 40 --out {out}/a.json",
+        rf"step of fixes 0.20 m +[1-9]\d* +{NUMBER}",
+    ),
     "fusion_accuracy": Smallest("--drives 1 --only 'GNSS alone'", rf"GNSS alone +{NUMBER}"),
     "honesty": Smallest(
         "--cells '^GNSS, wheels: clean' --seeds 1 --length 60 --out {out}/a.json",
