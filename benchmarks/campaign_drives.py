@@ -263,7 +263,7 @@ def log_of(drive: Drive, sensors: Sensors, fault: Fault) -> MemoryLog:
     """Return what is recorded of a drive where a fault is."""
     real = fault.sensors(sensors).mounted(WHOLE)
     readings = fault.readings(record(drive.truth, drive.site, real, WHOLE, drive.noise), drive)
-    messages = make_streams(readings, fault.told(real.stated(WHOLE, drive.noise)), HUSKY, geoid_m=drive.site.geoid_m)
+    messages = make_streams(readings, fault.told(real.stated(WHOLE, drive.noise)), HUSKY)
     recorded = fault.messages(messages, drive)
     return MemoryLog([m for m in recorded if m.constants.get("transforms") != []])
 

@@ -103,7 +103,7 @@ def measure(seed: int, length_m: float) -> Measurements:
     faults = replace(WHOLE, gnss_noise=False)
     sensors = Sensors().mounted(faults)
     readings = record(drive.truth, drive.site, sensors, faults, drive.noise)
-    messages = make_streams(readings, sensors, HUSKY, geoid_m=drive.site.geoid_m)
+    messages = make_streams(readings, sensors, HUSKY)
     log = MemoryLog([each for each in messages if each.constants.get("transforms") != []])
     return next(prepare(read_run(log, Recipe().read, robot="husky", known=load_shipped_profiles())))
 

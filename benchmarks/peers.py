@@ -106,7 +106,7 @@ def record_drive(drive: Drive, lasts_s: float, outage_s: float) -> Streams:
     std_m = float(np.sqrt(FIX_STD_M**2 - white_m**2))
     readings = claim_noise("noise", std_m, gauss_markov(std_m, lasts_s))(readings, drive)
     readings = cut_fixes(outage_s)(readings, drive)
-    log = MemoryLog(make_streams(readings, sensors, HUSKY, geoid_m=drive.site.geoid_m))
+    log = MemoryLog(make_streams(readings, sensors, HUSKY))
     return read_run(log, ReadConfig(), robot=drive.robot, known=load_shipped_profiles())
 
 

@@ -12,62 +12,34 @@ from dataclasses import dataclass, fields
 class Faults:
     """Switches; all off is a perfect sensor set at base_link."""
 
-    gnss_noise: bool = False
-    """Position noise, most of it correlated in time."""
-    gnss_lever_arm: bool = False
-    """The antenna is not at base_link."""
-    gnss_outliers: bool = False
-    """Multipath: some fixes are metres off, with the same covariance."""
-    gnss_outage: bool = False
-    """No fix for ten seconds (half of it said with status -1, half in silence)."""
-    gnss_stamp_jitter: bool = False
-    """The stamp is not quite the time of measurement."""
-    wheel_noise: bool = False
-    """White noise of speed and yaw rate."""
-    wheel_scale: bool = False
-    """A wrong wheel radius, and a yaw rate that a skid-steered robot overstates."""
-    wheel_slip: bool = False
-    """The wheels run faster than the ground passes."""
-    imu_noise: bool = False
-    """White noise of gyroscope and accelerometer."""
-    imu_bias: bool = False
-    """Constant biases that wander."""
-    imu_vibration: bool = False
-    """Shaking while driving."""
-    imu_mounting: bool = False
-    """The unit is turned, and not at base_link."""
-    imu_yaw_offset: bool = False
-    """Its orientation, where it gives one, has a magnetic yaw error."""
-    visual_noise: bool = False
-    """White noise of the velocity."""
-    visual_scale: bool = False
-    """A wrong scale."""
-    visual_outliers: bool = False
-    """Single frames that are far off."""
-    visual_dropouts: bool = False
-    """Stretches without visual odometry."""
-    power_noise: bool = False
-    """White noise and quantisation of voltage and currents."""
-    power_gap: bool = False
-    """A stretch without power messages."""
-    command_jitter: bool = False
-    """A joystick that is never still."""
-    transport_delay: bool = False
-    """Messages reach the recorder late, each by another time."""
-    duplicates: bool = False
-    """Some messages are recorded twice."""
-    clock_step: bool = False
-    """In the middle all header stamps jump ahead for good, while the recorder's clock runs on."""
-    gnss_clock_offset: bool = False
-    """The receiver's header stamps are late by a constant."""
-    wheel_clock_offset: bool = False
-    """The wheels' header stamps are late by a constant."""
-    imu_clock_offset: bool = False
-    """The inertial unit's header stamps are late by a constant."""
-    visual_clock_offset: bool = False
-    """The camera's header stamps are late by a constant."""
-    power_clock_offset: bool = False
-    """The header stamps of voltage and currents are late by a constant."""
+    gnss_noise: bool = False  # position noise, most of it correlated in time
+    gnss_lever_arm: bool = False  # the antenna is not at base_link
+    gnss_outliers: bool = False  # multipath: some fixes are metres off, with the same covariance
+    gnss_outage: bool = False  # no fix for ten seconds (half of it said with status -1, half in silence)
+    gnss_stamp_jitter: bool = False  # the stamp is not quite the time of measurement
+    wheel_noise: bool = False  # white noise of speed and yaw rate
+    wheel_scale: bool = False  # a wrong wheel radius, and a yaw rate that a skid-steered robot overstates
+    wheel_slip: bool = False  # the wheels run faster than the ground passes
+    imu_noise: bool = False  # white noise of gyroscope and accelerometer
+    imu_bias: bool = False  # constant biases that wander
+    imu_vibration: bool = False  # shaking while driving
+    imu_mounting: bool = False  # the unit is turned, and not at base_link
+    imu_yaw_offset: bool = False  # its orientation, where it gives one, has a magnetic yaw error
+    visual_noise: bool = False  # white noise of the velocity
+    visual_scale: bool = False  # a wrong scale
+    visual_outliers: bool = False  # single frames that are far off
+    visual_dropouts: bool = False  # stretches without visual odometry
+    power_noise: bool = False  # white noise and quantisation of voltage and currents
+    power_gap: bool = False  # a stretch without power messages
+    command_jitter: bool = False  # a joystick that is never still
+    transport_delay: bool = False  # messages reach the recorder late, each by another time
+    duplicates: bool = False  # some messages are recorded twice
+    clock_step: bool = False  # in the middle all header stamps jump ahead for good, while the recorder's clock runs on
+    gnss_clock_offset: bool = False  # the receiver's header stamps are late by a constant
+    wheel_clock_offset: bool = False  # the wheels' header stamps are late by a constant
+    imu_clock_offset: bool = False  # the inertial unit's header stamps are late by a constant
+    visual_clock_offset: bool = False  # the camera's header stamps are late by a constant
+    power_clock_offset: bool = False  # the header stamps of voltage and currents are late by a constant
 
     @classmethod
     def every(cls) -> Faults:

@@ -6,10 +6,9 @@ speed, rolling resistance depends on the class (and on what no map shows), grade
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED, Float, World
@@ -23,12 +22,9 @@ _STEEPEST_SIN = float(np.sin(np.radians(22.5)))
 class GroundModel:
     """How one terrain class treats the robot on the flat."""
 
-    speed: float
-    """Wheel speed reached under full command, as a fraction of it."""
-    slip: float
-    """1 - ground speed / wheel speed."""
-    rolling_resistance: float
-    """Traction force over normal force."""
+    speed: float  # wheel speed reached under full command, as a fraction of it
+    slip: float  # 1 - ground speed / wheel speed
+    rolling_resistance: float  # traction force over normal force
 
 
 _GROUND = {
@@ -43,16 +39,12 @@ _GROUND = {
 class Wheels:
     """Four wheels without suspension, and what uneven and sidelong ground costs them."""
 
-    track_m: float
-    """From left to right."""
-    contact_m: float
-    """Length of a wheel's contact, over which bumps are averaged."""
-    bump_loss: float
-    """Share of the height climbed at bumps that is not given back."""
+    track_m: float  # from left to right
+    contact_m: float  # length of a wheel's contact, over which bumps are averaged
+    bump_loss: float  # share of the height climbed at bumps that is not given back
     cornering_per_rad: float
     """Side force per slip angle, over the normal force: on a slope the wheels run sidelong by so much that it holds."""
-    slowdown: float
-    """Speed lost by a rolling resistance beyond the class's, as a fraction of speed over one of weight."""
+    slowdown: float  # speed lost by a rolling resistance beyond the class's, as a fraction of speed over one of weight
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,32 +56,24 @@ class SimulatedRobot:
     speed_time_constant_s: float = 0.25
     max_acceleration_mps2: float = 1.0
     max_yaw_rate_radps: float = 0.7
-    uphill_slowdown: float = 0.25
-    """Wheel speed lost on 22.5° uphill, as a fraction."""
-    slope_slip: float = 0.05
-    """Slip added on 22.5° uphill, taken away downhill."""
-    wheelbase_m: float = 0.5
-    """Ground properties are averaged over it."""
-    scrub_torque_nm: float = 190.0
-    """Turning in place."""
+    uphill_slowdown: float = 0.25  # wheel speed lost on 22.5° uphill, as a fraction
+    slope_slip: float = 0.05  # slip added on 22.5° uphill, taken away downhill
+    wheelbase_m: float = 0.5  # ground properties are averaged over it
+    scrub_torque_nm: float = 190.0  # turning in place
     scrub_half_radius_m: float = 0.4
     """Radius of the turn at which the torque is half of that; infinite: the torque is the same on every curve."""
     drive_efficiency: float = 0.72
     regeneration_efficiency: float = 0.55
     drivetrain_loss_newton: float = 0.0
     """Friction of motors and gears, as a force on the ground: paid at any grade, never given back."""
-    idle_watt: float = 14.0
-    """Both motor drivers at rest; part of the propulsion current."""
+    idle_watt: float = 14.0  # both motor drivers at rest; part of the propulsion current
     electronics_watt: float = 38.0
     """Computer and user ports: never part of the propulsion current, but the battery sags with it."""
     open_circuit_volt: float = 26.4
     discharge_volt_per_megajoule: float = 0.9
     internal_resistance_ohm: float = 0.045
-    driver_resistance_ohm: float = 0.006
-    resistance_noise: float = 0.10
-    """Fluctuation of the rolling resistance in time, relative, standard deviation."""
-    resistance_noise_s: float = 0.15
-    """Its correlation time."""
+    resistance_noise: float = 0.10  # fluctuation of the rolling resistance in time, relative, standard deviation
+    resistance_noise_s: float = 0.15  # its correlation time
     ground: dict[int, GroundModel] = field(default_factory=lambda: dict(_GROUND))
     """By class id; a class that is not named is grass."""
     wheels: Wheels | None = field(default=None, metadata=ABSENT)
@@ -97,10 +81,8 @@ class SimulatedRobot:
 
     def ground_table(self) -> Float:
         """Return speed, slip and rolling resistance by class id, shape (256, 3)."""
-        table = np.empty((256, 3))
-        table[:] = [self.ground[GRASS].speed, self.ground[GRASS].slip, self.ground[GRASS].rolling_resistance]
-        for class_id, ground in self.ground.items():
-            table[class_id] = [ground.speed, ground.slip, ground.rolling_resistance]
+        table = np.tile(astuple(self.ground[GRASS]), (256, 1))
+        table[list(self.ground)] = [astuple(ground) for ground in self.ground.values()]
         return table
 
     def speed_factor(self, flat_speed: Float, sin_slope: Float) -> Float:
@@ -112,34 +94,23 @@ class SimulatedRobot:
         return flat_slip + self.slope_slip * sin_slope / _STEEPEST_SIN
 
     def wheel_power_watt(
-        self,
-        *,
-        wheel_velocity_mps: Float,
-        acceleration_mps2: Float,
-        yaw_rate_radps: Float,
-        slope_rad: Float,
+        self, *, wheel_velocity_mps: Float, acceleration_mps2: Float, yaw_rate_radps: Float, slope_rad: Float,
         rolling_resistance: Float,
-    ) -> Float:
+    ) -> Float:  # fmt: skip
         """Return mechanical power at the wheels [W]; negative where the slope drives them."""
         direction = np.sign(wheel_velocity_mps)
         weight = self.mass_kg * GRAVITY_MPS2
-        force = (
-            weight * (rolling_resistance * direction * np.cos(slope_rad) + np.sin(slope_rad))
-            + self.mass_kg * acceleration_mps2
-        )
+        force = weight * (rolling_resistance * direction * np.cos(slope_rad) + np.sin(slope_rad))
+        force = force + self.mass_kg * acceleration_mps2
         radius_m = np.abs(wheel_velocity_mps) / np.maximum(np.abs(yaw_rate_radps), 1e-6)
         scrub = self.scrub_torque_nm * np.abs(yaw_rate_radps) / (1.0 + radius_m / self.scrub_half_radius_m)
         return force * wheel_velocity_mps + scrub
 
     def propulsion_watt(self, wheel_power_watt: Float, wheel_velocity_mps: Float) -> Float:
         """Return the electrical power of both motor drivers [W], negative when they give back."""
-        driving = wheel_power_watt > 0.0
         friction = self.drivetrain_loss_newton * np.abs(wheel_velocity_mps) / self.drive_efficiency
-        return (
-            self.idle_watt
-            + friction
-            + wheel_power_watt * np.where(driving, 1.0 / self.drive_efficiency, self.regeneration_efficiency)
-        )
+        gain = np.where(wheel_power_watt > 0.0, 1.0 / self.drive_efficiency, self.regeneration_efficiency)
+        return self.idle_watt + friction + wheel_power_watt * gain
 
     def battery(self, propulsion_watt: Float, *, dt_s: float) -> tuple[Float, Float]:
         """Return terminal voltage [V] and propulsion current [A] whose product is ``propulsion_watt``.
@@ -155,30 +126,19 @@ class SimulatedRobot:
 
 @compile_kernel
 def drive_along(  # noqa: PLR0917 - numba takes positional arguments
-    grid_m: float,
-    speed_factor: NDArray[np.float64],
-    slip: NDArray[np.float64],
-    map_per_surface: NDArray[np.float64],
-    command_mps: float,
-    brake_at_m: float,
-    time_constant_s: float,
-    max_acceleration_mps2: float,
-    dt_s: float,
-    max_steps: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    grid_m: float, speed_factor: Float, slip: Float, map_per_surface: Float, command_mps: float, brake_at_m: float,
+    time_constant_s: float, max_acceleration_mps2: float, dt_s: float, max_steps: int,
+) -> tuple[Float, Float, int]:  # fmt: skip
     """Drive one path from rest to rest; returns path position [m], wheel speed [m/s] at every step, and the number of steps.
 
     The arrays hold the ground along the path every ``grid_m`` map metres. Wheel speed follows command times ``speed_factor`` with a
     first-order lag and a limited acceleration; past ``brake_at_m`` the command is zero. Ends when the wheels stand, or, with the
     position past the path, when the path was too short to stop on (the caller checks).
     """
-    position = np.empty(max_steps)
-    wheel = np.empty(max_steps)
-    s, w = 0.0, 0.0
-    last = speed_factor.size - 1
+    position, wheel = np.empty(max_steps), np.empty(max_steps)
+    s, w, last = 0.0, 0.0, speed_factor.size - 1
     for step in range(max_steps):
-        position[step] = s
-        wheel[step] = w
+        position[step], wheel[step] = s, w
         at = min(s / grid_m, last - 1e-9)
         i = int(at)
         part = at - i
@@ -198,14 +158,11 @@ def drive_along(  # noqa: PLR0917 - numba takes positional arguments
 
 
 @compile_kernel
-def make_correlated_noise(white: NDArray[np.float64], correlation: float) -> NDArray[np.float64]:
+def make_correlated_noise(white: Float, correlation: float) -> Float:
     """Return a first-order Gauss-Markov series of unit variance from white noise; ``correlation`` is that of neighbours."""
-    out = np.empty_like(white)
-    gain = np.sqrt(1.0 - correlation * correlation)
-    state = 0.0
-    for i in range(white.size):
-        state = white[0] if i == 0 else correlation * state + gain * white[i]
-        out[i] = state
+    out, gain = white.copy(), np.sqrt(1.0 - correlation * correlation)
+    for i in range(1, white.size):
+        out[i] = correlation * out[i - 1] + gain * white[i]
     return out
 
 
@@ -229,10 +186,8 @@ def compute_rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y:
         _evaluate_at_contact(world, robot, x + at * cos - side * sin, y + at * sin + side * cos, (cos, sin))
         for at, side in places
     ]
-    mean = np.mean(found, axis=0)
-    return np.asarray(
-        mean if robot.wheels is None else mean + _compute_side_drag(world, robot.wheels, x, y, (cos, sin))
-    )
+    drag = _compute_side_drag(world, robot.wheels, x, y, (cos, sin)) if robot.wheels is not None else 0.0
+    return np.asarray(np.mean(found, axis=0) + drag)
 
 
 def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Float, y: Float, heading: Heading) -> Float:

@@ -35,10 +35,8 @@ class Leg:
 
     waypoints_m: tuple[tuple[float, float], ...]
     """From the site's south-west corner; the robot's own place is not among them."""
-    radius_m: float = 2.5
-    """Radius of the curves."""
-    command: float = 1.0
-    """Commanded speed as a fraction of the robot's maximum."""
+    radius_m: float = 2.5  # radius of the curves
+    command: float = 1.0  # commanded speed as a fraction of the robot's maximum
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +93,7 @@ def make_leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float]
     corners = np.vstack([start_m, np.asarray(leg.waypoints_m, dtype=np.float64)])
     curvature, straight_m = _compute_curvature(corners, leg.radius_m)
     first = corners[1] - corners[0]
-    yaw = np.arctan2(first[1], first[0]) + np.concatenate(
-        [[0.0], np.cumsum(curvature[:-1] + curvature[1:]) * PATH_GRID_M / 2]
-    )
+    yaw = np.arctan2(first[1], first[0]) + _integrate(curvature)
     s = np.arange(yaw.size) * PATH_GRID_M
     wavelengths, phases, weights = weave
     window = np.clip(np.minimum(s, straight_m - s) / 3.0, 0.0, 1.0)
@@ -106,9 +102,8 @@ def make_leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float]
     middle = np.column_stack([_integrate(np.cos(yaw)), _integrate(np.sin(yaw))]) + corners[0]
     points = middle + offset[:, None] * np.column_stack([-np.sin(yaw), np.cos(yaw)])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    coarse = slice(None, None, 10)
-    stop_m = float(np.interp(straight_m, s, arc))
-    return Path(CubicSpline(arc[coarse], points[coarse]), float(arc[coarse][-1]), stop_m)
+    stop_m, arc = float(np.interp(straight_m, s, arc)), arc[::10]
+    return Path(CubicSpline(arc, points[::10]), float(arc[-1]), stop_m)
 
 
 def make_straight_path(start_m: Float, direction_rad: float, distance_m: float) -> Path:
@@ -155,11 +150,9 @@ class AlongRoad:
     """To and fro along a road, each time on another line of it."""
 
     road: Band
-    from_m: float
-    """Along the road's axis, from its (x, y)."""
+    from_m: float  # along the road's axis, from its (x, y)
     to_m: float
-    length_m: float
-    """About how far to drive."""
+    length_m: float  # about how far to drive
 
     _STEP_M = 9.0
     _LEG_STEPS = 6
@@ -199,33 +192,24 @@ class AlongRoad:
 class Wander:
     """A random tour that stays on traversable ground and steers towards wanted shares of terrain classes."""
 
-    length_m: float
-    """About how far to drive."""
-    start_m: tuple[float, float]
-    """From the site's south-west corner."""
+    length_m: float  # about how far to drive
+    start_m: tuple[float, float]  # from the site's south-west corner
     shares: tuple[tuple[int, float], ...] = ((4, 0.51), (5, 0.09), (6, 0.20), (7, 0.20))
     """Wanted share of the distance by class id (the paper's by default)."""
     x_range_m: tuple[float, float] | None = None
     """Kept between these, from the site's west border; None: the whole site."""
-    margin_m: float = 5.0
-    """Kept from the site's border."""
-    max_slope_deg: float = 22.5
-    """Steeper ground is avoided."""
-    climbing: float = 0.3
-    """How much steep ground draws it, against wanted classes."""
-    odd_manoeuvres: bool = True
-    """Now and then reverse, drive slowly, or get stuck."""
+    margin_m: float = 5.0  # kept from the site's border
+    max_slope_deg: float = 22.5  # steeper ground is avoided
+    climbing: float = 0.3  # how much steep ground draws it, against wanted classes
+    odd_manoeuvres: bool = True  # now and then reverse, drive slowly, or get stuck
 
     def plan(self, world: World, rng: np.random.Generator) -> list[Manoeuvre]:
         """Return the manoeuvres; the same generator state gives the same plan."""
         here, driven = np.array(self.start_m), 0.0
-        done = np.zeros(256)
-        plan: list[Manoeuvre] = [Pause(3.0)]
-        legs = 0
+        plan, done, legs = list[Manoeuvre]([Pause(3.0)]), np.zeros(256), 0
         while driven < self.length_m:
             odd = legs % 6 if self.odd_manoeuvres else -1
-            waypoints: list[tuple[float, float]] = []
-            direction = None
+            waypoints, direction = list[tuple[float, float]](), None
             for _ in range(1 if odd == 5 else int(rng.integers(2, 6))):
                 step = self._next(world, rng, here, direction, done)
                 if step is None or driven >= self.length_m:
@@ -305,16 +289,9 @@ class _Stretch:
 
 
 def simulate_drive(
-    world: World,
-    plan: Sequence[Manoeuvre],
-    *,
-    start_m: tuple[float, float],
-    start_yaw_rad: float = 0.0,
-    start_ns: int = 0,
-    robot: SimulatedRobot,
-    weave_m: float = 0.04,
-    rng: np.random.Generator,
-) -> Truth:
+    world: World, plan: Sequence[Manoeuvre], *, start_m: tuple[float, float], start_yaw_rad: float = 0.0,
+    start_ns: int = 0, robot: SimulatedRobot, weave_m: float = 0.04, rng: np.random.Generator,
+) -> Truth:  # fmt: skip
     """Drive ``plan`` from ``start_m`` (from the site's south-west corner) and return the truth.
 
     ``start_yaw_rad`` counts from the map's x axis; ``weave_m`` is how far the human weaves to the side.
@@ -334,24 +311,15 @@ def simulate_drive(
 
 
 def _plan_stretches(
-    world: World,
-    manoeuvre: Manoeuvre,
-    place: Float,
-    yaw: float,
-    *,
-    robot: SimulatedRobot,
-    weave_m: float,
-    rng: np.random.Generator,
-) -> list[_Stretch]:
+    world: World, manoeuvre: Manoeuvre, place: Float, yaw: float, *,
+    robot: SimulatedRobot, weave_m: float, rng: np.random.Generator,
+) -> list[_Stretch]:  # fmt: skip
     match manoeuvre:
         case Pause(duration_s):
             return [_make_halt(place, yaw, duration_s)]
         case Stuck(duration_s):
-            return [
-                _make_halt(
-                    place, yaw, duration_s, wheel_mps=0.6 * robot.max_velocity_mps, command_mps=robot.max_velocity_mps
-                )
-            ]
+            fastest_mps = robot.max_velocity_mps
+            return [_make_halt(place, yaw, duration_s, wheel_mps=0.6 * fastest_mps, command_mps=fastest_mps)]
         case Turn(angle_rad):
             return [_turn(place, yaw, angle_rad, robot)]
         case Reverse(distance_m, command):
@@ -362,12 +330,10 @@ def _plan_stretches(
             path = make_leg_path(place, manoeuvre, weave=weave, weave_m=weave_m)
             wanted = float(path.at(np.zeros(1))[1][0])
             turn = (wanted - yaw + np.pi) % (2.0 * np.pi) - np.pi
-            first = (
-                [_turn(place, yaw, turn, robot), _make_halt(place, yaw + turn, 0.5)]
-                if abs(turn) > _SMALL_TURN_RAD
-                else []
-            )
-            return [*first, _drive_path(world, path, manoeuvre.command, robot, backwards=False)]
+            drive = _drive_path(world, path, manoeuvre.command, robot, backwards=False)
+            if abs(turn) <= _SMALL_TURN_RAD:
+                return [drive]
+            return [_turn(place, yaw, turn, robot), _make_halt(place, yaw + turn, 0.5), drive]
 
 
 def _make_halt(

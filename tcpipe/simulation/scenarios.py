@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any, Literal
 
@@ -33,7 +33,6 @@ from tcpipe.simulation.world import (
     Site,
     Surface,
     SurfaceEffect,
-    Wave,
     World,
     draw_waves,
 )
@@ -56,15 +55,12 @@ class DriveSpec:
 
     name: str
     plan: tuple[Manoeuvre, ...] | Wander | AlongRoad
-    start_m: tuple[float, float]
-    """From the site's south-west corner."""
+    start_m: tuple[float, float]  # from the site's south-west corner
     container: Container = "mcap"
     recorder: Recorder = HUSKY_ROS2
     sensors: Sensors = field(default_factory=Sensors)
     faults: Faults = field(default_factory=Faults)
     robot: SimulatedRobot = field(default_factory=SimulatedRobot)
-    start_yaw_rad: float = 0.0
-    """From the map's x axis."""
     weave_m: float = 0.04
 
 
@@ -105,28 +101,22 @@ def make_small_world(site: Site | None = None) -> World:
         site=Site() if site is None else site,
         base_m=598.0,
         hills=(
-            Hill(34.0, 52.0, 6.1, 10.0, 11.5),
-            Hill(86.0, 26.0, 6.4, 12.5, 10.0),
-            Hill(92.0, 66.0, 4.2, 14.0, 9.0),
-            Hill(52.0, 12.0, -2.6, 16.0, 9.0),
+            Hill(34.0, 52.0, 6.1, 10.0, 11.5), Hill(86.0, 26.0, 6.4, 12.5, 10.0),
+            Hill(92.0, 66.0, 4.2, 14.0, 9.0), Hill(52.0, 12.0, -2.6, 16.0, 9.0),
         ),
         waves=draw_waves(11, count=5, total=0.10, wavelength_m=(9.0, 22.0)),
         regions=(
-            Band(UNPAVED, 62.0, 40.0, 1.35, 4.0, 3.0, 70.0, 0.4),
-            Band(PAVED, 60.0, 24.0, 0.12, 4.6, 4.0, 85.0, 1.0),
-            Ellipse(MUD, 22.0, 22.0, 8.0, 5.5, 0.5),
-            Ellipse(MUD, 100.0, 48.0, 9.0, 6.0, 2.2),
+            Band(UNPAVED, 62.0, 40.0, 1.35, 4.0, 3.0, 70.0, 0.4), Band(PAVED, 60.0, 24.0, 0.12, 4.6, 4.0, 85.0, 1.0),
+            Ellipse(MUD, 22.0, 22.0, 8.0, 5.5, 0.5), Ellipse(MUD, 100.0, 48.0, 9.0, 6.0, 2.2),
             Ellipse(MUD, 50.0, 66.0, 6.0, 5.0, 0.0),
-            Ellipse(VEGETATION, 112.0, 12.0, 6.0, 8.0, 0.2),
-            Ellipse(VEGETATION, 9.0, 70.0, 7.0, 6.0, 0.0),
-            Ellipse(TREE, 74.0, 52.0, 2.2, 2.2),
-            Ellipse(TREE, 40.0, 36.0, 2.0, 2.0),
+            Ellipse(VEGETATION, 112.0, 12.0, 6.0, 8.0, 0.2), Ellipse(VEGETATION, 9.0, 70.0, 7.0, 6.0, 0.0),
+            Ellipse(TREE, 74.0, 52.0, 2.2, 2.2), Ellipse(TREE, 40.0, 36.0, 2.0, 2.0),
             Ellipse(OBSTACLE, 30.0, 8.0, 3.0, 1.5, 0.9),
         ),
         holes=(Ellipse(0, 118.0, 78.0, 9.0, 7.0), Ellipse(0, 71.0, 30.4, 2.2, 1.6)),
         texture=draw_waves(12, count=10, total=0.05, wavelength_m=(0.8, 5.0)),
         resistance=draw_waves(13, count=8, total=0.03, wavelength_m=(1.5, 12.0)),
-    )
+    )  # fmt: skip
 
 
 def _make_visible_world() -> World:
@@ -159,19 +149,23 @@ class PaperSite:
 
 
 def read_paper_parameters() -> Numbers:
-    """Return ``paper_site.toml``: tables of numbers, each with its ``source``."""
-    return tomllib.loads(files("tcpipe.simulation").joinpath("paper_site.toml").read_text(encoding="utf-8"))
+    """Return the tables of ``paper_site.toml`` without the ``source`` of each."""
+    return _drop_sources(
+        tomllib.loads(files("tcpipe.simulation").joinpath("paper_site.toml").read_text(encoding="utf-8"))
+    )
+
+
+def _drop_sources(table: Numbers) -> Numbers:
+    kept = {name: value for name, value in table.items() if name != "source"}
+    return {name: _drop_sources(value) if isinstance(value, dict) else value for name, value in kept.items()}
 
 
 def make_paper_site() -> PaperSite:
     """Return a site as large, as high and as steep as the paper's (section IV-A), its robot, and drives with its class shares."""
     parameters = read_paper_parameters()
-    ground = {_GROUNDS[name]: GroundModel(**_read_numbers(table)) for name, table in parameters["ground"].items()}
-    wheels = Wheels(**_read_table(Wheels, parameters["wheels"]))
-    robot = SimulatedRobot(**_read_table(SimulatedRobot, parameters["robot"]), ground=ground, wheels=wheels)
-    sensors = Sensors(
-        gnss=Gnss(**_read_table(Gnss, parameters["gnss"])), power=Power(**_read_table(Power, parameters["power"]))
-    )
+    ground = {_GROUNDS[name]: GroundModel(**table) for name, table in parameters["ground"].items()}
+    robot = SimulatedRobot(**parameters["robot"], ground=ground, wheels=Wheels(**parameters["wheels"]))
+    sensors = Sensors(gnss=Gnss(**parameters["gnss"]), power=Power(**parameters["power"]))
     return PaperSite(make_paper_world(), robot, sensors, tuple(_iterate_tours(parameters["drives"])))
 
 
@@ -179,25 +173,24 @@ def make_paper_surface() -> Surface:
     """Return what the ground is like from metre to metre."""
     parameters = read_paper_parameters()
     states = parameters["states"]
-
-    def make_field(seed: int, name: str, count: int, **options: Any) -> tuple[Wave, ...]:
-        return draw_waves(seed, count=count, total=1.0, wavelength_m=tuple(states[f"{name}_m"]), **options)
-
-    return Surface(
-        looks={
-            _GROUNDS[name]: SurfaceEffect(**_read_table(SurfaceEffect, table))
-            for name, table in parameters["look"].items()
-        },
-        wetness=make_field(31, "wetness", 16),
-        cover=make_field(32, "cover", 16),
-        roughness=make_field(33, "roughness", 10),
-        grain=make_field(34, "grain", 24),
-        bumps=make_field(35, "bumps", 20),
-        ridges=make_field(36, "ridges", 6, direction_rad=tuple(states["ridges_rad"])),
-        noise=make_field(37, "noise", 16),
-        map_noise_std_m=states["map_noise_std_m"],
-        swing=states["swing"],
+    fields = (
+        ("wetness", 16),
+        ("cover", 16),
+        ("roughness", 10),
+        ("grain", 24),
+        ("bumps", 20),
+        ("ridges", 6),
+        ("noise", 16),
     )
+    waves = {
+        name: draw_waves(
+            31 + number, count=count, total=1.0, wavelength_m=tuple(states[f"{name}_m"]),
+            direction_rad=tuple(states["ridges_rad"]) if name == "ridges" else (0.0, np.pi),
+        )
+        for number, (name, count) in enumerate(fields)
+    }  # fmt: skip
+    looks = {_GROUNDS[name]: SurfaceEffect(**table) for name, table in parameters["look"].items()}
+    return Surface(looks, **waves, map_noise_std_m=states["map_noise_std_m"], swing=states["swing"])
 
 
 def scale_hidden_variance(world: World, factor: float) -> World:
@@ -206,31 +199,15 @@ def scale_hidden_variance(world: World, factor: float) -> World:
     return replace(world, resistance=hidden)
 
 
-def _read_numbers(table: Numbers) -> Numbers:
-    return {name: value for name, value in table.items() if name != "source"}
-
-
-def _read_table(kind: type, table: Numbers) -> Numbers:
-    """Return a table's numbers; a name that the dataclass has not is a mistake in the file."""
-    unknown = set(_read_numbers(table)) - {field.name for field in fields(kind)}
-    if unknown:
-        raise ValueError(f"paper_site.toml: {kind.__name__} has no {', '.join(sorted(unknown))}")
-    return _read_numbers(table)
-
-
 def _iterate_tours(drives: Numbers) -> Iterator[Wander | AlongRoad]:
     """Yield the drives: to and fro along roads, and random tours of grass and mud that stay in one of the areas."""
     for run in drives["road"]:
         yield AlongRoad(_PAPER_ROADS[run["road"]], run["from_m"], run["to_m"], run["length_m"])
     for run in drives["field"]:
-        yield Wander(
-            run["length_m"],
-            (run["start_m"][0], run["start_m"][1]),
-            shares=((GRASS, 1.0 - run["mud_share"]), (MUD, run["mud_share"])),
-            x_range_m=(run["x_range_m"][0], run["x_range_m"][1]),
-            max_slope_deg=drives["slope_deg"],
-            climbing=drives["climbing"],
-        )
+        shares = ((GRASS, 1.0 - run["mud_share"]), (MUD, run["mud_share"]))
+        start_m, x_range_m = (run["start_m"][0], run["start_m"][1]), (run["x_range_m"][0], run["x_range_m"][1])
+        steep = {"max_slope_deg": drives["slope_deg"], "climbing": drives["climbing"]}
+        yield Wander(run["length_m"], start_m, shares=shares, x_range_m=x_range_m, **steep)
 
 
 _PAPER_ROADS = (
@@ -252,53 +229,41 @@ def make_paper_world() -> World:
     rng = np.random.default_rng(about["seed"])
     site = Site(west_m=697300.0, south_m=5208300.0, width_m=about["width_m"], height_m=about["height_m"])
     slope = (Hill(420.0, 210.0, 60.0, 170.0, 130.0), Hill(120.0, 60.0, -16.0, 120.0, 80.0))
-    knolls = tuple(
-        Hill(x, y, float(rng.uniform(3.0, 7.5)), x_sigma, y_sigma)
-        for x, y, x_sigma, y_sigma, _ in _scatter_places(site, rng, about["knolls"], size_m=(14.0, 26.0), margin_m=25.0)
-    )
-    mud = tuple(
-        Ellipse(MUD, *place)
-        for place in _scatter_places(site, rng, about["mud_patches"], size_m=(5.0, 13.0), margin_m=25.0)
-    )
-    hedges = tuple(
-        Ellipse(VEGETATION, *place) for place in _scatter_places(site, rng, about["hedges"], size_m=(3.0, 14.0))
-    )
-    trees = tuple(Ellipse(TREE, *place) for place in _scatter_places(site, rng, about["trees"], size_m=(1.5, 4.5)))
+    places = _scatter_places(site, rng, about["knolls"], size_m=(14.0, 26.0), margin_m=25.0)
+    knolls = tuple(Hill(x, y, float(rng.uniform(3.0, 7.5)), *sigmas_m) for x, y, *sigmas_m, _ in places)
+    plants = tuple(
+        Ellipse(class_id, *place)
+        for class_id, name, size_m, margin_m in (
+            (MUD, "mud_patches", (5.0, 13.0), 25.0), (VEGETATION, "hedges", (3.0, 14.0), 0.0), (TREE, "trees", (1.5, 4.5), 0.0),
+        )
+        for place in _scatter_places(site, rng, about[name], size_m=size_m, margin_m=margin_m)
+    )  # fmt: skip
     world = World(
         site,
         base_m=600.0,
         hills=slope + knolls,
         waves=draw_waves(21, count=6, total=0.12, wavelength_m=(9.0, 24.0)),
         regions=(
-            *mud,
-            *hedges,
-            *trees,
-            *_PAPER_ROADS,
-            Ellipse(OBSTACLE, 60.0, 245.0, 9.0, 6.0, 0.3),
-            Ellipse(OBSTACLE, 520.0, 40.0, 7.0, 5.0),
+            *plants, *_PAPER_ROADS,
+            Ellipse(OBSTACLE, 60.0, 245.0, 9.0, 6.0, 0.3), Ellipse(OBSTACLE, 520.0, 40.0, 7.0, 5.0),
         ),
         holes=(
-            Ellipse(0, 0.0, 305.0, 70.0, 40.0),
-            Ellipse(0, 596.0, 0.0, 60.0, 35.0),
-            Ellipse(0, 250.0, 60.0, 3.0, 2.0),
+            Ellipse(0, 0.0, 305.0, 70.0, 40.0), Ellipse(0, 596.0, 0.0, 60.0, 35.0), Ellipse(0, 250.0, 60.0, 3.0, 2.0),
         ),
         texture=draw_waves(22, count=12, total=surface["texture_share"], wavelength_m=(0.8, 6.0)),
         resistance=draw_waves(23, count=10, total=surface["hidden_resistance_share"], wavelength_m=(1.5, 15.0)),
         surface=make_paper_surface(),
-    )
+    )  # fmt: skip
     return _stretch_heights(world, about["lowest_m"], about["highest_m"])
 
 
 def _scatter_places(
-    site: Site, rng: np.random.Generator, count: int, *, size_m: tuple[float, float], margin_m: float = 0.0
-) -> list[tuple[float, float, float, float, float]]:
+    site: Site, rng: np.random.Generator, count: int, *, size_m: tuple[float, float], margin_m: float
+) -> list[list[float]]:
     """Return random places on the paper's site: x, y, two radii [m], rotation [rad]."""
-    low, high = (
-        (margin_m, margin_m, *[size_m[0]] * 2, 0.0),
-        (site.width_m - margin_m, site.height_m - margin_m, *[size_m[1]] * 2, np.pi),
-    )
-    drawn = rng.uniform(low, high, (count, 5)).tolist()
-    return [(x, y, x_radius, y_radius, rotation) for x, y, x_radius, y_radius, rotation in drawn]
+    low = (margin_m, margin_m, *[size_m[0]] * 2, 0.0)
+    high = (site.width_m - margin_m, site.height_m - margin_m, *[size_m[1]] * 2, np.pi)
+    return rng.uniform(low, high, (count, 5)).tolist()  # type: ignore[no-any-return]
 
 
 def _stretch_heights(world: World, lowest_m: float, highest_m: float) -> World:
@@ -345,29 +310,18 @@ def _make_paper_quick() -> Scenario:
 
 
 def _make_demo() -> Scenario:
-    faults = Faults.every()
     pose_only = replace(Sensors(), visual=Visual(says="pose"), imu=Imu(rate_hz=100.0, orientation=False))
-    return Scenario(
-        name="demo",
-        world=_make_visible_world(),
-        drives=(
-            DriveSpec("husky_2023-11-14_a", Wander(170.0, (110.0, 30.0)), (110.0, 30.0), faults=faults),
-            DriveSpec(
-                "husky_2023-11-14_b", Wander(170.0, (90.0, 55.0)), (90.0, 55.0), "bag", HUSKY_ROS1, pose_only, faults
-            ),
-        ),
-        region_m=_WEST,
+    first, second = (Wander(170.0, start_m) for start_m in ((110.0, 30.0), (90.0, 55.0)))
+    drives = (
+        DriveSpec("husky_2023-11-14_a", first, first.start_m, faults=Faults.every()),
+        DriveSpec("husky_2023-11-14_b", second, second.start_m, "bag", HUSKY_ROS1, pose_only, Faults.every()),
     )
+    return Scenario("demo", _make_visible_world(), drives, _WEST)
 
 
 def _make_hills12() -> Scenario:
-    drive = DriveSpec(
-        "hills12",
-        Wander(500.0, (14.0, 34.0), climbing=0.5),
-        (14.0, 34.0),
-        sensors=replace(Sensors(), imu=Imu(rate_hz=200.0)),
-        faults=Faults.every(),
-    )
+    plan, sensors = Wander(500.0, (14.0, 34.0), climbing=0.5), replace(Sensors(), imu=Imu(rate_hz=200.0))
+    drive = DriveSpec("hills12", plan, plan.start_m, sensors=sensors, faults=Faults.every())
     return Scenario("hills12", make_small_world(), (drive,), _WEST)
 
 
@@ -398,22 +352,11 @@ def make_tiny(
 
 def _make_manoeuvres() -> Scenario:
     plan = (
-        Pause(3.0),
-        Leg(((30.0, 34.0),)),
-        Pause(1.0),
-        Turn(np.pi / 2),
-        Turn(-np.pi),
-        Pause(0.5),
-        Reverse(3.0),
-        Pause(0.5),
-        Leg(((36.0, 44.0), (30.0, 50.0)), radius_m=1.2),
-        Stuck(3.0),
-        Leg(((20.0, 56.0),), command=0.5),
-        Pause(2.0),
-    )
-    return Scenario(
-        "manoeuvres", make_small_world(), (DriveSpec("manoeuvres", plan, (14.0, 34.0)),), _WESTERN_HALF, _COARSE
-    )
+        Pause(3.0), Leg(((30.0, 34.0),)), Pause(1.0), Turn(np.pi / 2), Turn(-np.pi), Pause(0.5), Reverse(3.0), Pause(0.5),
+        Leg(((36.0, 44.0), (30.0, 50.0)), radius_m=1.2), Stuck(3.0), Leg(((20.0, 56.0),), command=0.5), Pause(2.0),
+    )  # fmt: skip
+    drive = DriveSpec("manoeuvres", plan, (14.0, 34.0))
+    return Scenario("manoeuvres", make_small_world(), (drive,), _WESTERN_HALF, _COARSE)
 
 
 SCENARIOS: Mapping[str, Callable[[], Scenario]] = {

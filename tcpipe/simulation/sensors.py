@@ -50,23 +50,17 @@ class Mounting:
         return np.asarray(quat_from_rpy(*self.rpy_rad))
 
 
-AT_BASE_LINK = Mounting()
-
-
 @dataclass(frozen=True, slots=True)
 class Gnss:
     """RTK receiver; its covariance is that of both parts of its noise."""
 
     rate_hz: float = 10.0
-    std_m: float = 0.005
-    """White, east and north."""
+    std_m: float = 0.005  # white, east and north
     vertical_std_m: float = 0.0085
     lasting_std_m: tuple[float, float] = (0.008, 0.020)
     """Range of the part that is correlated in time, east and north; each drive draws one. (0, 0): all noise is white."""
-    lasts_s: tuple[float, float] = (5.0, 60.0)
-    """Range of its correlation time, of which each drive draws one."""
-    covariance: Literal["known", "unknown"] = "known"
-    """Whether the message states its standard deviation."""
+    lasts_s: tuple[float, float] = (5.0, 60.0)  # range of its correlation time, of which each drive draws one
+    covariance: Literal["known", "unknown"] = "known"  # whether the message states its standard deviation
     mounting: Mounting = Mounting((0.1, 0.0, 0.9))
     stated_off_m: float = 0.05
     """By at most how much the log states another place than that, in a direction that each drive draws."""
@@ -87,10 +81,8 @@ class Doppler:
     """The receiver's own velocity: east, north, up of its antenna."""
 
     rate_hz: float = 10.0
-    std_mps: float = 0.03
-    """White, east and north; twice that up."""
-    lasting_std_mps: float = 0.04
-    """Of the part that the receiver's filter and multipath make last."""
+    std_mps: float = 0.03  # white, east and north; twice that up
+    lasting_std_mps: float = 0.04  # of the part that the receiver's filter and multipath make last
     lasts_s: float = 1.5
     mounting: Mounting = Mounting((0.1, 0.0, 0.9))
     delay_s: float = 0.06
@@ -103,8 +95,7 @@ class Wheels:
     rate_hz: float = 50.0
     std_mps: float = 0.03
     yaw_rate_std_radps: float = 0.02
-    covariance: Literal["known", "unknown"] = "known"
-    """unknown: all zero in the message."""
+    covariance: Literal["known", "unknown"] = "known"  # unknown: all zero in the message
     scale: float = 1.015
     yaw_scale: float = 1.08
     delay_s: float = 0.006
@@ -120,8 +111,7 @@ class Imu:
     accelerometer_std_mps2: float = 0.04
     gyro_bias_radps: float = 0.004
     accelerometer_bias_mps2: float = 0.06
-    vibration_mps2: float = 0.25
-    """At full speed."""
+    vibration_mps2: float = 0.25  # at full speed
     mounting: Mounting = Mounting((0.05, -0.1, 0.3), (np.pi, 0.0, np.pi / 2))
     orientation: bool = True
     yaw_offset_rad: float = 0.14
@@ -135,10 +125,8 @@ class Visual:
     """Visual odometry, in its own child frame."""
 
     rate_hz: float = 30.0
-    says: Literal["twist", "pose"] = "twist"
-    """pose leaves the twist empty, as the ZED wrapper for ROS 1 does."""
-    covariance: Literal["known", "unknown"] = "known"
-    """unknown: all zero in the message."""
+    says: Literal["twist", "pose"] = "twist"  # pose leaves the twist empty, as the ZED wrapper for ROS 1 does
+    covariance: Literal["known", "unknown"] = "known"  # unknown: all zero in the message
     std_mps: float = 0.03
     yaw_rate_std_radps: float = 0.01
     scale: float = 0.97
@@ -155,8 +143,7 @@ class Power:
     """Voltage and driver currents."""
 
     rate_hz: float = 20.0
-    averaged: bool = False
-    """Over the period that ends at the stamp, rather than sampled at it."""
+    averaged: bool = False  # over the period that ends at the stamp, rather than sampled at it
     reading_hz: float | None = None
     """How often the device is read, where each message repeats the last reading; None: for every message."""
     voltage_std_volt: float = 0.02
@@ -164,8 +151,7 @@ class Power:
     voltage_step_volt: float = 0.01
     current_step_amp: float = 0.05
     gap_s: float = 1.5
-    electronics_watt: float = 38.0
-    """What computer and user ports draw; reported apart."""
+    electronics_watt: float = 38.0  # what computer and user ports draw; reported apart
     delay_s: float = 0.01
     clock_offset_s: float = 0.25
 
@@ -194,10 +180,8 @@ class Sensors:
     def mounted(self, faults: Faults) -> Sensors:
         """Return the sensors with their true extrinsics: at base_link unless the fault that moves them is on."""
         in_place = {"gnss": faults.gnss_lever_arm, "doppler": faults.gnss_lever_arm, "imu": faults.imu_mounting}
-        carried = {
-            name: sensor for name, kept in in_place.items() if not kept and (sensor := getattr(self, name)) is not None
-        }
-        return replace(self, **{name: replace(sensor, mounting=AT_BASE_LINK) for name, sensor in carried.items()})
+        names = [name for name, kept in in_place.items() if not kept and getattr(self, name) is not None]
+        return replace(self, **{name: replace(getattr(self, name), mounting=Mounting()) for name in names})
 
     def stated(self, faults: Faults, noise: Noise) -> Sensors:
         """Return mounted sensors as the log of a drive states them: the antenna off by up to its ``stated_off_m``."""
@@ -216,13 +200,16 @@ def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: No
         "gnss": partial(read_gnss, site=site), "imu": read_imu, "wheels": read_wheels, "visual": read_visual,
         "power": read_power, "command": read_command, "doppler": read_doppler,
     }  # fmt: skip
-    carried = {name: sensor for name in readers if (sensor := getattr(sensors, name)) is not None}
-    readings = {name: readers[name](truth, sensor, faults, noise) for name, sensor in carried.items()}
-    readings = {name: _offset_stamps(name, reading, sensors, faults) for name, reading in readings.items()}
-    if faults.clock_step:
-        middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
-        for name, reading in readings.items():
-            stamp_ns = np.where(reading.stamp_ns < middle_ns, reading.stamp_ns, reading.stamp_ns + CLOCK_STEP_NS)
+    middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
+    readings = {}
+    for name, read in readers.items():
+        if (sensor := getattr(sensors, name)) is not None:
+            readings[name] = reading = read(truth, sensor, faults, noise)
+            stamp_ns = reading.stamp_ns
+            if getattr(faults, f"{'wheel' if name == 'wheels' else name}_clock_offset", False):
+                stamp_ns = stamp_ns + round(1e9 * sensor.clock_offset_s)
+            if faults.clock_step:
+                stamp_ns = np.where(stamp_ns < middle_ns, stamp_ns, stamp_ns + CLOCK_STEP_NS)
             readings[name] = replace(reading, stamp_ns=stamp_ns)
     return readings
 
@@ -253,27 +240,24 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
         hit = rng.random(stamp.size) < sensor.outlier_share
         enu = enu + hit[:, None] * sensor.outlier_m * rng.standard_normal(enu.shape)
     lon, lat, alt = site.lonlatalt(enu)
-    status = np.full(stamp.size, 2, dtype=np.int8)
-    keep = np.ones(stamp.size, dtype=bool)
+    status, keep = np.full(stamp.size, 2, dtype=np.int8), np.ones(stamp.size, dtype=bool)
     if faults.gnss_outage:
         begin = _draw_begin_ns(truth, noise("gnss.outage"), sensor.outage_s)
         half = round(sensor.outage_s * 0.5e9)
         status[(stamp >= begin) & (stamp < begin + half)] = -1
         keep = (stamp < begin + half) | (stamp >= begin + 2 * half)
-    blind = status < 0
-    lon, lat, alt = (np.where(blind, np.nan, values) for values in (lon, lat, alt))
+    lon, lat, alt = (np.where(status < 0, np.nan, values) for values in (lon, lat, alt))
     known = sensor.covariance == "known"
     covariance = np.zeros((stamp.size, 9))
     covariance[:, [0, 4, 8]] = white_m**2 + lasting_m**2 if known else 0.0
     values = {"lon_deg": lon, "lat_deg": lat, "alt_m": alt, "covariance": covariance, "status": status}
     values["covariance_type"] = np.full(stamp.size, 2 if known else 0, dtype=np.uint8)
-    said = stamp
-    if faults.gnss_stamp_jitter:
-        said = stamp + np.round(1e9 * sensor.stamp_jitter_s * noise("gnss.jitter").standard_normal(stamp.size)).astype(
-            np.int64
-        )
-    log_time = _log_times(stamp, sensor.delay_s, faults, noise("gnss.delay"))
-    return _repeat_readings(_keep_rows(Reading(said, log_time, values), keep), faults, noise("gnss.duplicates"))
+    said = _finish(stamp, sensor.delay_s, values, faults, noise, name="gnss", keep=keep)
+    if not faults.gnss_stamp_jitter:
+        return said
+    jitter_s = sensor.stamp_jitter_s * noise("gnss.jitter").standard_normal(stamp.size)
+    row = np.searchsorted(stamp, said.stamp_ns)
+    return replace(said, stamp_ns=said.stamp_ns + np.round(1e9 * jitter_s).astype(np.int64)[row])
 
 
 def _draw_lasting_noise(sensor: Gnss, rng: np.random.Generator) -> tuple[Float, float]:
@@ -301,9 +285,8 @@ def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) ->
     covariance = np.zeros((stamp.size, 36))
     covariance[:, [0, 7, 14]] = np.square(axes * np.hypot(sensor.std_mps, sensor.lasting_std_mps))
     covariance[:, [21, 28, 35]] = -1.0  # a receiver measures no turns
-    return _finish(
-        stamp, sensor.delay_s, {"velocity_enu_mps": velocity, "covariance": covariance}, faults, noise, name="doppler"
-    )
+    values = {"velocity_enu_mps": velocity, "covariance": covariance}
+    return _finish(stamp, sensor.delay_s, values, faults, noise, name="doppler")
 
 
 def read_wheels(truth: Truth, sensor: Wheels, faults: Faults, noise: Noise) -> Reading:
@@ -329,7 +312,9 @@ def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading
     stamp = _sample_times(truth, sensor.rate_hz, noise("imu.phase"))
     at = truth.at(stamp)
     place = truth.enu_m + rotate(truth.quat_xyzw, np.array(sensor.mounting.xyz_m))
-    acceleration = _interpolate(_compute_acceleration(place, truth), truth, stamp)
+    dt_s, acceleration = float(truth.stamp_ns[1] - truth.stamp_ns[0]) * 1e-9, np.zeros_like(place)
+    acceleration[1:-1] = (place[2:] - 2.0 * place[1:-1] + place[:-2]) / dt_s**2
+    acceleration = _interpolate(acceleration, truth, stamp)
     unit_from_base = invert(sensor.mounting.quat_xyzw())
     enu_from_unit = multiply(at.quat_xyzw, sensor.mounting.quat_xyzw())
     force = rotate(invert(enu_from_unit), acceleration + np.array([0.0, 0.0, GRAVITY_MPS2]))
@@ -350,11 +335,7 @@ def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading
         error = sensor.orientation_std_rad * noise("imu.orientation").standard_normal((3, stamp.size))
         roll, pitch, yaw = roll + error[0], pitch + error[1], yaw + error[2]
     orientation = multiply(quat_from_rpy(roll, pitch, yaw), sensor.mounting.quat_xyzw())
-    values: Values = {
-        "angular_velocity_radps": rate,
-        "specific_force_mps2": force,
-        "orientation_xyzw": orientation,
-    }
+    values = {"angular_velocity_radps": rate, "specific_force_mps2": force, "orientation_xyzw": orientation}
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="imu")
 
 
@@ -392,19 +373,16 @@ def read_power(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Rea
     read_ns = stamp if sensor.reading_hz is None else _sample_times(truth, sensor.reading_hz, noise("power.reading"))
     right = truth.current_amp * truth.right_share
     series = {"voltage_volt": truth.voltage_volt, "left_amp": truth.current_amp - right, "right_amp": right}
-    if sensor.averaged:
-        period_ns = round(1e9 / (sensor.reading_hz or sensor.rate_hz))
-        values = {
-            name: _mean_before(truth, series_values, read_ns, period_ns) for name, series_values in series.items()
-        }
-    else:
-        values = {name: np.interp(read_ns, truth.stamp_ns, series_values) for name, series_values in series.items()}
+    period_ns = round(1e9 / (sensor.reading_hz or sensor.rate_hz)) if sensor.averaged else 0
+    values = {name: _mean_before(truth, each, read_ns, period_ns) for name, each in series.items()}
     if faults.power_noise:
-        for name in values:
-            volt = name == "voltage_volt"
-            std = sensor.voltage_std_volt if volt else sensor.current_std_amp
-            step = sensor.voltage_step_volt if volt else sensor.current_step_amp
-            noisy = values[name] + std * noise(f"power.{name}").standard_normal(read_ns.size)
+        volt, amp = (
+            (sensor.voltage_std_volt, sensor.voltage_step_volt),
+            (sensor.current_std_amp, sensor.current_step_amp),
+        )
+        for name, each in values.items():
+            std, step = volt if name == "voltage_volt" else amp
+            noisy = each + std * noise(f"power.{name}").standard_normal(read_ns.size)
             values[name] = np.round(noisy / step) * step
     if sensor.reading_hz is not None:
         last = np.maximum(np.searchsorted(read_ns, stamp, side="right") - 1, 0)
@@ -428,58 +406,25 @@ def read_command(truth: Truth, sensor: Command, faults: Faults, noise: Noise) ->
 
 
 def _finish(
-    stamp: NDArray[np.int64],
-    delay_s: float,
-    values: Values,
-    faults: Faults,
-    noise: Noise,
-    *,
-    name: str,
-    keep: NDArray[np.bool_] | None = None,
-) -> Reading:
-    reading = Reading(stamp, _log_times(stamp, delay_s, faults, noise(f"{name}.delay")), values)
-    if keep is not None:
-        reading = _keep_rows(reading, keep)
-    return _repeat_readings(reading, faults, noise(f"{name}.duplicates"))
+    stamp: NDArray[np.int64], delay_s: float, values: Values, faults: Faults, noise: Noise, *,
+    name: str, keep: NDArray[np.bool_] | None = None,
+) -> Reading:  # fmt: skip
+    """Return what is recorded: messages late by a delay with an exponential tail, without those not kept, some of them twice."""
+    times = np.ones(stamp.size, np.int64) if keep is None else keep.astype(np.int64)
+    log_time = stamp
+    if faults.transport_delay:
+        late_s = delay_s * (0.7 + 0.3 * noise(f"{name}.delay").exponential(1.0, stamp.size))
+        log_time = stamp + np.round(late_s * 1e9).astype(np.int64)
+    if faults.duplicates:
+        times[times > 0] += noise(f"{name}.duplicates").random(int(times.sum())) < 0.002
+    values = {column: np.repeat(each, times, axis=0) for column, each in values.items()}
+    return Reading(np.repeat(stamp, times), np.repeat(log_time, times), values)
 
 
 def _sample_times(truth: Truth, rate_hz: float, rng: np.random.Generator) -> NDArray[np.int64]:
     period_ns = 1e9 / rate_hz
-    span_ns = truth.stamp_ns[-1] - truth.stamp_ns[0]
-    first = rng.uniform(0.0, period_ns)
-    times = np.arange(first, span_ns, period_ns)
+    times = np.arange(rng.uniform(0.0, period_ns), truth.stamp_ns[-1] - truth.stamp_ns[0], period_ns)
     return np.asarray(truth.stamp_ns[0] + np.round(times).astype(np.int64))
-
-
-def _log_times(stamp: NDArray[np.int64], delay_s: float, faults: Faults, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return when the recorder got the messages: at once, or late by a delay with an exponential tail."""
-    if not faults.transport_delay:
-        return stamp
-    late_s = delay_s * (0.7 + 0.3 * rng.exponential(1.0, stamp.size))
-    return np.asarray(stamp + np.round(late_s * 1e9).astype(np.int64))
-
-
-def _keep_rows(reading: Reading, keep: NDArray[np.bool_]) -> Reading:
-    values = {name: values[keep] for name, values in reading.values.items()}
-    return Reading(reading.stamp_ns[keep], reading.log_time_ns[keep], values)
-
-
-def _repeat_readings(reading: Reading, faults: Faults, rng: np.random.Generator) -> Reading:
-    if not faults.duplicates:
-        return reading
-    times = 1 + (rng.random(reading.stamp_ns.size) < 0.002)
-    values = {name: np.repeat(values, times, axis=0) for name, values in reading.values.items()}
-    return Reading(np.repeat(reading.stamp_ns, times), np.repeat(reading.log_time_ns, times), values)
-
-
-def _offset_stamps(name: str, reading: Reading, sensors: Sensors, faults: Faults) -> Reading:
-    """Return the reading with header stamps late by its sensor's constant, if that fault is on; the recorder's clock is right."""
-    if not getattr(faults, f"{_SINGULAR.get(name, name)}_clock_offset", False):
-        return reading
-    return replace(reading, stamp_ns=reading.stamp_ns + round(1e9 * getattr(sensors, name).clock_offset_s))
-
-
-_SINGULAR = {"wheels": "wheel"}
 
 
 def _draw_begin_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> int:
@@ -502,13 +447,6 @@ def _dead_reckon(velocity: Float, yaw_rate: Float, dt_s: float) -> tuple[Float, 
     return np.cumsum(step_x) - step_x[0], np.cumsum(step_y) - step_y[0], (yaw + np.pi) % (2 * np.pi) - np.pi
 
 
-def _compute_acceleration(place_m: Float, truth: Truth) -> Float:
-    dt_s = float(truth.stamp_ns[1] - truth.stamp_ns[0]) * 1e-9
-    acceleration = np.zeros_like(place_m)
-    acceleration[1:-1] = (place_m[2:] - 2.0 * place_m[1:-1] + place_m[:-2]) / dt_s**2
-    return acceleration
-
-
 def _interpolate(values: Float, truth: Truth, stamp: NDArray[np.int64]) -> Float:
     return np.stack([np.interp(stamp, truth.stamp_ns, column) for column in values.T], axis=-1)
 
@@ -521,7 +459,9 @@ def _make_wandering_bias(stamp: NDArray[np.int64], size: float, rng: np.random.G
 
 
 def _mean_before(truth: Truth, values: Float, stamp: NDArray[np.int64], period_ns: int) -> Float:
-    """Return the mean of a series over the period that ends at each stamp."""
+    """Return the mean of a series over the period that ends at each stamp; of no period the value there."""
+    if not period_ns:
+        return np.interp(stamp, truth.stamp_ns, values)
     steps_s = np.diff(truth.stamp_ns) * 1e-9
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * steps_s)])
     start = np.maximum(stamp - period_ns, truth.stamp_ns[0])
@@ -538,9 +478,8 @@ def _make_camera_pose(at: Truth, sensor: Visual, faults: Faults, wrong_mps: Floa
     if faults.visual_noise:
         white = noise("visual.rotation").standard_normal((at.stamp_ns.size, 3))
         drift = np.cumsum(white, axis=0) * sensor.yaw_rate_std_radps / sensor.rate_hz
-    start_from_camera = multiply(
-        invert(enu_from_camera[0]), multiply(enu_from_camera, quat_from_rotation_vector(drift))
-    )
+    turned = multiply(enu_from_camera, quat_from_rotation_vector(drift))
+    start_from_camera = multiply(invert(enu_from_camera[0]), turned)
     moved = rotate(invert(enu_from_camera[:-1]), np.diff(place, axis=0))
     moved = moved * (sensor.scale if faults.visual_scale else 1.0) + wrong_mps[:-1] / sensor.rate_hz
     steps = rotate(start_from_camera[:-1], moved)

@@ -42,13 +42,11 @@ class SimulatedSite:
 
     directory: Path
     logs: tuple[Path, ...]
-    rasters: dict[str, Path]
-    """height, ortho, terrain, classes (the class table)."""
+    rasters: dict[str, Path]  # height, ortho, terrain, classes (the class table)
     region: Path
     truths: tuple[Path, ...]
     world: Path
-    unchanged: bool = False
-    """It was there already."""
+    unchanged: bool = False  # it was there already
 
 
 def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> SimulatedSite:
@@ -94,15 +92,9 @@ def simulate_readings(scenario: Scenario, index: int = 0, *, seed: int = 1) -> t
     spec, noise = scenario.drives[index], Noise(seed, index)
     plan = spec.plan if isinstance(spec.plan, tuple) else spec.plan.plan(scenario.world, noise("plan"))
     truth = simulate_drive(
-        scenario.world,
-        plan,
-        start_m=spec.start_m,
-        start_yaw_rad=spec.start_yaw_rad,
-        start_ns=scenario.start_ns(index),
-        robot=spec.robot,
-        weave_m=spec.weave_m,
-        rng=noise("drive"),
-    )
+        scenario.world, plan, start_m=spec.start_m, start_ns=scenario.start_ns(index), robot=spec.robot,
+        weave_m=spec.weave_m, rng=noise("drive"),
+    )  # fmt: skip
     sensors = spec.sensors.mounted(spec.faults)
     return truth, record(truth, scenario.world.site, sensors, spec.faults, noise)
 
@@ -111,7 +103,7 @@ def simulate_messages(scenario: Scenario, index: int = 0, *, seed: int = 1) -> t
     """Return the truth of one drive of a scenario, and what is recorded of it; nothing is written."""
     spec, (truth, readings) = scenario.drives[index], simulate_readings(scenario, index, seed=seed)
     stated = spec.sensors.mounted(spec.faults).stated(spec.faults, Noise(seed, index))
-    return truth, make_streams(readings, stated, spec.recorder, geoid_m=scenario.world.site.geoid_m)
+    return truth, make_streams(readings, stated, spec.recorder)
 
 
 def read_truth(path: Path) -> Truth:
@@ -120,36 +112,25 @@ def read_truth(path: Path) -> Truth:
 
 
 def _write_log(path: Path, spec: DriveSpec, messages: Sequence[MessageStream]) -> None:
-    match spec.container:
-        case "mcap":
-            write_mcap(path, messages, encoding="ros1" if spec.recorder.dialect == "ros1" else "cdr")
-        case "bag":
-            write_bag(path, messages)
-        case "rosbag2":
-            write_rosbag2(path, messages)
-        case "rosbag2_mcap":
-            write_rosbag2(path, messages, storage="mcap")
+    if spec.container == "mcap":
+        write_mcap(path, messages, encoding="ros1" if spec.recorder.dialect == "ros1" else "cdr")
+    elif spec.container == "bag":
+        write_bag(path, messages)
+    else:
+        write_rosbag2(path, messages, storage="mcap" if spec.container == "rosbag2_mcap" else "sqlite3")
 
 
 def write_rasters(directory: Path, world: World, spec: RasterSpec) -> dict[str, Path]:
     """Write height (float32), ortho (RGBA) and terrain (palette) GeoTIFFs and the class table."""
     paths = _make_raster_paths(directory)
-    _write_raster(
-        paths["height"],
-        world,
-        spec.height_pitch_m,
-        (0.0, 0.0),
-        _make_height_pixels,
-        dtype="float32",
-        nodata=_HEIGHT_NODATA,
-    )
-    _write_raster(
-        paths["ortho"], world, spec.ortho_pitch_m, spec.ortho_shift_m, _make_ortho_pixels, dtype="uint8", bands=4
-    )
-    _write_raster(
-        paths["terrain"], world, spec.terrain_pitch_m, spec.terrain_shift_m, _make_terrain_pixels,
-        dtype="uint8", nodata=0, palette=_PALETTE,
-    )  # fmt: skip
+    height = {"dtype": "float32", "nodata": _HEIGHT_NODATA}
+    terrain = {"dtype": "uint8", "nodata": 0, "palette": _PALETTE}
+    for name, pixel_size_m, shift_m, pixels, options in (
+        ("height", spec.height_pitch_m, (0.0, 0.0), _make_height_pixels, height),
+        ("ortho", spec.ortho_pitch_m, spec.ortho_shift_m, _make_ortho_pixels, {"dtype": "uint8", "bands": 4}),
+        ("terrain", spec.terrain_pitch_m, spec.terrain_shift_m, _make_terrain_pixels, terrain),
+    ):
+        _write_raster(paths[name], world, pixel_size_m, shift_m, pixels, **options)
     lines = [f"{10 * c.id},{c.id},{c.name},{str(c.traversable).lower()}" for c in PAPER_CLASSES.classes]
     write_text(paths["classes"], "\n".join(["value,id,name,traversable", *lines, ""]))
     return paths

@@ -33,32 +33,24 @@ class Truth:
     y_map_m: Float
     lon_deg: Float
     lat_deg: Float
-    alt_m: Float
-    """Above the ellipsoid."""
+    alt_m: Float  # above the ellipsoid
     enu_m: Float
     quat_xyzw: Float
     velocity_enu_mps: Float
-    angular_velocity_radps: Float
-    """In base_link, shape (N, 3)."""
-    forward_velocity_mps: Float
-    """Along base_link's x, on the surface."""
+    angular_velocity_radps: Float  # in base_link, shape (N, 3)
+    forward_velocity_mps: Float  # along base_link's x, on the surface
     wheel_velocity_mps: Float
     slip: Float
-    slope_rad: Float
-    """Along base_link's x, positive uphill."""
+    slope_rad: Float  # along base_link's x, positive uphill
     terrain_class: NDArray[np.uint8]
     command_velocity_mps: Float
     command_yaw_rate_radps: Float
     voltage_volt: Float
-    current_amp: Float
-    """Propulsion, both drivers, drawn positive."""
-    right_share: Float
-    """Of the current, drawn by the right driver."""
+    current_amp: Float  # propulsion, both drivers, drawn positive
+    right_share: Float  # of the current, drawn by the right driver
     power_watt: Float
-    energy_joule: Float
-    """Since the start."""
-    distance_m: Float
-    """Horizontal way since the start."""
+    energy_joule: Float  # since the start
+    distance_m: Float  # horizontal way since the start
 
     def at(self, stamp_ns: NDArray[np.int64]) -> Truth:
         """Return the truth at other times, linear between steps; beyond the ends it is held."""

@@ -114,15 +114,9 @@ def draw_waves(
     """Return plane waves of random direction and phase, log-uniform wavelength, and amplitudes that sum in square to ``total``²."""
     rng = np.random.default_rng(seed)
     amplitude = total * np.sqrt(2.0 / count)
-    return tuple(
-        Wave(
-            amplitude,
-            float(np.exp(rng.uniform(*np.log(wavelength_m)))),
-            float(rng.uniform(*direction_rad)),
-            float(rng.uniform(0.0, 2.0 * np.pi)),
-        )
-        for _ in range(count)
-    )
+    ranges = (*np.log(wavelength_m),), direction_rad, (0.0, 2.0 * np.pi)
+    drawn = ([float(rng.uniform(*ends)) for ends in ranges] for _ in range(count))
+    return tuple(Wave(amplitude, float(np.exp(log_m)), direction, phase) for log_m, direction, phase in drawn)
 
 
 def sum_waves(waves: Sequence[Wave], u: Float, v: Float) -> Float:
@@ -161,15 +155,11 @@ def state(waves: Sequence[Wave], u: Float, v: Float) -> Float:
 class SurfaceEffect:
     """What the states do to one class of ground, where they are 1; where they are -1 the opposite."""
 
-    wet_shade: float = 0.0
-    """Brightness taken away, as a fraction."""
-    wet_resistance: float = 0.0
-    """Rolling resistance added, as a fraction; so with cover."""
+    wet_shade: float = 0.0  # brightness taken away, as a fraction
+    wet_resistance: float = 0.0  # rolling resistance added, as a fraction; so with cover
     cover_resistance: float = 0.0
-    grain: float = 0.0
-    """Deviation of the brightness from pixel to pixel where cover is 0, as a fraction."""
-    bump_m: float = 0.0
-    """Deviation of the height by bumps where roughness is 0; so with ridges."""
+    grain: float = 0.0  # deviation of the brightness from pixel to pixel where cover is 0, as a fraction
+    bump_m: float = 0.0  # deviation of the height by bumps where roughness is 0; so with ridges
     ridge_m: float = 0.0
 
 
@@ -177,8 +167,7 @@ class SurfaceEffect:
 class Surface:
     """The states of a site's ground; the waves of each have a deviation of 1 together."""
 
-    looks: dict[int, SurfaceEffect]
-    """By class id; a class that is not named has none."""
+    looks: dict[int, SurfaceEffect]  # by class id; a class that is not named has none
     wetness: tuple[Wave, ...]
     cover: tuple[Wave, ...]
     roughness: tuple[Wave, ...]
@@ -186,10 +175,8 @@ class Surface:
     bumps: tuple[Wave, ...]
     ridges: tuple[Wave, ...]
     noise: tuple[Wave, ...]
-    map_noise_std_m: float
-    """Of the height raster, which costs nothing."""
-    swing: float
-    """By how much grain, bumps and ridges grow where their state is 1, as a fraction."""
+    map_noise_std_m: float  # of the height raster, which costs nothing
+    swing: float  # by how much grain, bumps and ridges grow where their state is 1, as a fraction
 
     def shade(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
         """Return what the brightness is multiplied with, at offsets from the site's corner [m]."""
@@ -221,19 +208,10 @@ class Surface:
 
 OBSTACLE, TREE, VEGETATION, GRASS, MUD, UNPAVED, PAVED = range(1, 8)
 
-_COLOUR = np.array(
-    [
-        [0, 0, 0],
-        [120, 60, 56],
-        [32, 52, 30],
-        [58, 84, 44],
-        [96, 134, 62],
-        [104, 82, 58],
-        [168, 150, 122],
-        [122, 124, 128],
-    ],
-    dtype=np.float64,
-)
+_COLOUR = np.array([
+    [0, 0, 0], [120, 60, 56], [32, 52, 30], [58, 84, 44],
+    [96, 134, 62], [104, 82, 58], [168, 150, 122], [122, 124, 128],
+], dtype=np.float64)  # fmt: skip
 """RGB by class id; 0 is nothing."""
 
 _SOFT_BORDER_M = 0.3
@@ -248,6 +226,11 @@ class Hill:
     height_m: float
     x_sigma_m: float
     y_sigma_m: float
+
+    def rise_m(self, u: Float, v: Float) -> Float:
+        """Return its height there [m]."""
+        x, y = (u - self.x_m) / self.x_sigma_m, (v - self.y_m) / self.y_sigma_m
+        return np.asarray(self.height_m * np.exp(-0.5 * x**2) * np.exp(-0.5 * y**2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,17 +293,12 @@ class World:
     """The ground truth of a site. Lengths of its parts are map metres from the site's south-west corner."""
 
     site: Site
-    base_m: float
-    """Height above the geoid without hills [m]."""
+    base_m: float  # height above the geoid without hills [m]
     hills: tuple[Hill, ...] = ()
-    waves: tuple[Wave, ...] = ()
-    """Ripples of the height [m]."""
-    regions: tuple[Ellipse | Band, ...] = ()
-    """Later ones lie on earlier ones; the rest is grass."""
-    holes: tuple[Ellipse, ...] = ()
-    """Where the rasters hold nothing (the white areas of the paper's figure 1)."""
-    texture: tuple[Wave, ...] = ()
-    """Ripples of the brightness, as a fraction."""
+    waves: tuple[Wave, ...] = ()  # ripples of the height [m]
+    regions: tuple[Ellipse | Band, ...] = ()  # later ones lie on earlier ones; the rest is grass
+    holes: tuple[Ellipse, ...] = ()  # where the rasters hold nothing (the white areas of the paper's figure 1)
+    texture: tuple[Wave, ...] = ()  # ripples of the brightness, as a fraction
     resistance: tuple[Wave, ...] = field(default=())
     """Ripples of the rolling resistance that no map shows, as a fraction."""
     surface: Surface | None = field(default=None, metadata=ABSENT)
@@ -333,11 +311,7 @@ class World:
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         total = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), self.base_m)
         for hill in self.hills:
-            total += (
-                hill.height_m
-                * _evaluate_bell(u - hill.x_m, hill.x_sigma_m)
-                * _evaluate_bell(v - hill.y_m, hill.y_sigma_m)
-            )
+            total += hill.rise_m(u, v)
         return total + sum_waves(self.waves, u, v)
 
     def mapped_height_m(self, x_map_m: Float, y_map_m: Float) -> Float:
@@ -354,11 +328,7 @@ class World:
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         gx, gy = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v))), np.zeros(())
         for hill in self.hills:
-            bump = (
-                hill.height_m
-                * _evaluate_bell(u - hill.x_m, hill.x_sigma_m)
-                * _evaluate_bell(v - hill.y_m, hill.y_sigma_m)
-            )
+            bump = hill.rise_m(u, v)
             gx = gx - bump * (u - hill.x_m) / hill.x_sigma_m**2
             gy = gy - bump * (v - hill.y_m) / hill.y_sigma_m**2
         for wave in self.waves:
@@ -411,13 +381,7 @@ class World:
 
     @staticmethod
     def _near(regions: Sequence[Ellipse | Band], u: Float, v: Float) -> Sequence[Ellipse | Band]:
-        box = (
-            (float(np.min(u)), float(np.min(v)), float(np.max(u)), float(np.max(v)))
-            if np.size(u) and np.size(v)
-            else None
-        )
-        return [region for region in regions if box is not None and region.may_touch(box)]
-
-
-def _evaluate_bell(offset_m: Float, sigma_m: float) -> Float:
-    return np.exp(-0.5 * (offset_m / sigma_m) ** 2)
+        if not (np.size(u) and np.size(v)):
+            return ()
+        box = (float(np.min(u)), float(np.min(v)), float(np.max(u)), float(np.max(v)))
+        return [region for region in regions if region.may_touch(box)]
