@@ -15,8 +15,7 @@ from shapely.geometry import Point, shape
 
 from tcpipe.errors import UsageError
 from tcpipe.simulation import Faults, find_scenario, make_tiny, read_truth, simulate, simulate_readings
-from tcpipe.simulation.messages import Recorder
-from tcpipe.simulation.scenarios import HUSKY_ROS1, RasterSpec, make_small_world
+from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, RasterSpec, make_small_world
 
 
 @pytest.fixture(scope="module")
@@ -154,24 +153,6 @@ def test_other_containers_hold_the_same_numbers(site, tmp_path, container, diale
     np.testing.assert_allclose([m.left_driver_current for _, m in status], said, rtol=1e-6)
 
 
-def test_gga_sentences_tell_the_fixes(tmp_path):
-    recorder = Recorder("ros1", "battery_state", gnss="nmea")
-    drive = make_coarse(container="bag", recorder=recorder, seconds=18.0)
-    found = messages(simulate(tmp_path, scenario=drive, seed=3).logs[0])
-    _, readings = simulate_readings(drive, seed=3)
-    fixes = readings["gnss"].values
-    for i, (_, message) in enumerate(found["/nmea_sentence"]):
-        body, checksum = message.sentence[1:].split("*")
-        assert np.bitwise_xor.reduce(np.frombuffer(body.encode(), np.uint8)) == int(checksum, 16)
-        parts = body.split(",")
-        lat = int(parts[2][:2]) + float(parts[2][2:]) / 60
-        lon = int(parts[4][:3]) + float(parts[4][3:]) / 60
-        assert lat == pytest.approx(fixes["lat_deg"][i], abs=2e-9)
-        assert lon == pytest.approx(fixes["lon_deg"][i], abs=2e-9)
-        assert float(parts[9]) + float(parts[11]) == pytest.approx(fixes["alt_m"][i], abs=1e-4)
-    assert (np.array([m.current for _, m in found["/battery_state"]]) < 0).mean() > 0.9
-
-
 def test_the_same_seed_gives_the_same_bytes(tmp_path):
     def digests(directory):
         return {
@@ -181,7 +162,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
         }
 
     def bag(container):
-        recorder = HUSKY_ROS1 if container == "bag" else Recorder("ros2", "battery_states")
+        recorder = HUSKY_ROS1 if container == "bag" else HUSKY_ROS2
         return make_coarse(Faults.every(), container=container, recorder=recorder, seconds=17.0)
 
     for container in ("mcap", "bag", "rosbag2"):
