@@ -27,7 +27,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -91,9 +91,9 @@ class World:
 
     def at(self, t: Array, values: Array) -> Array:
         """Return values of the steps at other times [s], shape (N,) or (N, 3)."""
-        return np.stack([np.interp(t, self.t, column) for column in np.atleast_2d(values.T)], -1).squeeze(
-            -1 if values.ndim == 1 else ()
-        )
+        if values.ndim == 1:
+            return np.interp(t, self.t, values)
+        return np.stack([np.interp(t, self.t, column) for column in values.T], -1)
 
     def find_cost(self, start_s: Array) -> tuple[Array, Array]:
         """Return duration [s] and energy [J] of the horizontal metre that begins at each time; NaN after the last whole metre."""
@@ -314,17 +314,14 @@ def put(role: str, name: str, change: Callable[[dict[str, Array], World, np.rand
     return lambda log, world, rng: log.columns[role].update({name: change(log.columns[role], world, rng)})
 
 
-def err(make: FixError) -> Change:
-    """Return a change of the fixes by an error."""
-    return put("gnss", "enu_m", lambda of, world, rng: of["enu_m"] + make(of["t"], world.t[-1], rng))
-
-
-def err_and_state(make: FixError, std_m: float) -> Change:
-    """Return the same with another stated standard deviation."""
+def err(make: FixError, std_m: float | None = None) -> Change:
+    """Return a change of the fixes by an error, and of their stated standard deviation."""
 
     def change(log: Log, world: World, rng: np.random.Generator) -> None:
-        err(make)(log, world, rng)
-        log.columns["gnss"]["variance"][:] = (AXES * std_m) ** 2
+        of = log.columns["gnss"]
+        of["enu_m"] = of["enu_m"] + make(of["t"], world.t[-1], rng)
+        if std_m is not None:
+            of["variance"][:] = (AXES * std_m) ** 2
 
     return change
 
@@ -344,18 +341,13 @@ def smooth(of: dict[str, Array], _: World, __: np.random.Generator) -> Array:
     return places
 
 
-def slow_alone(moving: bool) -> Change:  # noqa: FBT001
-    """Return a change that leaves power and fixes at 1 Hz, from the beginning or from when the robot drives."""
-
-    def change(log: Log, world: World, _: np.random.Generator) -> None:
-        begin_s = world.t[int(np.argmax(world.speed_mps > 0.5))] + 4.0 if moving else 0.0
-        log.columns = {role: log.columns[role] for role in ("gnss", "power")}
-        every = round(1.0 / np.median(np.diff(log.columns["gnss"]["t"])))
-        log.keep("gnss", slice(None, None, every))
-        for role in log.columns:
-            log.keep(role, log.columns[role]["t"] >= begin_s)
-
-    return change
+def slow_alone(log: Log, world: World, _: np.random.Generator, *, moving: bool = False) -> None:
+    """Leave power and fixes at 1 Hz, from the beginning or from when the robot drives."""
+    log.columns = {role: log.columns[role] for role in ("gnss", "power")}
+    log.keep("gnss", slice(None, None, round(1.0 / np.median(np.diff(log.columns["gnss"]["t"])))))
+    begin_s = world.t[int(np.argmax(world.speed_mps > 0.5))] + 4.0 if moving else 0.0
+    for role, of in log.columns.items():
+        log.keep(role, of["t"] >= begin_s)
 
 
 def republish(log: Log, _: World, __: np.random.Generator) -> None:
@@ -384,8 +376,8 @@ def _add_by_speed(of: dict[str, Array], world: World, _: np.random.Generator) ->
 _FIXES, _CLOCK = r"^(sensor-changed gnss|gnss-contradicts-odometry|position-jumps|fixes-\S+)", r"^(time-|clock)\S* "
 KINDS: dict[str, tuple[Change, str]] = {
     "clean": (lambda *_: None, ""),
-    "step of fixes 0.20 m": (err_and_state(step(0.20), 0.025), _FIXES),
-    "step of fixes 0.30 m": (err_and_state(step(0.30), 0.025), _FIXES),
+    "step of fixes 0.20 m": (err(step(0.20), 0.025), _FIXES),
+    "step of fixes 0.30 m": (err(step(0.30), 0.025), _FIXES),
     "ramp of fixes": (err(ramps), _FIXES),
     "smooth excursion": (err(excursions(1)), _FIXES),
     "two excursions": (err(excursions(2)), _FIXES),
@@ -399,8 +391,8 @@ KINDS: dict[str, tuple[Change, str]] = {
     "clock of IMU 2000 ppm": (stamp("imu", lambda s, _: 1.002 * s), rf"{_CLOCK}imu"),
     "gyro scale 5 %": (put("imu", "rate", lambda of, *_: 1.05 * of["rate"]), r"^\S+ imu"),
     "antenna 0.65 m too high": (lambda log, *_: setattr(log, "lever_m", LEVER_M + [0, 0, 0.65]), "^lever-arm"),  # noqa: RUF005
-    "fixes at 1 Hz alone": (slow_alone(moving=False), ""),
-    "1 Hz alone, moving start": (slow_alone(moving=True), ""),
+    "fixes at 1 Hz alone": (slow_alone, ""),
+    "1 Hz alone, moving start": (partial(slow_alone, moving=True), ""),
     "mixed covariances": (
         put(
             "gnss",
@@ -410,7 +402,7 @@ KINDS: dict[str, tuple[Change, str]] = {
         "",
     ),
     "stale fixes at 20 Hz": (republish, "repeat|stale|republish"),
-    "float fixes, 0.2 m of 0.3 m": (err_and_state(lambda t, _, rng: 0.2 * slow_noise(rng, t, 80.0, 3), 0.30), ""),
+    "float fixes, 0.2 m of 0.3 m": (err(lambda t, _, rng: 0.2 * slow_noise(rng, t, 80.0, 3), 0.30), ""),
     "drift over two epochs": (two_epochs, rf"{_CLOCK}gnss"),
     "log begins in 1970": (begin_in_1970, ""),
 }
@@ -427,8 +419,8 @@ class Outcome:
     """Labels of a run against the truth, one value a label; without labels the reason is the first line."""
 
     start_s: list[float] = field(default_factory=list)
-    error: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in QUANTITIES})
-    std: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in QUANTITIES})
+    error: dict[str, list[float]] = field(default_factory=dict)
+    std: dict[str, list[float]] = field(default_factory=dict)
     bits: list[int] = field(default_factory=list)
     lines: list[str] = field(default_factory=lambda: [""])
     length: float = float("nan")
@@ -437,9 +429,9 @@ class Outcome:
 
     def judge(self, name: str) -> tuple[Array, Array, Array]:
         """Return absolute errors, the same over σ, and which have a flag that doubts the quantity."""
-        error, std = np.abs(self.error[name]), np.array(self.std[name], float)
+        error, std = (np.array(of.get(name, []), float) for of in (self.error, self.std))
         flagged = (np.array(self.bits, np.int64) & ~int(QUANTITIES[name][-1])) != 0
-        return error, error / std, flagged
+        return np.abs(error), np.abs(error) / std, flagged
 
     @property
     def matters(self) -> bool:
@@ -513,7 +505,7 @@ def find_figures(runs: Outcomes, clean: Outcomes) -> dict[str, float]:
         wrong[name] = [(ratio > far) & ~flagged for _, ratio, flagged in judged]
         f[name] = _share([ratio[~flagged & np.isfinite(ratio)] <= good for _, ratio, flagged in judged])
         for (_, seed), (error, _, flagged) in zip(runs, judged, strict=True):
-            doubted.append(flagged[error <= good * np.median(clean["clean", seed].std[name] or [0.0])])
+            doubted.append(flagged[error <= good * np.median(clean["clean", seed].std.get(name) or [0.0])])
     f[">3σ"] = _share([np.any(each, axis=0) for each in zip(*(wrong[name] for name in "TwE"), strict=True)])
     f |= {"pos": _share(wrong["start"]), "doubted": _share(doubted)}
     f["lost"] = 100.0 - 100.0 * f["labels"] / max(sum(len(clean["clean", seed].bits) for _, seed in runs), 1)
@@ -546,7 +538,7 @@ def compare(first: Outcomes, second: Outcomes) -> Iterator[str]:
     for key, a, b in ((key, a, second[key]) for key, a in first.items() if key in second and a.bits):
         apart_s = np.abs(np.array(a.start_s)[:, None] - np.array(b.start_s or [np.inf]))
         near, same = np.argmin(apart_s, axis=1), np.min(apart_s, axis=1) < 0.6
-        moved = [(np.array(b.error[q] or [0.0])[near] - a.error[q])[same] / np.array(a.std[q])[same] for q in "TwE"]
+        moved = [(np.array(b.error.get(q) or [0.0])[near] - a.error[q])[same] / np.array(a.std[q])[same] for q in "TwE"]
         size = np.abs(np.concatenate(moved)) if same.any() else np.full(1, np.nan)
         yield f"{key[0]:<28} {key[1]:5d} {same.sum():5d} {np.nanmedian(size):12.2f} {np.nanmax(size):7.1f}"
 
