@@ -1,12 +1,10 @@
-"""Where a simulated drive goes: legs, turns, pauses, and the smooth curve a leg follows.
+"""Plans of simulated drives, and the truth of driving them over a world.
 
-A plan is a list of manoeuvres. A `Leg` starts where the robot stands and looks, so that turns in place are found by the driver
-(`simulate_drive`); its corners become arcs, its curvature is smoothed over half a metre, and a human's weaving is laid over it.
+A plan is a list of manoeuvres. A `Leg` starts at the robot's pose, after a turn in place if necessary; its corners become arcs, its
+curvature is smoothed over 0.5 m, and sideways weaving of a human driver is added.
 
-Drives a robot over a world: manoeuvres in, truth out.
-
-Time runs at 200 Hz. Along a leg only position on the path and wheel speed are integrated (`robot.drive_along`); everything else follows
-exactly: the pose stands tangent on the surface, ground metres from the projection, power from the plant.
+Time runs at 200 Hz. Along a leg only position on the path and wheel speed are integrated (`robot.drive_along`); pose, ground distance
+and power follow exactly from the surface, the projection and the robot model.
 """
 
 from __future__ import annotations
