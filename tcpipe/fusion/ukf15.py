@@ -183,7 +183,7 @@ class _Filter:
         """Add the squared innovation to the variance of the errors that a kind of measurement measures."""
         first = int(np.searchsorted(self._model.active, _MEASURED_ERRORS[kind]))
         variance = float(innovation @ innovation)
-        rows = range(first, first + 3)
+        rows = [first, first + 1, first + 2]
         self._ukf.P[rows, rows] += variance if first != state.THETA else min(variance, _MAX_ANGLE_STD_RAD**2)
         if kind == state.FIX:  # a wrong yaw and velocity lead positions astray
             rows = [state.THETA + 2, *range(state.U, state.U + 3)]
