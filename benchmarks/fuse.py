@@ -1,8 +1,8 @@
 """CPU time and memory of the estimators, paired with compiled C++: ``python benchmarks/fuse.py [--hours 1 6]``.
 
 The log: a robot that winds over flat ground at 1 m/s with IMU 200 Hz, wheels 50 Hz, visual odometry 30 Hz and GNSS 10 Hz: 290 events a
-second, each one prediction and one update for the 15-state filters; ``us/event`` is by these everywhere. (The error-state filter takes the
-IMU as its process input, so that it steps less often than messages come; the same log is the same work.)
+second, each one prediction and one update for the compiled C++; ``us/event`` is by these everywhere. (tcpipe's filters take the
+IMU as their process input and step less often than messages come; the same log is the same work.)
 
 The compiled C++ is `eigen_ukf15.cpp`, the step of robot_localization's UKF core on the same events; it needs g++ and Eigen
 (Debian: libeigen3-dev), else it is left out. Runs are interleaved, so that a busy machine slows all; the median of the paired ratios
@@ -20,13 +20,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.ukf15 import PROCESS_VARIANCE, SensorRows, filter_forward
+from tcpipe.fusion.measurements import Trajectory
+from tcpipe.fusion.ukf15 import run_ukf15
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
@@ -34,44 +36,18 @@ from tcpipe.stages.fuse_inputs import prepare_inputs
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 REPEATS = 7
+FILTERPY = "forward filter by filterpy"
 LEVER_M = (0.2, -0.1, 0.8)
 DATUM_DEG_M = (15.0, 47.0, 500.0)
 RATES_HZ = {"imu": 200, "wheel_odometry": 50, "visual_odometry": 30, "gnss": 10}
+EIGEN_EVENTS = {
+    "imu": ((3, 4, 9, 10, 11), 0.01),
+    "wheel_odometry": ((6, 7, 8), 0.05),
+    "visual_odometry": ((6, 7, 8), 0.05),
+    "gnss": ((0, 1, 2), 0.02),
+}
+"""Measured states and standard deviation of the events of the compiled C++, by role."""
 EIGEN = ("/usr/include/eigen3", "/usr/local/include/eigen3")
-
-
-def sources(seconds: float, lever_m: tuple[float, float, float]) -> list[SensorRows]:
-    """Events of a robot at rest; what is measured does not change what a step costs."""
-    rng = np.random.default_rng(0)
-    found = []
-    for role, entries, std in (
-        ("imu", (3, 4, 9, 10, 11), 0.01),
-        ("wheel_odometry", (6, 7, 8), 0.05),
-        ("visual_odometry", (6, 7, 8), 0.05),
-        ("gnss", (0, 1, 2), 0.02),
-    ):
-        lever, hz = lever_m if role == "gnss" else (0.0, 0.0, 0.0), RATES_HZ[role]
-        stamp_ns = np.arange(1, int(seconds * hz) + 1, dtype=np.int64) * (1_000_000_000 // hz)
-        z = rng.normal(0.0, std, (stamp_ns.size, len(entries)))
-        z += lever if role == "gnss" else 0.0
-        found.append(SensorRows(role, entries, stamp_ns, z, np.full(z.shape, std**2), lever))
-    return found
-
-
-def ukf15_us(seconds: float, lever_m: tuple[float, float, float] = LEVER_M) -> tuple[float, np.ndarray]:
-    """CPU microseconds an event of the paper's filter, and its final state."""
-    events = sources(seconds, lever_m)
-    begin = time.process_time()
-    found = filter_forward(
-        events,
-        [np.inf] * len(events),
-        x=np.zeros(15),
-        P=0.01 * np.eye(15),
-        q=PROCESS_VARIANCE,
-        start_ns=0,
-        output_ns=np.arange(1, int(seconds * 20) + 1, dtype=np.int64) * 50_000_000,
-    )
-    return 1e6 * (time.process_time() - begin) / sum(source.stamp_ns.size for source in events), found.x[-1]
 
 
 def compiled_eigen(directory: Path, seconds: float) -> list[str] | None:
@@ -83,24 +59,29 @@ def compiled_eigen(directory: Path, seconds: float) -> list[str] | None:
     program, events = directory / "eigen_ukf15", directory / "events"
     source = Path(__file__).with_name("eigen_ukf15.cpp")
     subprocess.run([compiler, "-O2", "-std=c++17", f"-I{include}", source, "-o", program], check=True)
-    parts = sources(seconds, (0.0, 0.0, 0.0))
-    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
-    rows = np.zeros((stamp_ns.size, 17))
-    first = 0
-    for part in parts:
-        chosen, size = slice(first, first + part.stamp_ns.size), len(part.entries)
-        rows[chosen, 1], rows[chosen, 2 : 2 + size] = size, part.entries
-        rows[chosen, 7 : 7 + size], rows[chosen, 12 : 12 + size] = part.z, part.variance
-        first += part.stamp_ns.size
-    order = np.argsort(stamp_ns, kind="stable")
-    rows[order, 0] = np.diff(stamp_ns[order], prepend=0) * 1e-9
-    events.write_bytes(np.asarray(PROCESS_VARIANCE, np.float64).tobytes() + rows[order].tobytes())
+    rng = np.random.default_rng(0)
+    parts = []
+    for role, (
+        entries,
+        std,
+    ) in EIGEN_EVENTS.items():  # a robot at rest: what is measured does not change what a step costs
+        count, size = int(seconds * RATES_HZ[role]), len(entries)
+        part = np.zeros((count, 17))
+        part[:, 0] = np.arange(1, count + 1) / RATES_HZ[role]
+        part[:, 1], part[:, 2 : 2 + size] = size, entries
+        part[:, 7 : 7 + size], part[:, 12 : 12 + size] = rng.normal(0.0, std, (count, size)), std**2
+        parts.append(part)
+    rows = np.concatenate(parts)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    rows[:, 0] = np.diff(rows[:, 0], prepend=0.0)
+    process_variance = np.repeat([1e-4, 1e-4, 1e-2, 1.0, 2.0], 3)
+    events.write_bytes(process_variance.tobytes() + rows.tobytes())
     return [str(program), str(events)]
 
 
-def eigen_us(command: list[str], seconds: float) -> tuple[float, np.ndarray]:
-    numbers = np.array(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split(), float)
-    return 1e6 * numbers[0] / (seconds * sum(RATES_HZ.values())), numbers[1:]
+def eigen_us(command: list[str], seconds: float) -> float:
+    numbers = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    return 1e6 * float(numbers[0]) / (seconds * sum(RATES_HZ.values()))
 
 
 def made_streams(seconds: float) -> Streams:
@@ -162,8 +143,8 @@ def _gnss(
     return dict(zip(("lon_deg", "lat_deg", "alt_m"), place, strict=True)) | variance | {"fix_status": np.zeros(t.size)}
 
 
-class ErrorState:
-    """The error-state filter over the winding drive."""
+class Drive:
+    """The winding drive, for either estimator."""
 
     def __init__(self, seconds: float) -> None:
         streams = made_streams(seconds)
@@ -175,33 +156,29 @@ class ErrorState:
         self.output_ns = np.arange(first, last + 1, dtype=np.int64) * 50_000_000
         self.events = sum(table.num_rows for table in streams.tables.values())
 
-    def us(self) -> float:
+    def us(self, run: Callable[..., Trajectory] = run_error_state) -> float:
         """CPU microseconds a message."""
         begin = time.process_time()
-        run_error_state(self.measurements, self.initial, output_ns=self.output_ns)
+        run(self.measurements, self.initial, output_ns=self.output_ns, gate_probability=0.999)
         return 1e6 * (time.process_time() - begin) / self.events
 
 
 def print_paired(seconds: float) -> None:
     """Interleave every estimator and print medians and paired ratios."""
-    short, drive = min(4.0, seconds), ErrorState(seconds)
-    ErrorState(5.0).us()
+    short, drive = Drive(min(5.0, seconds)), Drive(seconds)
+    short.us()
     found: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as directory:
         command = compiled_eigen(Path(directory), seconds)
         for _ in range(REPEATS):
             run = {
-                "15-state filterpy": ukf15_us(short)[0],
+                FILTERPY: short.us(run_ukf15),
                 "error-state forward + smoother": drive.us(),
             }
             if command is not None:
-                run["C++ Eigen core, 15 states"] = eigen_us(command, seconds)[0]
+                run["C++ Eigen core, 15 states"] = eigen_us(command, seconds)
             for name, value in run.items():
                 found.setdefault(name, []).append(value)
-        if command is not None:
-            command = compiled_eigen(Path(directory), short)
-            ours, theirs = ukf15_us(short, (0.0, 0.0, 0.0))[1], eigen_us(command, short)[1]
-            print(f"final states of ours and the C++ differ by at most {np.abs(ours - theirs).max():.1e}")
     for name, values in found.items():
         print(f"{name:<32} {statistics.median(values):8.2f} us/event")
     _ratios(found)
@@ -212,7 +189,7 @@ def _ratios(found: dict[str, list[float]]) -> None:
     if core not in found:
         print("no g++ or no Eigen (libeigen3-dev): not compared with C++")
         return
-    for name in ("15-state filterpy", "error-state forward + smoother"):
+    for name in (FILTERPY, "error-state forward + smoother"):
         ratio = statistics.median(a / b for a, b in zip(found[name], found[core], strict=True))
         print(f"{name} / {core}: {ratio:.2f}")
 

@@ -57,7 +57,8 @@ SMALLEST = {
     "few_samples": Smallest("{dataset} --counts 60 --kinds physics", rf"60 physics +test +: E +{NUMBER} ± {NUMBER} J"),
     "first_minute": Smallest("{out} tiny", rf"\| {NUMBER} ± {NUMBER} segments an hour \|"),
     "fuse": Smallest(
-        "--hours 0.01 --paired-seconds 5", rf"15-state filterpy +{NUMBER} us/event[\s\S]*peak memory {NUMBER} MB"
+        "--hours 0.01 --paired-seconds 5",
+        rf"forward filter by filterpy +{NUMBER} us/event[\s\S]*peak memory {NUMBER} MB",
     ),
     "fusion_worlds": Smallest(
         "--kinds '^step of fixes 0.20' --seeds 1 --length 40 --out {out}/a.json",

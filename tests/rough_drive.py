@@ -23,7 +23,6 @@ GRAVITY_MPS2 = 9.80665
 RATE_HZ = 200
 ANTENNA_M = (0.2, -0.1, 0.8)
 CAMERA_M = (0.4, 0.06, 0.3)
-IMU_M = (0.1, 0.0, 0.25)
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def drive(seconds=120.0, seed=0):
     )
 
 
-def measured(truth, seed=0, *, gnss_std=0.015, orientation=True):
+def measured(truth, seed=0, *, gnss_std=0.015):
     """IMU 200 Hz (gyroscope bias known to 1 mrad/s), wheels 50 Hz with slip to 4 %, camera 25 Hz, RTK 10 Hz."""
     rng = np.random.default_rng(seed + 1000)
 
@@ -111,13 +110,7 @@ def measured(truth, seed=0, *, gnss_std=0.015, orientation=True):
         return np.arange(delay, truth.stamp_ns.size, RATE_HZ // hz)
 
     n = truth.stamp_ns.size
-    lever = np.array(IMU_M)
-    force = (
-        truth.force
-        + np.cross(truth.turn, np.cross(truth.turn, lever))
-        + rng.normal(0, 0.3, (n, 3))
-        + [0.03, -0.03, 0.02]
-    )
+    force = truth.force + rng.normal(0, 0.3, (n, 3)) + [0.03, -0.03, 0.02]
     tilt = rpy_from_matrix(truth.rotation)
     wander = 0.006 * np.sin(np.linspace(0, 20, n))[:, None]
     quat = quat_from_rpy(tilt[:, 0] + wander[:, 0], tilt[:, 1] - wander[:, 0], tilt[:, 2] + 1.0)
@@ -125,10 +118,9 @@ def measured(truth, seed=0, *, gnss_std=0.015, orientation=True):
         stamp_ns=truth.stamp_ns,
         angular_velocity_radps=truth.turn + rng.normal(0, 0.005, (n, 3)) + rng.normal(0, 1e-3, 3),
         specific_force_mps2=force,
-        quat_xyzw=quat if orientation else np.full((n, 4), np.nan),
+        quat_xyzw=quat,
         gyro_std_radps=0.005,
         accelerometer_std_mps2=0.3,
-        lever_arm_m=IMU_M,
     )
     at = rows(50)
     slip = 1.0 + 0.02 + 0.02 * np.sin(np.arange(at.size) / 400)

@@ -147,7 +147,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     residuals, standing = find_residuals(m), find_stationary_intervals(m)
     m = inflate_unclaimed_fixes(m, residuals)
     noise = fit_noise(m, residuals)
-    ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
+    ticks = build_ticks(m, noise, standing, find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
     std = make_priors(m, noise, ticks)[0]
     section = _Section(m, noise, ticks, gate_probability)
     model = section.make_model()
@@ -167,7 +167,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
-    return _make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
+    return make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
 
 
 def _is_judging_fixes(m: Measurements) -> bool:
@@ -252,12 +252,13 @@ def _compute_yaw(states: Floats) -> Floats:
     return np.arctan2(states[:, 3], states[:, 0])
 
 
-def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
+def find_start_ns(m: Measurements, output_ns: Ints) -> int:
+    """Return the first stamp of a measurement of motion, or that of the first wanted state if it is earlier [ns]."""
     moving = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != IMU]
     return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
-def _make_trajectory(  # noqa: PLR0917
+def make_trajectory(  # noqa: PLR0917
     m: Measurements,
     noise: NoiseModel,
     made: Pass,

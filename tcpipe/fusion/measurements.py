@@ -137,7 +137,6 @@ class InertialMeasurements:
     gyro_std_radps, accelerometer_std_mps2 : white noise at the unit's rate, one axis.
     accelerometer_usable : False where the specific force is not one (gravity removed, other units): the gyroscope alone is used.
     accelerometer_noise_mps2 : the same around each sample, shape (N,): vibration comes and goes with the motion; None: the same throughout.
-    lever_arm_m : [m], where the specific force is felt; zero once it is moved to base_link, as the error-state filter wants it.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -147,7 +146,6 @@ class InertialMeasurements:
     gyro_std_radps: float
     accelerometer_std_mps2: float
     accelerometer_usable: bool = True
-    lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
     accelerometer_noise_mps2: NDArray[np.float64] | None = None
 
 

@@ -114,7 +114,7 @@ class FuseConfig(_Section):
     """The estimator, and the noise that it assumes if the log states none."""
 
     estimator: Literal["smoother", "ukf"] = "smoother"
-    """smoother: error-state unscented filter and fixed-interval smoother; ukf: the paper's forward filter, 15 states."""
+    """smoother: error-state unscented filter and fixed-interval smoother; ukf: the paper's forward filter."""
     rate_hz: Annotated[float, Bounds(ge=1, le=500)] = 20.0
     """Rate of the track, at most 500 Hz (the paper: 20 Hz)."""
     gate_probability: Annotated[float, Bounds(ge=0.5, le=0.999999999)] = 0.999

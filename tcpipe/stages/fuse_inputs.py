@@ -80,9 +80,6 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     if GNSS in tables:
         datum = preparation.find_datum(*(to_floats(tables[GNSS], name) for name in ("lon_deg", "lat_deg", "alt_m")))
     inputs = FusionInputs(datum)
-    if config.estimator == "ukf" and tables.pop(DOPPLER, None) is not None:
-        names = {"estimator": config.estimator}
-        inputs.findings.append(make_finding("unused-by-estimator", Subject("role", DOPPLER), names=names))
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["clock_epoch"]).to_pylist()}):
         parts = {role: select_rows(table, "clock_epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}

@@ -9,10 +9,11 @@ from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import Faults, make_tiny, read_truth, simulate
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run
+from tcpipe.tables.findings import select_findings
 
 SETTLED_NS = 8_000_000_000
-HORIZONTAL_M, HEIGHT_M = 0.04, 0.06
-"""RMS errors: the stated antenna is up to 5 cm off, fixes lastingly up to 3.4 cm in height, and nothing shows either."""
+HORIZONTAL_M, HEIGHT_M = 0.04, 0.1
+"""RMS errors: the stated antenna is up to 5 cm off, 10 cm in height, fixes lastingly up to 3.4 cm in height, and nothing shows either."""
 
 
 def test_the_track_is_the_true_drive(tmp_path):
@@ -28,7 +29,7 @@ def test_the_track_is_the_true_drive(tmp_path):
     yaw = wrap_to_pi(column["yaw_rad"] - rpy_from_quat(at.quat_xyzw)[:, 2])
     forward = column["forward_velocity_mps"] - at.forward_velocity_mps
     settled = column["stamp_ns"] > column["stamp_ns"][0] + SETTLED_NS
-    fixed = settled & (column["x_std_m"] < 0.03)  # not in the ten seconds without GNSS
+    fixed = settled & (column["x_std_m"] < 0.06)  # not in the ten seconds without GNSS
 
     def rms(error, rows=settled):
         return float(np.sqrt(np.mean(np.square(error[rows]))))
@@ -37,8 +38,9 @@ def test_the_track_is_the_true_drive(tmp_path):
     assert fixed.sum() > 0.6 * settled.sum()
     assert rms(np.hypot(east, north), fixed) < HORIZONTAL_M
     assert rms(column["alt_m"] - at.alt_m, fixed) < HEIGHT_M
-    assert rms(forward) < 0.03
+    assert rms(forward) < 0.02
     assert rms(yaw) < np.radians(1.0)
-    assert rms(east / column["x_std_m"]) < 1.5
-    assert rms(north / column["y_std_m"]) < 1.5
-    assert rms(yaw / column["yaw_std_rad"]) < 1.5
+    scaled = {"x_std_m": east, "y_std_m": north, "z_std_m": column["alt_m"] - at.alt_m, "yaw_std_rad": yaw}
+    for name, error in scaled.items():
+        assert rms(error / column[name]) < 1.5, name
+    assert not select_findings(track.info.report.findings, "odometry-scale-varies")

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.fusion.initial import compute_course_rate, find_initial_state, find_stationary_intervals
-from tcpipe.fusion.measurements import Positions
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.geometry.rotation import rpy_from_quat
 
 
@@ -108,3 +108,19 @@ def test_a_wild_fix_does_not_turn_the_course():
     stamp_s, rate = compute_course_rate(fixes, None, 0)
     inside = (stamp_s > 2.0) & (stamp_s < 57.0)
     assert rate[inside] == pytest.approx(np.full(inside.sum(), 0.3), abs=0.04)
+
+
+@pytest.mark.parametrize("slope_rad", [0.2, -0.2])
+def test_a_robot_that_starts_on_a_slope_rises_or_falls_with_it(slope_rad):
+    stamp_ns = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
+    along = np.array([np.cos(slope_rad), 0.0, np.sin(slope_rad)])  # east, and up the slope
+    n = stamp_ns.size
+    force = np.tile([9.80665 * np.sin(slope_rad), 0.0, 9.80665 * np.cos(slope_rad)], (n, 1))
+    imu = InertialMeasurements(stamp_ns, np.zeros((n, 3)), force, np.full((n, 4), np.nan), 0.003, 0.1)
+    only_x = np.column_stack((np.ones(n // 2), np.full((n // 2, 2), np.nan)))
+    unknown = np.full(n // 2, np.nan)
+    wheels = BodyVelocities(stamp_ns[::2], only_x, 1e-4 * only_x, unknown, unknown)
+    fix_ns = stamp_ns[::10]
+    fixes = Positions(fix_ns, np.outer(fix_ns * 1e-9, along), np.full((fix_ns.size, 3), 1e-4))
+    initial = start_of(Measurements(gnss=fixes, imu=imu, wheels=wheels))
+    assert initial.velocity_enu_mps == pytest.approx(along, abs=0.05)

@@ -13,6 +13,7 @@ from tcpipe.fusion.signals import (
     estimate_white_noise,
     find_chi_square_threshold,
     hold_last,
+    integrate_signal,
     is_in_gap,
 )
 
@@ -71,3 +72,11 @@ def test_as_scipy(freedom, probability):
     assert find_chi_square_threshold(freedom, probability) == pytest.approx(
         chdtri(freedom, 1.0 - probability), rel=1e-7
     )
+
+
+def test_the_integral_of_a_ramp_is_exact_at_any_stamp():
+    stamp_s = np.array([0.0, 0.1, 0.5, 0.6, 2.0])
+    at_s = np.array([0.0, 0.05, 0.5, 0.55, 1.7, 2.0])
+    found = integrate_signal(stamp_s, np.column_stack((1.0 + 2.0 * stamp_s, -stamp_s)), at_s)
+    assert found == pytest.approx(np.column_stack((at_s + at_s**2, -0.5 * at_s**2)), abs=1e-12)
+    assert integrate_signal(stamp_s, stamp_s[:, None], np.array([-1.0, 3.0])) == pytest.approx(np.array([[0.0], [4.0]]))

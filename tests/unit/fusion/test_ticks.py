@@ -9,6 +9,7 @@ from unit.fusion import drive
 
 from tcpipe.fusion import state
 from tcpipe.fusion.measurements import (
+    WHEELS,
     BodyVelocities,
     InertialMeasurements,
     Measurements,
@@ -93,6 +94,24 @@ def test_a_sensor_of_any_rate_carries_the_information_that_it_claims(hz):
     noise = drive.estimate_noise(slow)
     white_m2 = noise.horizontal.white_m2 / noise.horizontal.claimed_m2
     assert np.sum(1.0 / found.inputs.variance[told, state.FIX, 0]) == pytest.approx(stamp_ns.size / white_m2, rel=0.02)
+
+
+@pytest.mark.parametrize("hz", [4.0, 20.0, 100.0])
+def test_wheels_of_any_rate_carry_the_information_of_their_noise_density(hz):
+    m = drive.measure(drive.make_drive(20.0), 2)
+    stamp_ns, density = drive.ns(np.arange(0.2, 19.0, 1.0 / hz)), 2e-3  # m²/s
+    steady = np.column_stack((np.ones(stamp_ns.size), np.full((stamp_ns.size, 2), np.nan)))
+    source = BodyVelocities(stamp_ns, steady, 1e-6 * steady, steady[:, 1], steady[:, 1])
+    fitted = drive.estimate_noise(m)
+    odometry = replace(fitted.odometries[WHEELS], velocity_m2ps=density, velocity_data_share=1.0)
+    noise = replace(fitted, odometries={**fitted.odometries, WHEELS: odometry})
+    output_ns = np.arange(int(drive.ns(0.1)) // TICK_NS, int(drive.ns(19.5)) // TICK_NS) * TICK_NS
+    found = build_ticks(
+        replace(m, wheels=source), noise, NOWHERE, int(output_ns[0]), int(output_ns[-1]), output_ns=output_ns
+    )
+    used = np.isfinite(found.inputs.value[:, state.WHEELS, 0])
+    per_second = np.sum(1.0 / found.inputs.variance[used, state.WHEELS, 0]) / (stamp_ns.size / hz)
+    assert per_second == pytest.approx(1.0 / density, rel=1e-3)
 
 
 def integrate_finely(imu, start_s, end_s, steps=20_000):

@@ -236,9 +236,3 @@ def test_what_no_receiver_claims_is_the_recipes(streams):
     assert set(found.sensors()) == {"gnss", "gnss_velocity"}
     assert found.doppler.velocity_enu_mps[0].tolist() == [0.76, 0.0, 0.0]
     assert found.doppler.variance_m2ps2[0] == pytest.approx([0.04, 0.04, 1e6])
-
-
-def test_the_forward_filter_says_that_it_does_not_use_it(streams):
-    inputs = prepare_inputs(streams, FuseConfig(estimator="ukf"))
-    assert [set(m.sensors()) for m in inputs.measurements.values()] == [{"gnss"}]
-    assert [(of.code, of.subject.name) for of in inputs.findings] == [("unused-by-estimator", "gnss_velocity")]

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion.checks.audit import Audit, audit_trajectory, is_astray
-from tcpipe.fusion.measurements import Rejections, Trajectory
+from tcpipe.fusion.measurements import (
+    DISPLACEMENT_LAGS_S,
+    BodyVelocities,
+    Measurements,
+    Positions,
+    Rejections,
+    Trajectory,
+)
+from tcpipe.geometry.rotation import quat_from_rpy
+from tcpipe.tables.facts import StretchFacts
 
 
 def seconds(track, stamp_ns):
@@ -98,3 +107,39 @@ def test_a_track_that_has_lost_the_robot_is_astray_whatever_it_claims_and_reject
     assert 0.4 < found.astray / found.windows < 0.6
     assert is_astray(found.windows, found.astray)
     assert (raised.forward_velocity_std_mps[seconds(track, track.stamp_ns) > 65.0] > 1.0).all()
+
+
+def spin(arm_m):
+    """Return the true track of a robot that turns in place at 0.5 rad/s, and a camera and an antenna at ``arm_m`` [m] of it."""
+    t = np.arange(0.0, 60.0, 0.05)
+    stamp_ns = (t * 1e9).astype(np.int64)
+    zero, ahead = np.zeros((t.size, 3)), np.column_stack((np.cos(0.5 * t), np.sin(0.5 * t), 0.0 * t))
+    aside = np.column_stack((-ahead[:, 1], ahead[:, 0], 0.0 * t))
+    still = Trajectory(
+        stamp_ns=stamp_ns,
+        position_enu_m=zero,
+        quat_xyzw=quat_from_rpy(0.0 * t, 0.0 * t, 0.5 * t),
+        velocity_enu_mps=zero,
+        angular_velocity_radps=zero + np.array([0.0, 0.0, 0.5]),
+        position_std_m=zero + 0.01,
+        yaw_std_rad=zero[:, 0] + 0.01,
+        forward_velocity_std_mps=zero[:, 0] + 0.01,
+        rejections=Rejections(np.empty(0, np.int64), *np.empty((2, 0), np.str_), *np.empty((2, 0))),
+        displacement_std_m=np.full((t.size, len(DISPLACEMENT_LAGS_S)), 0.01),
+        facts=StretchFacts({}, {}, {}),
+    )
+    swept_mps = np.array([-0.5 * arm_m[1], 0.5 * arm_m[0], 0.0])  # angular velocity times radius, at right angles to it
+    camera = BodyVelocities(stamp_ns, zero + swept_mps, zero + 1e-4, zero[:, 2] + 0.5, zero[:, 2] + 1e-4, arm_m)
+    antenna = Positions(stamp_ns, ahead * arm_m[0] + aside * arm_m[1], zero + 1e-4, arm_m)
+    return still, camera, antenna
+
+
+@pytest.mark.parametrize("role", ["visual", "gnss"])
+def test_a_robot_that_turns_in_place_sweeps_its_sensors_around(role):
+    track, *sensors = spin((1.2, -0.9, 0.0))
+    seen = dict(zip(("visual", "gnss"), sensors, strict=True))[role]
+    _, found = audit_trajectory(track, Measurements(**{role: seen}))
+    assert (found.windows > 10, found.astray) == (True, 0)
+    elsewhere = replace(seen, lever_arm_m=(-1.2, 0.9, 0.0))
+    _, found = audit_trajectory(track, Measurements(**{role: elsewhere}))
+    assert found.astray == found.windows
