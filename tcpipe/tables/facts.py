@@ -166,6 +166,17 @@ class StretchFacts:
     gyro_noise_radps: float | None = None
     heading_from: str = ""
 
+    def is_explained(self, max_rejected_fraction: float, max_change_count: float) -> bool:
+        """Return whether the estimate explains its sensors: it rejects few measurements of each, and needs few changes."""
+        return not self.list_unlikely_changes(max_change_count) and all(
+            self.rejected[role] <= max_rejected_fraction * count for role, count in self.measurements.items()
+        )
+
+    def list_unlikely_changes(self, max_change_count: float) -> tuple[ChangeFacts, ...]:
+        """Return the changes if they are too many; lasting errors of fixes do not count, as they only make the position uncertain."""
+        changes = tuple(each for each in self.changes if each.kind not in {"step", "slow", "wander"})
+        return changes if len(changes) > max_change_count else ()
+
 
 @dataclass(frozen=True, slots=True)
 class FuseFacts:
