@@ -132,7 +132,8 @@ def test_no_side_of_a_step_of_fixes_is_believed(share):
     t, _, off = find_errors(found)
     assert np.mean(off < 2.45) > 0.95
     drms_m = np.hypot(*found.position_std_m[:, :2].T)
-    assert drms_m[t < 40.0].min() > 0.5 * 0.3 and drms_m[t > 120.0].min() > 0.5 * 0.3
+    assert drms_m[t < 40.0].min() > 0.5 * 0.3
+    assert drms_m[t > 120.0].min() > 0.5 * 0.3
 
 
 def test_fixes_that_two_odometries_contradict_smoothly_are_an_excursion():
