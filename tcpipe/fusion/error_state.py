@@ -239,8 +239,14 @@ class _Section:
         steps = find_steps(tests, self.ticks.inputs.period_s)
         stepped = self._judge(Hypothesis((*best.changes, *steps), 0.0), start)[0]
         best = max(best, stepped, key=lambda each: each.score)
-        rivals = [each for each in hypotheses if len(each.changes) == 1 or {c.kind for c in each.changes} == {"step"}]
-        return hypotheses if any(self._judge(each, start)[0].score > best.score for each in rivals) else [best]
+        for each in hypotheses[:1]:
+            score = self._judge(each, start)[0].score
+            is_simple = len(each.changes) == 1 or {change.kind for change in each.changes} == {"step"}
+            if is_simple and score > best.score:
+                return hypotheses
+            if score > best.score + _SHOWS_ERROR:
+                best = replace(best, rival_change_count=len(each.changes))
+        return [best]
 
     def _judge(self, hypothesis: Hypothesis, start: Memory) -> tuple[Hypothesis, Tests]:
         """Return the hypothesis with its score by all measurements of the section, and their tests."""
@@ -549,6 +555,7 @@ def _make_facts(  # noqa: PLR0917
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,
+        rival_change_count=max((each.rival_change_count for each in explained), default=0),
         parameters=_describe_parameters(m, made, smoothed, std),
     )
 

@@ -170,10 +170,11 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Changes, and their score against that of none, in nats."""
+    """Changes, and their score against that of none, in nats; changes of a set that explains clearly more, and was not believed."""
 
     changes: tuple[Change, ...]
     score: float
+    rival_change_count: int = 0
 
     @property
     def events(self) -> tuple[Event, ...]:
