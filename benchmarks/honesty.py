@@ -120,6 +120,12 @@ class Labels:
     """The part of ``claimed`` that is one error of the whole drive."""
     value: Mapping[str, np.ndarray]
     sure: np.ndarray
+    placed: np.ndarray
+    """Which sure labels also have a sure place: `weak_gnss` doubts the place alone."""
+
+    def are_sure(self, name: str) -> np.ndarray:
+        """Return which labels no bit doubts a quantity of."""
+        return self.placed if name == "start" else self.sure
 
     def split(self, name: str) -> tuple[np.ndarray, float]:
         """Return absolute errors over standard deviations without what is common, of sure labels, and the common error over its own.
@@ -158,7 +164,6 @@ class Labels:
 
 def labels_of(outcome: Outcome, sensors: str) -> Labels:
     """Return the labels; without GNSS no place is claimed."""
-    described = OF_THE_DRIVE | (Quality.WEAK_GNSS if "gnss" in SETS[sensors] else 0)
     bits = np.asarray(outcome.bits, np.int64)
     error, claimed = (
         {name: np.asarray(of[name], float) for name in QUANTITIES} for of in (outcome.error, outcome.claimed)
@@ -167,7 +172,9 @@ def labels_of(outcome: Outcome, sensors: str) -> Labels:
         {name: np.asarray(of.get(name, np.zeros(bits.size)), float) for name in QUANTITIES}
         for of in (outcome.common, outcome.value)
     )
-    return Labels(np.asarray(outcome.start_s, float), error, claimed, common, value, (bits & ~int(described)) == 0)
+    sure = (bits & ~int(OF_THE_DRIVE | Quality.WEAK_GNSS)) == 0
+    placed = sure & (("gnss" in SETS[sensors]) | ((bits & int(Quality.WEAK_GNSS)) == 0))
+    return Labels(np.asarray(outcome.start_s, float), error, claimed, common, value, sure, placed)
 
 
 @dataclass
@@ -204,7 +211,7 @@ def figures_of(cell: HonestCell, outcomes: Sequence[Outcome], bases: Sequence[Ou
     """Return the figures of a cell from its drives and the same drives without the fault."""
     labels = [labels_of(of, cell.sensors) for of in outcomes]
     losses = [_losses(of, labels_of(base, cell.sensors)) for of, base in zip(labels, bases, strict=True)]
-    ratio = {name: _joined([of.ratio[name][of.sure] for of in labels]) for name in QUANTITIES}
+    ratio = {name: _joined([of.ratio[name][of.are_sure(name)] for of in labels]) for name in QUANTITIES}
     split = {name: [of.split(name) for of in labels] for name in LABELS}
     error = _joined([of.error["T"][of.sure] for of in labels])
     claimed = _joined([of.claimed["T"][of.sure] for of in labels])
@@ -373,7 +380,7 @@ def compare(first: Mapping[Key, Outcome], second: Mapping[Key, Outcome]) -> Iter
 
 
 def _of_sure(labels: Labels, name: str, within: tuple[float, float]) -> str:
-    ratio = labels.ratio[name][labels.sure]
+    ratio = labels.ratio[name][labels.are_sure(name)]
     ratio = ratio[np.isfinite(ratio)]
     return "/".join(f"{100 * np.mean(ratio <= k):.0f}" for k in within) if ratio.size else "–"
 

@@ -31,11 +31,14 @@ from tcpipe.fusion.filter_kernel import (
 from tcpipe.fusion.hypotheses import (
     POSSIBLE,
     ROLES,
+    Change,
     EventCandidate,
     Hypothesis,
+    compute_evidence,
     compute_weights,
     explain,
     find_fix_excursions,
+    find_steps,
     find_suspects,
     find_turn_jump,
     make_excursions,
@@ -53,7 +56,7 @@ from tcpipe.fusion.measurements import (
     select_rows,
 )
 from tcpipe.fusion.pair_residuals import find_residuals
-from tcpipe.fusion.parameters import PARAMETERS, make_model, make_priors, make_start
+from tcpipe.fusion.parameters import PARAMETERS, make_model, make_priors, make_start, widen_start
 from tcpipe.fusion.process import (
     GROUND,
     SLOPE_RAD,
@@ -85,6 +88,10 @@ _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50  # from so many on, their white noise is averaged out
 _JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose no better
 _UNCHANGED = Hypothesis((), 0.0)
+_ERRORS_M = (0.03, 0.06, 0.12, 0.24)
+"""Sizes of a lasting error of fixes that are tried [m], 1σ: from RTK's usual error to a wrong ambiguity."""
+_SHOWS_ERROR, _SHOWS_LARGER = 100.0, 8.0
+"""Log likelihood by which such an error, and a larger one, must explain more: gains are -5 to 59 on clean runs, above 1,000 on stepped."""
 
 
 def make_tests(size: int) -> Tests:
@@ -157,7 +164,11 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     )
     start.x[:9] = smooth_section(first_minute).states[0, :9]
     made = filter_section(ticks, model, start.select(model.active))
-    hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise)) if _is_judging_fixes(m) else []
+    hypotheses = []
+    if _is_judging_fixes(m):
+        hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise))
+        if m.gnss is not None and find_suspects(made.tests, ticks.inputs.period_s):
+            hypotheses = section.prefer_larger_errors(hypotheses, start)
     if hypotheses:
         made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
@@ -203,10 +214,45 @@ class _Section:
             possible=POSSIBLE if judges else (),
         )
 
-    def filter(self, start: Memory, hypothesis: Hypothesis) -> Pass:
+    def filter(self, start: Memory, hypothesis: Hypothesis, *, judges: bool = False) -> Pass:
         """Return the forward pass under a hypothesis from a start of all errors."""
-        changed = self.make_model(hypothesis)
-        return filter_section(hypothesis.alter_ticks(self.ticks), changed, start.select(changed.active))
+        changed, ticks = self.make_model(hypothesis, judges=judges), hypothesis.alter_ticks(self.ticks)
+        std = make_priors(self.measurements, hypothesis.alter_noise(self.noise), ticks)[0]
+        return filter_section(ticks, changed, widen_start(start, std).select(changed.active))
+
+    def prefer_larger_errors(self, hypotheses: list[Hypothesis], start: Memory) -> list[Hypothesis]:
+        """Return the hypothesis that fixes err by more throughout, and in steps, where it is the most likely one, else those given.
+
+        Their usual error may be larger ("wander"), and a slow one may come on top. Sets of changes would explain both by inventions: only
+        a single change, or steps of the fixes alone, may be more likely.
+        """
+        best, tests = self._judge(_UNCHANGED, start)
+        for kind in ("wander", "slow"):
+            kept, least = best.changes, best.score + _SHOWS_ERROR
+            for size_m in _ERRORS_M:
+                tried, of_tried = self._judge(Hypothesis((*kept, Change(kind, state.FIX, 0, size=size_m)), 0.0), start)
+                if tried.score <= least:
+                    break
+                best, tests, least = tried, of_tried, tried.score + _SHOWS_LARGER
+        if not best.changes:
+            return hypotheses
+        steps = find_steps(tests, self.ticks.inputs.period_s)
+        stepped = self._judge(Hypothesis((*best.changes, *steps), 0.0), start)[0]
+        best = max(best, stepped, key=lambda each: each.score)
+        for each in hypotheses[:1]:
+            score = self._judge(each, start)[0].score
+            is_simple = len(each.changes) == 1 or {change.kind for change in each.changes} == {"step"}
+            if is_simple and score > best.score:
+                return hypotheses
+            if score > best.score + _SHOWS_ERROR:
+                best = replace(best, rival_change_count=len(each.changes))
+        return [best]
+
+    def _judge(self, hypothesis: Hypothesis, start: Memory) -> tuple[Hypothesis, Tests]:
+        """Return the hypothesis with its score by all measurements of the section, and their tests."""
+        made = self.filter(start, hypothesis, judges=True)
+        score = compute_evidence(made.tests, made.model.gates, 0, made.states.shape[0])
+        return replace(hypothesis, score=score - sum(change.cost for change in hypothesis.changes)), made.tests
 
     def explain(self, made: Pass, start: Memory, excursions: Sequence[EventCandidate]) -> list[Hypothesis]:
         """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not.
@@ -510,6 +556,7 @@ def _make_facts(  # noqa: PLR0917
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,
+        rival_change_count=max((each.rival_change_count for each in explained), default=0),
         parameters=_describe_parameters(m, made, smoothed, std),
     )
 

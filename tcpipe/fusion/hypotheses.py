@@ -2,8 +2,8 @@
 
 A hypothesis is a set of changes. A change makes one block of the state uncertain at a tick, and where it ends makes it what it was: fixes
 are off by a constant, the antenna was moved, a clock stepped, a gyroscope's bias jumped, the scale of an odometry changed, the robot was
-carried, the frame of a pose turned, a sensor is useless for a while. The scale of an odometry may also vary much, throughout. Fixes do not
-err for ever: where nothing tells when they did, their lasting error is taken to be larger around a step. Each hypothesis runs the filter
+carried, the frame of a pose turned, a sensor is useless for a while. The scale of an odometry may also vary much, throughout. A step of
+fixes makes them uncertain on both sides, since nothing shows which side is right. Each hypothesis runs the filter
 over the same measurements, predicted whether they are used or not; its score is the log likelihood, with what lies beyond the gate counted
 as the gate, less a cost by kind. The changes that explain most are found one after the other; hypotheses that are nearly as good widen the
 deviations where they differ.
@@ -29,7 +29,7 @@ from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
 from tcpipe.fusion.level_motion import find_turn_roles, get_turn_rates
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, Residuals, align_turns
-from tcpipe.fusion.parameters import Event
+from tcpipe.fusion.parameters import FIX_AXES, Event
 from tcpipe.fusion.signals import compute_interval_means, compute_seconds, is_covered
 from tcpipe.fusion.ticks import Pass, Ticks
 from tcpipe.robust import estimate_robust_std
@@ -57,8 +57,6 @@ _LASTS_S = {state.FIX: 1.0, state.WHEELS: 10.0, state.VISUAL: 10.0, state.ATTITU
 _TOGETHER_S = 5.0
 _MOST_CHANGES = 3
 _CARRIED_M = 1.0  # a jump that is smaller is one of the fixes
-_ERR_FOR_S = 40.0
-_SIDE = 60.0  # log likelihood by which fixes err rather before a step than after it
 _MUCH_SHORTER = 0.25
 _ALIKE = 0.4  # of the size of an innovation
 _HORIZON_S = 60.0
@@ -75,8 +73,7 @@ _MOST_RIVALS = 2
 class Change:
     """One change: its kind, the sensor it is of, and its first and last tick (None: to the end of the section).
 
-    ``size``: how far fixes are off [m]; ``steps_at``: the tick at which their error changes at once. ``jump``: of a gyroscope, where its
-    turns tell it.
+    ``size``: how far fixes are off [m]. ``jump``: of a gyroscope, where its turns show it.
     """
 
     kind: str
@@ -84,7 +81,6 @@ class Change:
     first: int
     last: int | None = None
     size: float = 0.0
-    steps_at: int | None = None
     jump: TurnJump | None = None
 
     @property
@@ -103,10 +99,9 @@ class Change:
     def list_events(self) -> Iterator[Event]:
         """Yield what it changes in the state."""
         for place, count, std in self.blocks:
-            yield Event(self.first, place, count, std)
+            yield Event(self.first, place, count, std, is_new=self.kind == "step")
             if self.last is not None:
-                is_new = place == state.FIX_OFFSET
-                yield Event(self.last, place, count, 0.0 if is_new else std, is_new)
+                yield Event(self.last, place, count, std, is_new=place == state.FIX_OFFSET)
 
     def alter_ticks(self, ticks: Ticks) -> Ticks:
         """Return the ticks as they are under the change."""
@@ -114,9 +109,7 @@ class Change:
         if self.kind == "wander":
             kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
             span = slice(self.first, self.last)
-            variance[span] = np.maximum(variance[span], np.square(self.size * _ERRS_ALONG))
-            if self.steps_at is not None:
-                kept[self.steps_at] = 0.0
+            variance[span] = np.maximum(variance[span], np.square(self.size * FIX_AXES))
             if self.last is not None:
                 kept[self.last] *= np.sqrt(variance[self.last, 0] / variance[self.last - 1, 0])
             earlier = np.concatenate((variance[:1], variance[:-1]))
@@ -130,10 +123,12 @@ class Change:
         return ticks
 
 
-_ERRS_ALONG = np.array([1.0, 1.0, 1.7])  # heights err more
+_SLOW_S = 60.0
+"""Correlation time of a slow error of fixes [s]: the paths of reflected signals change with the satellites."""
 _UNMEASURED = 1e3  # rad²/s²
 _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
     ("offset", state.FIX): ((state.FIX_OFFSET, 3, 1.0),),
+    ("step", state.FIX): ((state.FIX_OFFSET, 3, 0.0),),  # drawn from the prior that `Hypothesis.alter_noise` gives
     ("antenna", state.FIX): ((state.ARM, 3, 0.3),),
     ("clock", state.FIX): ((state.FIX_LAG, 1, 0.3),),
     ("clock", state.WHEELS): ((state.WHEEL_LAG, 1, 0.3),),
@@ -158,6 +153,8 @@ _COSTS = {
     "frame": 14.0,
     "pose": 20.0,
     "wander": 12.0,
+    "step": 12.0,
+    "slow": 0.0,
     "useless": 12.0,
 }
 
@@ -173,10 +170,11 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Changes, and their score against that of none, in nats."""
+    """Changes, and their score against that of none, in nats; changes of a set that explains clearly more, and was not believed."""
 
     changes: tuple[Change, ...]
     score: float
+    rival_change_count: int = 0
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -193,7 +191,11 @@ class Hypothesis:
         """Return the noise of the sensors as it is under all changes."""
         roles = [ROLES[change.role] for change in self.changes if change.kind == "varies"]
         varying = {role: replace(noise.odometries[role], scale=_VARYING) for role in roles}
-        return replace(noise, odometries={**noise.odometries, **varying})
+        # Either side of a step may be right: both are off by half of it, 1σ, for as long as they last.
+        steps_m = [0.5 * change.size for change in self.changes if change.kind == "step"]
+        slow_m = [change.size for change in self.changes if change.kind == "slow"]
+        offset = GaussMarkov(max((*steps_m, *slow_m), default=0.0) ** 2, _SLOW_S if slow_m else np.inf)
+        return replace(noise, odometries={**noise.odometries, **varying}, offset=offset)
 
     @property
     def ignored(self) -> tuple[tuple[int, int, int], ...]:
@@ -266,20 +268,13 @@ def explain(
             found.remove(top)
             best = top
             if (change := top.changes[-1]).kind == "pose" and change.size < _CARRIED_M:
-                # Such a step is one of the fixes, which err before or after it; if neither is more likely, around it.
-                wanders = _list_wanders(change.first, change.size, size, period_s)
-                around, *sides = (replace(top, changes=(*top.changes[:-1], each)) for each in wanders)
-                begin = min(c.first for c in around.changes)
-                likely = [compute_evidence(run(each, begin, last).tests, gates, begin, last) for each in sides]
-                best = around if abs(likely[0] - likely[1]) < _SIDE else sides[int(np.argmax(likely))]
+                best = replace(top, changes=(*top.changes[:-1], replace(change, kind="step")))
             tests = run(best, 0, size).tests
         elif number > 0:
             break
-    left = [each for each in find_suspects(tests, period_s) if each.role == state.FIX] if best.changes else []
     rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
-    off_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in left]
-    errs = [next(_list_wanders(each.first, size_m, size, period_s)) for each, size_m in zip(left, off_m, strict=True)]
-    best = replace(best, changes=(*best.changes, *errs))
+    if best.changes:
+        best = replace(best, changes=(*best.changes, *find_steps(tests, period_s)))
     return [best, *sorted(rivals, key=lambda each: -each.score)[:_MOST_RIVALS]] if best.changes or rivals else []
 
 
@@ -290,13 +285,11 @@ def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> b
     return all(e in active for place, count, _ in change.blocks for e in range(place, place + count))
 
 
-def _list_wanders(tick: int, off_m: float, size: int, period_s: float) -> Iterator[Change]:
-    """Yield changes by which fixes err around a tick at which they step, before it, and after it."""
-    length = round(_ERR_FOR_S / period_s)
-    first, last = max(0, tick - length), None if tick + length >= size else tick + length
-    yield Change("wander", state.FIX, first, last, off_m, tick)
-    yield Change("wander", state.FIX, first, tick, off_m, tick)
-    yield Change("wander", state.FIX, tick, last, off_m, tick)
+def find_steps(tests: Tests, period_s: float) -> list[Change]:
+    """Return a step of the fixes wherever they are rejected for long."""
+    suspects = [each for each in find_suspects(tests, period_s) if each.role == state.FIX]
+    sizes_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in suspects]
+    return [Change("step", state.FIX, each.first, size=size) for each, size in zip(suspects, sizes_m, strict=True)]
 
 
 def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> list[Hypothesis]:
@@ -359,7 +352,7 @@ def _list_changes(suspect: Suspect, suspects: Sequence[Suspect], tests: Tests, p
         yield Change("useless", role, first, last)
     heard = np.flatnonzero(tests.verdict[:first, role] != NONE)
     silent = int(heard[-1]) + 1 if heard.size and (first - heard[-1]) * period_s > _TOGETHER_S else first
-    for kind, at in (("antenna", first), ("clock", first), ("gyroscope", silent), ("pose", silent)):
+    for kind, at in (("antenna", first), ("clock", first), ("step", first), ("gyroscope", silent), ("pose", silent)):
         yield Change(kind, role, at, size=size_m)
 
 

@@ -59,6 +59,8 @@ PARAMETERS = (
     Parameter("frame of the pose", state.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
 )
 """What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
+FIX_AXES = np.array([1.0, 1.0, 1.7])
+"""Ratio of lasting errors of fixes east, north and up [1]: no satellite is below."""
 _PATIENCE = {state.FIX: (5.0, 15.0, 5.0), state.WHEELS: (5.0, 5.0, 0.3), state.VISUAL: (5.0, 5.0, 0.3)}
 _NEVER = (1e18, 1e18, 1e18)
 _MINUTE_S = 60.0
@@ -67,12 +69,12 @@ _MEAN_LASTS_S = 100.0  # the mean of a varying scale strays by as much as the sc
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What changes at a tick: errors from ``place`` on become uncertain by ``std`` more; ``is_new``: they are other errors from then on."""
+    """What changes at a tick: errors from ``place`` on grow by ``std``, or are drawn anew from their prior (``is_new``)."""
 
     tick: int
     place: int
     count: int
-    std: float
+    std: float = 0.0
     is_new: bool = False
 
 
@@ -116,6 +118,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
+        std[state.FIX_OFFSET : state.FIX_OFFSET + 3] = np.sqrt(noise.offset.variance) * FIX_AXES
+        time_s[state.FIX_OFFSET : state.FIX_OFFSET + 3] = noise.offset.time_s
     return std, walk, time_s
 
 
@@ -210,7 +214,7 @@ def make_model(
         mount=position.get(state.MOUNT, -1),
         scales=scales,
         events=np.array([(e.tick, position[e.place], e.count, e.is_new) for e in events], np.int64).reshape(-1, 4),
-        sizes=np.array([e.std**2 for e in events], np.float64),
+        sizes=np.array([(std[e.place] if e.is_new else e.std) ** 2 for e in events], np.float64),
         ignored=np.array(ignored, np.int64).reshape(-1, 3),
     )
 
@@ -245,3 +249,17 @@ def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Me
     P[3:6, 3:6] = rotation.T @ np.diag(np.square(initial.position_std_m)) @ rotation
     P[6:9, 6:9] = np.eye(3) * initial.velocity_std_mps**2
     return Memory(x, P, np.zeros((state.KINDS, 2)))
+
+
+_START_FIXES = 3.0
+"""Standard deviations of a lasting error of fixes by which the start, which is made of the first fixes, may be off."""
+
+
+def widen_start(start: Memory, std: Floats) -> Memory:
+    """Return a start of all errors whose fixes err by other standard deviations ``std``, shape (45,), than it was made with."""
+    widened = start.copy()
+    for place in range(state.FIX_ERROR, state.FIX_OFFSET + 3):
+        widened.P[place, place] = std[place] ** 2
+    offset_m2 = (_START_FIXES * std[state.FIX_OFFSET]) ** 2
+    widened.P[range(state.RHO, state.RHO + 3), range(state.RHO, state.RHO + 3)] += offset_m2
+    return widened

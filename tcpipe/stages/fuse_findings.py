@@ -82,6 +82,7 @@ def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) 
         ]
     findings += _find_reopenings(facts, first_ns)
     findings += _find_changes(facts, first_ns)
+    findings += _find_unlikely_changes(facts, first_ns, run)
     findings += _find_scale(facts)
     findings += _find_rejections(facts)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
@@ -171,9 +172,20 @@ def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
         )
 
 
+def _find_unlikely_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
+    """Yield each section whose sensors are explained by more changes than are likely."""
+    most = read_threshold("changes-unlikely", "max_change_count")
+    for section in facts.stretches:
+        count = section.count_changes()
+        if count > most:
+            yield make_finding("changes-unlikely", run, span_s=_find_span_s(section, first_ns), change_count=count)
+
+
 CHANGES = {
     "offset": "positions are off by a constant",
     "wander": "positions err far more than usual",
+    "step": "positions step, and nothing shows which side is right",
+    "slow": "positions err slowly, by more than they claim",
     "antenna": "it was moved on the robot",
     "clock": "its clock stepped",
     "gyroscope": "the bias of its gyroscope jumped",

@@ -156,6 +156,8 @@ class StretchFacts:
     common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
     changes: tuple[ChangeFacts, ...] = field(default=(), metadata=LEFT_OUT)
+    rival_change_count: int = field(default=0, metadata=LEFT_OUT)
+    """Number of changes of a set that explains the sensors clearly better than those believed."""
     parameters: Mapping[str, ParameterFacts] = field(default_factory=dict, metadata=LEFT_OUT)
     noise: Mapping[str, NoiseFacts] = field(default_factory=dict, metadata=LEFT_OUT)
     clock_epoch: int = 0
@@ -165,6 +167,16 @@ class StretchFacts:
     sensors: tuple[str, ...] = ()
     gyro_noise_radps: float | None = None
     heading_from: str = ""
+
+    def is_explained(self, max_rejected_fraction: float, max_change_count: float) -> bool:
+        """Return whether the estimate explains its sensors: it rejects few measurements of each, and needs few changes."""
+        return self.count_changes() <= max_change_count and all(
+            self.rejected[role] <= max_rejected_fraction * count for role, count in self.measurements.items()
+        )
+
+    def count_changes(self) -> int:
+        """Return how many changes the sensors need; larger errors of fixes throughout are none."""
+        return max(self.rival_change_count, sum(each.kind not in {"slow", "wander"} for each in self.changes))
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,12 +119,21 @@ def test_a_jump_within_an_outage_bends_no_track():
     assert np.mean(off[(t > 56.0) & (t < 104.0)] < 2.45) > 0.9
 
 
-def test_fixes_that_drift_away_and_jump_back_are_distrusted_around_the_jump():
-    found = fuse(shift(drive.measure(truth(), 1), lambda t: np.interp(t, [50.0, 75.0, 75.01], [0.0, 0.3, 0.0])))
-    assert {change.kind for change in found.facts.changes} == {"wander"}
-    t, error, off = find_errors(found)
-    assert np.mean(off < 2.45) > 0.9
-    assert np.hypot(*error[t > 120.0].T).max() < 0.05
+def drift_and_jump_back(t):
+    return np.interp(t, [50.0, 75.0, 75.01], [0.0, 0.3, 0.0])
+
+
+@pytest.mark.parametrize("share", [lambda t: 0.3 * (t > 75.0), drift_and_jump_back], ids=["step", "ramp"])
+def test_no_side_of_a_step_of_fixes_is_believed(share):
+    found = fuse(shift(drive.measure(truth(), 1), share))
+    (change,) = found.facts.changes
+    assert (change.kind, change.role) == ("step", "gnss")
+    assert (change.start_ns - drive.ZERO_NS) * 1e-9 == pytest.approx(75.1, abs=0.3)
+    t, _, off = find_errors(found)
+    assert np.mean(off < 2.45) > 0.95
+    drms_m = np.hypot(*found.position_std_m[:, :2].T)
+    assert drms_m[t < 40.0].min() > 0.5 * 0.3
+    assert drms_m[t > 120.0].min() > 0.5 * 0.3
 
 
 def test_fixes_that_two_odometries_contradict_smoothly_are_an_excursion():
