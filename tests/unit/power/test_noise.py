@@ -1,5 +1,7 @@
 """The energy's deviation against the scatter of many noisy, sampled or rounded records of one truth."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -161,6 +163,25 @@ def test_what_a_faster_source_would_leave():
     truth = integrate_energy([record(t, amp)], STARTS, ENDS, rule="exact")
     error = integrate_energy(fast, STARTS, ENDS, rule="exact") - truth
     assert np.sqrt(told) == pytest.approx(error.std(), rel=0.25)
+
+
+def test_readings_of_1970_cost_no_memory_and_change_no_deviation():
+    t, rng = np.arange(0, 600, 0.25), np.random.default_rng(12)
+    rail = record(t, 6 + rng.normal(0, 0.5, len(t)))
+    late = [
+        make_samples(np.append([0, 250_000_000], each.stamp_ns), np.append(each.value[:2], each.value))
+        for each in (rail.voltage, rail.current)
+    ]
+    for rate_hz in (None, 20.0):
+        wanted = estimate_energy_noise([rail], STARTS, ENDS, NEVER_STILL, rate_hz=rate_hz)
+        tracemalloc.start()
+        got = estimate_energy_noise(
+            [make_rail("drive", *late, averaged=False)], STARTS, ENDS, NEVER_STILL, rate_hz=rate_hz
+        )
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert got.std_joule() == pytest.approx(wanted.std_joule(), rel=1e-2)
+        assert peak_bytes < 40_000_000
 
 
 def test_the_median_period_needs_two_samples():
