@@ -20,12 +20,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from tcpipe.fusion.level_motion import KNOT_S
 from tcpipe.fusion.measurements import GNSS, IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, TURN, TURN_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
-from tcpipe.power.noise import solve_non_negative
 from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std
 from tcpipe.tables.facts import NoiseFacts
 
@@ -287,7 +287,7 @@ class _Fit:
             logarithm = np.log(np.maximum(levels, _LEAST_LEVEL)) + np.minimum(1.0 / (_OVERLAP * counts), 0.5)
             target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
             # Solved in units of the prior, so that rounding does not decide.
-            fitted = solve_non_negative(matrix * std, target) * std
+            fitted = nnls(matrix * std, target)[0] * std
             self._variances = 0.5 * (self._variances + fitted)
             self._covariance = np.linalg.inv(np.einsum("mi,mj->ij", matrix, matrix))
 

@@ -128,9 +128,9 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     """Return the clearest change of the gain, by the battery's resistance before and after; None where it is not sure, or gradual."""
     if sag is None:
         return None
-    edge_ns, by_volt, weight = _split_blocks(sag)
+    start_ns, by_volt, weight = _split_blocks(sag)
     used = weight > 0.0
-    edge_ns, by_volt, weight = edge_ns[:-1][used], by_volt[used], weight[used]
+    start_ns, by_volt, weight = start_ns[used], by_volt[used], weight[used]
     count = len(weight)
     if count < 2 * _FEWEST_BLOCKS or _estimate_ohm(by_volt, weight) is None:
         return None
@@ -159,18 +159,18 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     is_sure = judged[first][0] > _SURE**2 and judged[first][1] > _GRADUAL**2
     least = read_threshold("current-gain-changes", "min_change_fraction")
     if not is_sure or min(before, after) <= 0.0 or abs(before / after - 1.0) < least:
-        return _compare_halves(edge_ns, by_volt, weight)
-    return GainChange(int(edge_ns[first]), before / after)
+        return _compare_halves(start_ns, by_volt, weight)
+    return GainChange(int(start_ns[first]), before / after)
 
 
-def _compare_halves(edge_ns: Stamps, by_volt: Floats, weight: Floats) -> GainChange | None:
+def _compare_halves(start_ns: Stamps, by_volt: Floats, weight: Floats) -> GainChange | None:
     """Return the gain of the second half of the blocks over the first; None where it is usual, or a half does not show the resistance."""
     middle = len(weight) // 2
     first_ohm, last_ohm = (_estimate_ohm(by_volt[half], weight[half]) for half in (slice(middle), slice(middle, None)))
     if first_ohm is None or last_ohm is None:
         return None
     ratio, most = first_ohm / last_ohm, read_threshold("current-gain-changes", "max_ratio_of_halves")
-    return None if 1.0 / most <= ratio <= most else GainChange(int(edge_ns[middle]), ratio)
+    return None if 1.0 / most <= ratio <= most else GainChange(int(start_ns[middle]), ratio)
 
 
 def estimate_resistance_ohm(sag: Sag | None) -> float | None:
@@ -179,10 +179,16 @@ def estimate_resistance_ohm(sag: Sag | None) -> float | None:
 
 
 def _split_blocks(sag: Sag) -> tuple[Stamps, Floats, Floats]:
-    """Return the edges of blocks [ns] and, of each block, the sums of voltage times current and of the current's square."""
-    edge_ns = np.arange(sag.stamp_ns[0], sag.stamp_ns[-1], round(_BLOCK_S * 1e9), dtype=np.int64)
-    by_volt, by_amp = (np.diff(product) for product in sag.products(edge_ns))
-    return edge_ns, by_volt, by_amp
+    """Return the start of each block [ns], and its sums of voltage times current and of the current's square, shape (B,).
+
+    Blocks start anew after a gap that is longer than a block.
+    """
+    block_ns = round(_BLOCK_S * 1e9)
+    sections = np.split(sag.stamp_ns, np.flatnonzero(np.diff(sag.stamp_ns) > block_ns) + 1)
+    edge_ns = np.concatenate([np.arange(each[0], each[-1], block_ns, dtype=np.int64) for each in sections])
+    is_whole = np.diff(edge_ns) == block_ns
+    by_volt, by_amp = (np.diff(product)[is_whole] for product in sag.products(edge_ns))
+    return edge_ns[:-1][is_whole], by_volt, by_amp
 
 
 def _estimate_ohm(by_volt: Floats, by_amp: Floats) -> float | None:

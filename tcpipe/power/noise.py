@@ -1,23 +1,13 @@
-"""Standard deviation of an energy, since power was sampled, noisy and quantised; estimated from the record itself.
+"""Standard deviation of the energy of a span by sampling, noise and quantisation of its power record, estimated from the record.
 
-The energy of a span is a weighted sum of samples; its error is that sum less the integral of the true current. For a process with
-covariance K(t - t') the variance of that error is the double integral of e(t) K(t - t') e(t'), where e is the samples' weights as
-impulses less one over the span. It is exact for any sampling, regular or not, and for sources that average: there a sample's weight is
-spread over its period, and e vanishes except where a segment's end divides a period. Independent errors of samples add their variance
-times the sum of the squared weights.
+The energy of a span is a weighted sum of samples. Independent errors of samples add their variance times the sum of the squared weights.
+A process of variance s and covariance s exp(-d / tau) that is sampled every h seconds differs from the sum of its samples over a span by
+s h² (coth(h / 2 tau) - 2 tau / h) for each interval. Means over periods have no such error, but where an end of the span divides a period.
 
-`fit_signal_model` describes a signal as a sum of processes, each with a variance and a correlation time, plus independent errors of its
-samples (noise, rounding). Second differences at several spacings separate them: independent errors scatter alike at all spacings, a
-process that changes over a time tau scatters more the wider the spacing, up to tau. Second differences do not see a level and a steady
-rise, which an integral of straight lines follows exactly. Two families of processes are fitted over a range of tau with non-negative
-variances: exp(-d / tau), rough as a random walk, and (1 + d / tau) exp(-d / tau), which is smooth (Rasmussen and Williams, Gaussian
-Processes for Machine Learning, section 4.2.1: Matern with nu = 1/2 and 3/2). Independent errors are the scatter while the robot is
-stationary. Where it hardly is, they are fitted too, in place of what changes within a period; for means they are then the scatter where
-the record is calmest. The processes hold for the whole record; their size near a segment is that of the second differences there.
-
-Least squares with sizes that cannot be negative.
-
-scipy.optimize has it too, and is what the tests compare with; to load that takes longer than all fits of a run.
+`fit_signal_model` describes a signal as a sum of such processes and independent errors. The scatter of a stationary robot is the variance
+of the errors. Second differences at several spacings show the processes: one that changes over tau scatters more the wider the spacing,
+up to tau. They are zero for a level and a steady rise, which an integral of straight lines follows exactly. The model holds for the whole
+record; near a span the size of the processes is that of the second differences there.
 """
 
 from __future__ import annotations
@@ -26,19 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
-from tcpipe.power.rails import Rail, Rule, Samples, integrate_energy, interpolate_rail, sum_power
+from tcpipe.power.rails import Rail, Samples, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
-from tcpipe.robust import MEDIAN_OF_SQUARES
 from tcpipe.tables.facts import Smoothing
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _NS = 1e-9
-_NODES = 256  # cells of a span and the samples around it; four times as many change a deviation by 7 % at 20 Hz, at 2 Hz by nothing
-_CHUNK = 1000  # spans at a time: some MB
-_SETTLED_S = 0.2  # after a stop and before a start the motors still draw
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +42,7 @@ class EnergyNoise:
     voltage: Floats
 
     def std_joule(self) -> Floats:
-        """Return the standard deviation of each span's energy, [J], shape (M,)."""
+        """Return the standard deviation of each span's energy [J], shape (M,)."""
         return np.sqrt(self.rate + self.current + self.voltage)
 
 
@@ -72,7 +60,7 @@ def estimate_energy_noise(
     Parameters
     ----------
     start_ns, end_ns : [ns], shape (M,), the spans of steady driving of the labels, in order of time.
-    still_ns : [ns], shape (S, 2), begin and end of every span in which the robot is stationary.
+    still_ns : [ns], shape (S, 2), begin and end of every span in which the robot is stationary, in order of time.
     rate_hz : [Hz], as if power had been sampled so; None as it was.
     """
     rate, current, voltage = np.zeros((3, len(start_ns)))
@@ -89,33 +77,9 @@ def estimate_energy_noise(
         current += volt**2 * error
         voltage += amp**2 * sum(of_voltage)
     if smoothing is not None and (power := sum_power(rails)) is not None:
-        steady = _select_used_samples(power.stamp_ns, start_ns, end_ns)
+        steady = _is_inside(power.stamp_ns, start_ns, end_ns)
         rate += np.square((end_ns - start_ns) * _NS) * estimate_smoothing_variance(power, steady, smoothing)
     return EnergyNoise(rate, current, voltage)
-
-
-_USUAL_DELAY_S = 0.03
-"""σ of the delay of power where clocks are synchronised [s]: a period of 20 Hz or less."""
-
-
-def estimate_delay_variance(
-    rails: list[Rail], start_ns: Stamps, end_ns: Stamps, delay_s: float, std_s: float, *, rule: Rule
-) -> Floats:
-    """Return the mean square of what a delay of power changes of each span's energy [J²], shape (M,); 0 where it is unknown.
-
-    The energies of two spans in a row change by opposite amounts at their border: over a path the error averages out. The mean is over
-    the normal distribution of the delay (``delay_s``, ``std_s`` [s]), by Gauss and Hermite's three nodes. A delay inside 2σ is weighted
-    with the usual delay of a synchronised driver.
-    """
-    if abs(delay_s) < 2.0 * std_s:
-        weight = _USUAL_DELAY_S**2 / (_USUAL_DELAY_S**2 + std_s**2)
-        delay_s, std_s = weight * delay_s, weight**0.5 * std_s
-    stamped = integrate_energy(rails, start_ns, end_ns, rule=rule)
-    squares = []
-    for node_s in delay_s + std_s * np.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]):
-        shift_ns = round(node_s / _NS)
-        squares.append((integrate_energy(rails, start_ns + shift_ns, end_ns + shift_ns, rule=rule) - stamped) ** 2)
-    return np.nan_to_num(np.average(squares, axis=0, weights=[1 / 6, 2 / 3, 1 / 6]))
 
 
 def compute_median_period_s(signal: Samples) -> float:
@@ -129,184 +93,75 @@ def estimate_resolution(signal: Samples) -> float:
     return float(np.median(np.diff(levels))) if 1 < len(levels) < 0.5 * len(signal.value) else 0.0
 
 
+def _is_inside(at_ns: Stamps, start_ns: Stamps, end_ns: Stamps) -> Mask:
+    """Return whether each time, shape (N,), is inside one of several spans, (M,)."""
+    return np.asarray(np.searchsorted(start_ns, at_ns, side="right") > np.searchsorted(end_ns, at_ns, side="left"))
+
+
 def _estimate_integral_variance(
     signal: Samples, start_ns: Stamps, end_ns: Stamps, still_ns: Stamps, *, averaged: bool, rate_hz: float | None
 ) -> tuple[Floats, Floats]:
     """Return the variance of the signal's time integral over each span, in its unit squared times s², shape (M,).
 
-    From what it did between samples, and from the samples' errors.
+    The first is by changes of the signal between samples, the second by the errors of samples.
     """
     if len(signal.value) < 3:
         return np.zeros(len(start_ns)), np.zeros(len(start_ns))
-    steady = _select_used_samples(signal.stamp_ns, start_ns, end_ns)
-    model = fit_signal_model(
-        signal, steady, _select_stationary_samples(signal, still_ns, averaged=averaged), averaged=averaged
-    )
-    stamp_ns = signal.stamp_ns
-    if rate_hz is not None:
-        period_ns = round(1e9 / rate_hz)
-        stamp_ns = np.arange(stamp_ns[0], stamp_ns[-1] + period_ns, period_ns, dtype=np.int64)
-    between = np.empty(len(start_ns))
-    for first in range(0, len(start_ns), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        between[part] = _process_variance(model, stamp_ns, start_ns[part], end_ns[part], averaged=averaged)
-    between *= estimate_local_scale(model, signal, steady, start_ns, end_ns)
-    error = model.error_variance * sum_squared_weights(stamp_ns, start_ns, end_ns, averaged=averaged)
-    return between, error + _estimate_rounding(signal, start_ns, end_ns)
-
-
-def _select_used_samples(stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps) -> NDArray[np.bool_]:
-    """Return the samples that the spans use: those inside, and one on either side."""
-    edges = np.zeros(len(stamp_ns) + 1, dtype=np.int64)
-    np.add.at(edges, np.maximum(np.searchsorted(stamp_ns, start_ns, side="right") - 1, 0), 1)
-    np.add.at(edges, np.minimum(np.searchsorted(stamp_ns, end_ns, side="left") + 1, len(stamp_ns)), -1)
-    used: NDArray[np.bool_] = np.cumsum(edges)[:-1] > 0
-    return used
-
-
-def _select_stationary_samples(signal: Samples, still_ns: Stamps, *, averaged: bool) -> NDArray[np.bool_]:
-    """Return the samples of a stationary robot, 0.2 s from any motion; of averages those whose whole period is such."""
-    edge_ns = round(_SETTLED_S / _NS)
-    still = _is_inside(signal.stamp_ns, still_ns, edge_ns)
+    steady, still = (_is_inside(signal.stamp_ns, *spans) for spans in ((start_ns, end_ns), still_ns.T))
+    model = fit_signal_model(signal, steady, still, averaged=averaged)
+    sample_s, start_s, end_s = ((at_ns - signal.stamp_ns[0]) * _NS for at_ns in (signal.stamp_ns, start_ns, end_ns))
+    if rate_hz is not None:  # all spans on one short grid, each at its phase
+        start_s, end_s = start_s % (1.0 / rate_hz), end_s - start_s + start_s % (1.0 / rate_hz)
+        sample_s = np.arange(end_s.max() * rate_hz + 2.0) / rate_hz
+    interval_s = np.diff(sample_s)
+    edge_s = sample_s if averaged else np.r_[sample_s[0], sample_s[1:] - interval_s / 2.0, sample_s[-1]]
+    error = _sum_squared_shares(model.error_variance * np.diff(edge_s) ** 2, edge_s, start_s, end_s)
     if averaged:
-        begin_ns = np.concatenate((signal.stamp_ns[:1], signal.stamp_ns[:-1]))
-        still &= _is_inside(begin_ns, still_ns, edge_ns) & (
-            np.searchsorted(still_ns[:, 0], begin_ns) == np.searchsorted(still_ns[:, 0], signal.stamp_ns)
-        )
-    return still
+        ends = (_find_cells(at_s, sample_s) for at_s in (start_s, end_s))
+        between = sum(model.compute_divided_variance(interval_s[cell], share) for cell, share in ends)
+    else:
+        between = _sum_squared_shares(model.compute_interval_variance(interval_s), sample_s, start_s, end_s)
+        between += model.slope_variance * np.median(interval_s) ** 4 / 72.0
+    scale = estimate_local_scale(model, signal, steady, start_ns, end_ns)
+    return scale * between, error + _estimate_rounding(signal, start_ns, end_ns)
 
 
-def _is_inside(at_ns: Stamps, span_ns: Stamps, edge_ns: int) -> NDArray[np.bool_]:
-    begun = np.searchsorted(span_ns[:, 0] + edge_ns, at_ns, side="right")
-    ended = np.searchsorted(span_ns[:, 1] - edge_ns, at_ns, side="left")
-    inside: NDArray[np.bool_] = begun > ended
-    return inside
+def _find_cells(at_s: Floats, edge_s: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Return the cell between edges, (N + 1,), in which each time lies, and the share of the cell before the time, shape (M,)."""
+    place = np.interp(at_s, edge_s, np.arange(len(edge_s)))
+    cell = np.minimum(place.astype(np.int64), len(edge_s) - 2)
+    return cell, place - cell
+
+
+def _sum_squared_shares(variance: Floats, edge_s: Floats, start_s: Floats, end_s: Floats) -> Floats:
+    """Return the sum of variances of cells, (N,), each times the square of the share of the cell that a span covers, shape (M,)."""
+    (first, begin), (last, end) = (_find_cells(at_s, edge_s) for at_s in (start_s, end_s))
+    sums = np.add.reduceat(variance, np.column_stack((first, last)).ravel())[::2] - variance[first]
+    divided = variance[first] * (1.0 - begin) ** 2 + variance[last] * end**2
+    return np.where(first < last, sums + divided, variance[first] * (end - begin) ** 2)
 
 
 def _estimate_rounding(signal: Samples, start_ns: Stamps, end_ns: Stamps) -> Floats:
     """Return the variance of a signal that stays on one level of its resolution, shape (M,): all its samples have one error."""
-    changes = np.concatenate(([0], np.cumsum(np.diff(signal.value) != 0)))
-    first, last = (np.clip(np.searchsorted(signal.stamp_ns, at) - 1, 0, len(changes) - 1) for at in (start_ns, end_ns))
-    duration_s = (end_ns - start_ns) * _NS
-    variance: Floats = (estimate_resolution(signal) * duration_s) ** 2 / 12.0 / (1 + changes[last] - changes[first])
-    return variance
+    changes = np.append(0, np.cumsum(np.diff(signal.value) != 0))
+    first, last = (changes[np.maximum(np.searchsorted(signal.stamp_ns, at) - 1, 0)] for at in (start_ns, end_ns))
+    return np.asarray((estimate_resolution(signal) * (end_ns - start_ns) * _NS) ** 2 / 12.0 / (1 + last - first))
 
 
-def _process_variance(
-    model: SignalModel, stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, averaged: bool
-) -> Floats:
-    """Return the double integral of e K e over each span, on a grid over all samples that it uses, shape (M,)."""
-    first, last = _find_first_and_last(stamp_ns, start_ns, end_ns)
-    zero = stamp_ns[first]
-    end_s, last_s = _compute_seconds(end_ns, zero), _compute_seconds(stamp_ns[last], zero)
-    step_s = np.maximum(last_s, end_s) / (_NODES - 1)
-    edge_s: Floats = (np.arange(_NODES + 1) - 0.5) * step_s[:, None]
-    mass = -_integrate_overlap(edge_s, _compute_seconds(start_ns, zero), end_s)
-    if averaged:
-        mass += _mean_up_to(edge_s, stamp_ns, end_ns, zero) - _mean_up_to(edge_s, stamp_ns, start_ns, zero)
-    else:
-        span, sample, weight_s = _compute_weights_s(stamp_ns, start_ns, end_ns)
-        place = np.clip(_compute_seconds(stamp_ns[sample], zero[span]) / step_s[span], 0.0, _NODES - 1.0)
-        node = np.minimum(place.astype(np.int64), _NODES - 2)
-        np.add.at(mass, (span, node), weight_s * (1.0 - (place - node)))
-        np.add.at(mass, (span, node + 1), weight_s * (place - node))
-    pairs = np.fft.irfft(np.abs(np.fft.rfft(mass, 2 * _NODES, axis=1)) ** 2, axis=1)[:, :_NODES]
-    pairs[:, 1:] *= 2.0
-    lag_s: Floats = np.arange(_NODES) * step_s[:, None]
-    variance: Floats = np.sum(pairs * model.covariance(lag_s), axis=1)
-    return np.maximum(variance, 0.0)
-
-
-def _compute_seconds(at_ns: Stamps, zero_ns: Stamps) -> Floats:
-    return (at_ns - zero_ns).astype(np.float64) * _NS
-
-
-def _mean_up_to(edge_s: Floats, stamp_ns: Stamps, at_ns: Stamps, zero_ns: Stamps) -> Floats:
-    """Return how much every cell counts in the sum of means up to a time, [s], shape (M, C): a divided period counts by its share."""
-    right = np.clip(np.searchsorted(stamp_ns, at_ns, side="left"), 1, len(stamp_ns) - 1)
-    before_s, after_s, at_s = (
-        _compute_seconds(each, zero_ns) for each in (stamp_ns[right - 1], stamp_ns[right], at_ns)
-    )
-    share: Floats = np.clip((at_s - before_s) / (after_s - before_s), 0.0, 1.0)
-    return _integrate_overlap(edge_s, edge_s[:, 0], before_s) + share[:, None] * _integrate_overlap(
-        edge_s, before_s, after_s
-    )
-
-
-def _integrate_overlap(edge_s: Floats, low_s: Floats, high_s: Floats) -> Floats:
-    """Return how much of each cell between edges, shape (M, C + 1), lies between two times, [s], shape (M, C)."""
-    covered: Floats = np.diff(np.clip(edge_s, low_s[:, None], np.maximum(low_s, high_s)[:, None]), axis=1)
-    return covered
-
-
-def _find_first_and_last(
-    stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first and last sample that each span uses, shape (M,): one beyond either end where there is one."""
-    first = np.clip(np.searchsorted(stamp_ns, start_ns, side="right") - 1, 0, len(stamp_ns) - 2)
-    return first, np.clip(np.searchsorted(stamp_ns, end_ns, side="left"), first + 1, len(stamp_ns) - 1)
-
-
-def sum_squared_weights(stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, averaged: bool) -> Floats:
-    """Return the sum of the squared weights that samples have in the integral over each span, [s²], shape (M,)."""
-    span, _, weight_s = _compute_weights_s(stamp_ns, start_ns, end_ns, averaged=averaged)
-    total: Floats = np.bincount(span, weight_s**2, minlength=len(start_ns)).astype(np.float64)
-    return total
-
-
-def _compute_weights_s(
-    stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, averaged: bool = False
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-    """Return span, sample and weight [s] of every sample that a span uses, each of shape (W,).
-
-    The weight is the integral over the span of the sample's hat function, or, if averaged, of the period that ends at it.
-    """
-    t = (stamp_ns - stamp_ns[0]) * _NS
-    start, end = (start_ns - stamp_ns[0]) * _NS, (end_ns - stamp_ns[0]) * _NS
-    first, last = _find_first_and_last(stamp_ns, start_ns, end_ns)
-    count = last - first + 1
-    span = np.repeat(np.arange(len(start)), count)
-    sample = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - first, count)
-    integral = _integrate_period if averaged else _integrate_hat
-    return span, sample, integral(t, sample, end[span]) - integral(t, sample, start[span])
-
-
-def _integrate_period(t: Floats, sample: NDArray[np.int64], until: Floats) -> Floats:
-    """Return how much of the period that ends at each sample lies before a time, [s]."""
-    before = t[np.maximum(sample - 1, 0)]
-    return np.clip(until - before, 0.0, t[sample] - before)
-
-
-def _integrate_hat(t: Floats, sample: NDArray[np.int64], until: Floats) -> Floats:
-    """Return the integral of each sample's hat function up to a time, [s]."""
-    left, right = t[np.maximum(sample - 1, 0)], t[np.minimum(sample + 1, len(t) - 1)]
-    rise, fall = t[sample] - left, right - t[sample]
-    up, down = np.clip(until - left, 0.0, rise), np.clip(until - t[sample], 0.0, fall)
-    rising = np.divide(up**2, 2.0 * rise, out=np.zeros_like(up), where=rise > 0)
-    falling = down - np.divide(down**2, 2.0 * fall, out=np.zeros_like(down), where=fall > 0)
-    integral: Floats = rising + falling
-    return integral
-
-
-Mask = NDArray[np.bool_]
-
-
-_ROUGH_TAU = (0.1, 1.0 / 3.0, 1.0, 3.0, 9.0, 27.0)
-"""Correlation times tried, in sampling periods; what changes within less than one looks like independent errors, unless these are known."""
-_SMOOTH_TAU = (1.0, 3.0, 9.0, 27.0)
-_SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # of second differences, in samples: about two an octave
-_LONGEST_S = 5.0  # of a spacing: what changes more slowly a segment of a second or two follows exactly
-_FEWEST = 20  # second differences at a spacing: their mean square is known to a third
-_LOCAL_NS = 2_000_000_000  # a drive changes within seconds, and a current's scatter wants some samples
-_PRIOR_SAMPLES = 4.0  # that the whole record counts for beside those near a segment
-_CALM_S, _CALM_SAMPLES = 1.5, 8  # shorter than a halt, longer than what vibration correlates over
-_FEWEST_STILL = 8
-_MOST_OF_CALMEST = 2.0
-"""A stationary scatter above this, relative to the calmest spans, is more than the error of samples."""
-_NOT_NOISE = 16.0
-"""A square beyond so many variances is no noise: of a normal variate one in 16,000."""
-_SIEVES = 5
-_OVERLAP_NODES = 24  # of the overlap of two periods
+_TAU = np.array([0.1, 1.0 / 3.0, 1.0, 3.0, 9.0, 27.0, 1.5, 4.5, 13.5])
+"""Correlation times of exponentials, in sampling periods."""
+_PROCESSES = np.vstack((np.eye(6, 9), 2.0 * np.eye(3, 9, 3) - np.eye(3, 9, 6)))
+"""Covariances of unit variance by exponentials: six are rough, three smooth, 2 exp(-d / tau) - exp(-2 d / tau)."""
+_SLOPES = np.append(np.zeros(6), 2.0 / _TAU[3:6] ** 2)
+"""Variance of the slopes of the smooth processes. By Euler and Maclaurin they add h⁴ / 72 of it to the error of an integral."""
+_SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+"""Spacings of second differences, in samples: about two an octave."""
+_FEWEST = 20
+"""Fewest second differences at a spacing: their mean square is known to a third."""
+_LOCAL_NS, _PRIOR_SAMPLES, _MIN_SCALE = 2_000_000_000, 4.0, 0.05
+"""The size of the processes near a span: time before and after it [ns], weight of the record beside the samples there, smallest value."""
+_CALM_S, _CALM_SAMPLES = 1.5, 8
+"""Length of a calm section [s], and its fewest samples: shorter than a halt, longer than what vibration correlates over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,194 +170,111 @@ class SignalModel:
 
     Attributes
     ----------
-    period_s : [s], between samples.
     error_variance : independent error of each sample.
-    variance, tau_s, smooth : of each process, shape (J,), with its correlation time [s] and family.
-    curvature_variance : expected variance of a sample against its neighbours that the processes make (`compute_curvature` less the errors).
+    variance, tau_s : of each exponential of the processes' covariance, shape (K,), with its correlation time [s].
+    curvature_variance, slope_variance : of the processes, in the mean of `compute_curvature`, and of the slopes of smooth ones, per s².
     """
 
-    period_s: float
     error_variance: float
     variance: Floats
     tau_s: Floats
-    smooth: Mask
     curvature_variance: float
+    slope_variance: float
 
-    def covariance(self, lag_s: Floats) -> Floats:
-        """Return the covariance of the processes at each lag [s], any shape."""
-        total = np.zeros_like(lag_s)
-        for variance, tau_s, smooth in zip(self.variance, self.tau_s, self.smooth, strict=True):
-            total += variance * _estimate_correlation(lag_s / tau_s, smooth=bool(smooth))
-        return total
+    def compute_interval_variance(self, interval_s: Floats) -> Floats:
+        """Return the variance of the processes' integrals over intervals [s], shape (N,), less those by their samples."""
+        half = interval_s / (2.0 * self.tau_s[:, None])
+        return np.maximum(interval_s**2 * (self.variance @ (1.0 / np.tanh(half) - 1.0 / half)), 0.0)
+
+    def compute_divided_variance(self, period_s: Floats, share: Floats) -> Floats:
+        """Return the variance of the processes' integrals over a share of periods [s], shape (M,), less the share of their means."""
+        before, after = (part * period_s / self.tau_s[:, None] for part in (share, 1.0 - share))
+        squares = (1.0 - share) ** 2 * (before + np.expm1(-before)) + share**2 * (after + np.expm1(-after))
+        products = share * (1.0 - share) * np.expm1(-before) * np.expm1(-after)
+        return np.maximum(2.0 * (self.variance * self.tau_s**2) @ (squares - products), 0.0)
 
 
 def fit_signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
-    """Return the model of a signal by its ``steady`` samples, shape (N,).
+    """Return the model of a signal by its ``steady`` samples, shape (N,), or by all where these are too few.
 
     ``still`` are the samples of a stationary robot, shape (N,), where all scatter is error. Of ``averaged`` signals a sample is the mean
     since the one before it.
     """
-    period_s = float(np.median(np.diff(signal.stamp_ns))) * _NS
+    period_s, size = compute_median_period_s(signal), np.zeros(len(_PROCESSES))
     spacing, seen, weight = _compute_second_differences(signal, steady, period_s)
     if not len(spacing):
-        everywhere = np.ones_like(steady)
-        spacing, seen, weight = _compute_second_differences(signal, everywhere, period_s)
-    tau_s = period_s * np.array(_ROUGH_TAU + _SMOOTH_TAU)
-    smooth = np.arange(len(tau_s)) >= len(_ROUGH_TAU)
+        spacing, seen, weight = _compute_second_differences(signal, np.ones_like(steady), period_s)
     if not len(spacing):
-        return SignalModel(period_s, 0.0, np.zeros(len(tau_s)), tau_s, smooth, 0.0)
-    made = np.stack(
-        [
-            _predict_second_differences(spacing, period_s, tau, smooth=bool(kind), averaged=averaged)
-            for tau, kind in zip(tau_s, smooth, strict=True)
-        ]
-    )
-    error, calmest = _estimate_stationary_error(signal, still), estimate_calmest_variance(signal, period_s)
-    if averaged or error is not None:
-        error = calmest if error is None else min(error, _MOST_OF_CALMEST * calmest)
-    variance = np.zeros(len(tau_s))
+        return SignalModel(0.0, np.zeros(len(_TAU)), period_s * _TAU, 0.0, 0.0)
+    shown = _PROCESSES @ _predict_second_differences(spacing, averaged=averaged)
+    error = _estimate_error_variance(signal, still, period_s, averaged=averaged)
     if error is None:
-        slow = tau_s >= period_s
-        *slowly, error = _fit_sizes(np.vstack((made[slow], np.ones(len(spacing)))), seen, weight)
-        variance[slow] = slowly
+        columns = np.vstack((np.ones(len(spacing)), shown[2:]))  # faster processes look like independent errors
+        error, *size[2:] = nnls((columns * weight).T, seen * weight)[0].tolist()
     else:
         error = min(error, float(seen.min()))
-        variance[:] = _fit_sizes(made, seen - error, weight)
-    return SignalModel(period_s, error, variance, tau_s, smooth, float(variance @ made[:, 0]))
+        size = nnls((shown * weight).T, (seen - error) * weight)[0]
+    slope_variance = float(size @ _SLOPES) / period_s**2
+    return SignalModel(error, size @ _PROCESSES, period_s * _TAU, float(size @ shown[:, 0]), slope_variance)
 
 
 def estimate_local_scale(model: SignalModel, signal: Samples, steady: Mask, start_ns: Stamps, end_ns: Stamps) -> Floats:
-    """Return how large the processes' variance is near each span against the record's, [1], shape (M,).
+    """Return the ratio of the processes' variance near each span to that of the record, shape (M,).
 
-    Taken over the steady samples from 2 s before to 2 s after the span, with the whole record as a prior of 4 samples.
+    Near are the steady samples from 2 s before to 2 s after the span; the whole record counts as 4 samples.
     """
-    if model.curvature_variance <= 0.0 or len(signal.value) < 3:
+    if model.curvature_variance <= 0.0:
         return np.ones(len(start_ns))
-    counted = steady[1:-1]
-    if not counted.any():
-        counted = np.ones_like(counted)
-    off = np.where(counted, compute_curvature(signal), 0.0)
-    sums, counts = (np.concatenate(([0.0], np.cumsum(each))) for each in (off, counted))
-    inner = signal.stamp_ns[1:-1]
-    first = np.searchsorted(inner, start_ns - _LOCAL_NS, side="left")
-    last = np.searchsorted(inner, end_ns + _LOCAL_NS, side="right")
+    near, used = signal.stamp_ns[1:-1], steady[1:-1]
+    sums, counts = (np.append(0.0, np.cumsum(each)) for each in (compute_curvature(signal) * used, used))
+    first, last = np.searchsorted(near, start_ns - _LOCAL_NS), np.searchsorted(near, end_ns + _LOCAL_NS, side="right")
     expected = model.curvature_variance + model.error_variance
     here = (sums[last] - sums[first] + _PRIOR_SAMPLES * expected) / (counts[last] - counts[first] + _PRIOR_SAMPLES)
-    scale: Floats = np.maximum(here - model.error_variance, 0.05 * model.curvature_variance) / model.curvature_variance
-    return scale
+    return np.asarray(np.maximum((here - model.error_variance) / model.curvature_variance, _MIN_SCALE))
 
 
 def compute_curvature(signal: Samples) -> Floats:
     """Return each inner sample's squared deviation from the line through its neighbours, as the variance of one sample, shape (N - 2,)."""
-    stamp_ns, value = signal.stamp_ns, signal.value
-    right = (stamp_ns[1:-1] - stamp_ns[:-2]) / (stamp_ns[2:] - stamp_ns[:-2])
-    off_line = value[1:-1] - (1.0 - right) * value[:-2] - right * value[2:]
-    single: Floats = off_line**2 / (1.0 + right**2 + (1.0 - right) ** 2)
-    return single
+    t, x = signal.stamp_ns, signal.value
+    right = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+    off_line = x[1:-1] - (1.0 - right) * x[:-2] - right * x[2:]
+    return np.asarray(off_line**2 / (1.0 + right**2 + (1.0 - right) ** 2))
 
 
-def _fit_sizes(made: Floats, seen: Floats, weight: Floats) -> list[float]:
-    """Return the non-negative size of each row of ``made``, shape (J, S), whose sum is nearest to ``seen``."""
-    fitted: list[float] = solve_non_negative((made * weight).T, seen * weight).tolist()
-    return fitted
+def _estimate_error_variance(signal: Samples, still: Mask, period_s: float, *, averaged: bool) -> float | None:
+    """Return the variance of a sample against its neighbours: the median of calm sections of a stationary robot.
 
-
-def _estimate_stationary_error(signal: Samples, still: Mask) -> float | None:
-    """Return the variance of a sample while the robot is stationary, in the signal's unit squared; None where it hardly is.
-
-    It is that of the squared differences of successive samples without those beyond four deviations, which a motor makes that starts or
-    stops; repeated from their median, which is a multiple of the record's resolution.
-    """
-    if still.sum() <= _FEWEST_STILL:
-        return None
-    square = np.diff(signal.value[still]) ** 2
-    variance = float(np.median(square)) / MEDIAN_OF_SQUARES
-    for _ in range(_SIEVES):
-        variance = float(np.mean(square[square <= _NOT_NOISE * variance]))
-    return variance / 2.0
-
-
-def estimate_calmest_variance(signal: Samples, period_s: float) -> float:
-    """Return the variance of a sample against its neighbours where the record is calmest, as while standing, in its unit squared.
-
-    Of all stretches of 1.5 s, and of 8 samples at least, one in twenty is calmer.
+    If no section of the record is stationary throughout, it is that of the calmest twentieth of means, and unknown of samples.
     """
     count = max(_CALM_SAMPLES, round(_CALM_S / period_s))
-    if len(signal.value) < count + 2:
-        return 0.0
-    sums = np.concatenate(([0.0], np.cumsum(compute_curvature(signal))))
-    return float(np.quantile((sums[count:] - sums[:-count]) / count, 0.05))
+    stationary = still[:-2] & still[1:-1] & still[2:]
+    squares, is_still = (np.append(0.0, np.cumsum(each)) for each in (compute_curvature(signal), stationary))
+    means = (squares[count:] - squares[:-count]) / count
+    calm = means[is_still[count:] - is_still[:-count] == count]
+    if calm.size:
+        return float(np.median(calm))
+    return float(np.quantile(means, 0.05)) if averaged and means.size else None
 
 
-def _compute_second_differences(signal: Samples, steady: Mask, period_s: float) -> tuple[Stamps, Floats, Floats]:
-    """Return spacings, the variance that second differences at each show for one sample, and the weight of each."""
-    found = []
-    x, t = signal.value, signal.stamp_ns
-    unsteady = np.concatenate(([0], np.cumsum(~steady)))
-    for m in _SPACINGS:
-        if m * period_s > _LONGEST_S or len(x) <= 2 * m:
-            break
+def _compute_second_differences(signal: Samples, steady: Mask, period_s: float) -> Floats:
+    """Return spacings, the variance that second differences at each show for one sample, and the weight of each, shape (3, S)."""
+    found, x, t = list[tuple[int, float, float]](), signal.value, signal.stamp_ns
+    unsteady = np.append(0, np.cumsum(~steady))
+    for m in (each for each in _SPACINGS if 2 * each < len(x)):
         whole = unsteady[2 * m + 1 :] == unsteady[: -2 * m - 1]
         whole &= np.abs((t[2 * m :] - t[: -2 * m]) * _NS - 2 * m * period_s) < 0.5 * period_s
         if whole.sum() < _FEWEST:
             break
-        square = (x[: -2 * m] - 2.0 * x[m:-m] + x[2 * m :])[whole] ** 2 / 6.0
-        found.append((m, float(square.mean()), float(np.sqrt(whole.sum() / m))))
-    spacing, seen, weight = (np.array(each) for each in zip(*found, strict=True)) if found else (np.empty(0),) * 3
-    return spacing.astype(np.int64), seen, np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0.0)
+        level = float(np.mean((x[: -2 * m] - 2.0 * x[m:-m] + x[2 * m :])[whole] ** 2)) / 6.0
+        found.append((m, level, float(np.sqrt(whole.sum() / m)) / level if level > 0.0 else 0.0))
+    return np.array(found).reshape(-1, 3).T
 
 
-def _predict_second_differences(
-    spacing: Stamps, period_s: float, tau_s: float, *, smooth: bool, averaged: bool
-) -> Floats:
-    """Return what second differences show of a process of unit variance, as the variance of one sample, shape (S,)."""
-    lag_s = np.stack((0 * spacing, spacing, 2 * spacing)).astype(np.float64) * period_s
-    each: Floats
-    if averaged:  # covariance of means: that of the process, weighted with the overlap of two periods
-        u = (np.arange(-_OVERLAP_NODES, _OVERLAP_NODES) + 0.5) / _OVERLAP_NODES
-        weight = (1.0 - np.abs(u)) / np.sum(1.0 - np.abs(u))
-        apart: Floats = np.abs(lag_s[..., None] + u * period_s)
-        each = _estimate_correlation(apart / tau_s, smooth=smooth) @ weight
-    else:
-        each = _estimate_correlation(lag_s / tau_s, smooth=smooth)
-    expected: Floats = (6.0 * each[0] - 8.0 * each[1] + 2.0 * each[2]) / 6.0
-    return expected
-
-
-def _estimate_correlation(lag: Floats, *, smooth: bool) -> Floats:
-    correlation: Floats = (1.0 + lag) * np.exp(-lag) if smooth else np.exp(-lag)
-    return correlation
-
-
-def solve_non_negative(made: Floats, seen: Floats) -> Floats:
-    """Return the sizes, none negative, shape (J,), with which the columns of ``made`` (S, J) add up nearest to ``seen`` (S,).
-
-    Lawson and Hanson, Solving Least Squares Problems (1974), algorithm 23.10 (NNLS): columns that would lessen the residual most become
-    free one by one; what would become negative stops at zero.
-    """
-    size, free, vain = np.zeros(made.shape[1]), np.zeros(made.shape[1], np.bool_), np.zeros(made.shape[1], np.bool_)
-    rounding = 10.0 * np.finfo(np.float64).eps * np.linalg.norm(made, axis=0) * np.linalg.norm(seen)
-    for _ in range(3 * made.shape[1]):
-        gain = np.where(free | vain, -np.inf, made.T @ (seen - made @ size))
-        best = int(np.argmax(gain))
-        if gain[best] <= rounding[best] or free.sum() == len(seen):
-            break
-        free[best] = True
-        tried = _solve_subset(made, seen, free)
-        if tried[best] <= 0.0:  # its gain was rounding
-            free[best], vain[best] = False, True
-            continue
-        while (negative := free & (tried <= 0.0)).any():
-            share = size[negative] / (size[negative] - tried[negative])
-            size = size + share.min() * (tried - size)
-            size[np.flatnonzero(negative)[share == share.min()]] = 0.0
-            free &= size > 0.0
-            tried = _solve_subset(made, seen, free)
-        size, vain = tried, np.zeros_like(vain)
-    return size
-
-
-def _solve_subset(made: Floats, seen: Floats, free: NDArray[np.bool_]) -> Floats:
-    sizes = np.zeros(made.shape[1])
-    sizes[free] = np.linalg.lstsq(made[:, free], seen, rcond=None)[0]
-    return sizes
+def _predict_second_differences(spacing: Floats, *, averaged: bool) -> Floats:
+    """Return what second differences show of each process of unit variance, as the variance of one sample, shape (J, S)."""
+    rate = 1.0 / _TAU[:, None]
+    apart, twice, own = np.exp(-rate * spacing), np.exp(-2.0 * rate * spacing), np.ones_like(rate)
+    if averaged:  # covariances of means over a period
+        gain = (2.0 * np.sinh(rate / 2.0) / rate) ** 2
+        apart, twice, own = gain * apart, gain * twice, 2.0 * (rate + np.expm1(-rate)) / rate**2
+    return np.asarray((6.0 * own - 8.0 * apart + 2.0 * twice) / 6.0)

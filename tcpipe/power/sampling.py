@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.rails import Samples
+from tcpipe.power.rails import Rail, Rule, Samples, integrate_energy
 from tcpipe.tables.facts import Smoothing
 from tcpipe.tables.findings import read_threshold
 
@@ -304,3 +304,27 @@ def estimate_smoothing_variance(power: Samples, steady: NDArray[np.bool_], smoot
         used = earlier_s > 0.0
     share = (smoothing.before_s**3 + smoothing.after_s**3) / (2.0 * smoothing.width_s**3)
     return share * float(np.mean(np.square(change[used]))) if used.any() else 0.0
+
+
+_USUAL_DELAY_S = 0.03
+"""σ of the delay of power where clocks are synchronised [s]: a period of 20 Hz or less."""
+
+
+def estimate_delay_variance(
+    rails: list[Rail], start_ns: Stamps, end_ns: Stamps, delay_s: float, std_s: float, *, rule: Rule
+) -> Floats:
+    """Return the mean square of what a delay of power changes of each span's energy [J²], shape (M,); 0 where it is unknown.
+
+    The energies of two spans in a row change by opposite amounts at their border: over a path the error averages out. The mean is over
+    the normal distribution of the delay (``delay_s``, ``std_s`` [s]), by Gauss and Hermite's three nodes. A delay inside 2σ is weighted
+    with the usual delay of a synchronised driver.
+    """
+    if abs(delay_s) < 2.0 * std_s:
+        weight = _USUAL_DELAY_S**2 / (_USUAL_DELAY_S**2 + std_s**2)
+        delay_s, std_s = weight * delay_s, weight**0.5 * std_s
+    stamped = integrate_energy(rails, start_ns, end_ns, rule=rule)
+    squares = []
+    for node_s in delay_s + std_s * np.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]):
+        shift_ns = round(node_s * 1e9)
+        squares.append((integrate_energy(rails, start_ns + shift_ns, end_ns + shift_ns, rule=rule) - stamped) ** 2)
+    return np.nan_to_num(np.average(squares, axis=0, weights=[1 / 6, 2 / 3, 1 / 6]))

@@ -23,7 +23,7 @@ from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, find_common_scale_std
-from tcpipe.power.noise import estimate_delay_variance, estimate_energy_noise, estimate_resolution
+from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import (
     IdlePower,
     Rail,
@@ -33,6 +33,7 @@ from tcpipe.power.rails import (
     estimate_idle_power,
     integrate_energy,
 )
+from tcpipe.power.sampling import estimate_delay_variance
 from tcpipe.recipe import LabelConfig
 from tcpipe.robots import Robot
 from tcpipe.stages.label_motion import (

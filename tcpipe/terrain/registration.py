@@ -1,12 +1,10 @@
-"""Registration of a map to a track, by the heights of the ground under the track.
+"""Registration of a map to tracks by the heights of the ground under them: the horizontal shift, and the unit of the map's heights.
 
-A track's heights and the map's differ by a constant (ellipsoid against geoid, the robot's own height) without information. The rest is
-the shape of the ground; the horizontal shift at which the two shapes agree best is searched over a small window, as in terrain-aided
-navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary the shift is
-not observable, and stays zero. The regression of the track's heights on the map's gives the unit of the map, such as feet.
-
-The shift is fitted together with a tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, and from
-the misfit itself: along slopes that are noisy a step is too short.
+Heights of track and map differ by a constant (geoid, the robot's own height). The rest is the shape of the ground. The shift at which the
+two shapes agree best is searched on a lattice, as in terrain-aided navigation (Hollowell 1990; Nuth & Kääb 2011), and refined by a
+paraboloid through the squared misfits. A tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, are
+fitted with it. Along directions in which the ground does not vary the shift is not observable, and stays zero. All uncertainties are
+by a delete-one-block jackknife, since errors of GNSS are alike over seconds, and those of the map over metres.
 """
 
 from __future__ import annotations
@@ -16,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
-from scipy.optimize import brentq
+from scipy.ndimage import map_coordinates, minimum_filter
+from scipy.optimize import brentq, least_squares
 from scipy.stats import chi2
 
 from tcpipe.robust import estimate_robust_std
@@ -27,70 +25,46 @@ from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_wi
 
 FloatArray = NDArray[np.float64]
 Rows = NDArray[np.int64]
-Points = NDArray[np.bool_]
 
-REACH_M = 4.0
-"""Shifts are searched this far each way [m]: one of 3.5 m is not at the edge."""
-
-KNOWN_M = 0.25
-"""A direction along which the shift's standard deviation is larger is not determined by the ground [m]."""
-
-_STEP_M = 0.25
-_SPACING_M = 0.5
-_MOST_POINTS, _MOST_TOGETHER = 1_200, 6_000
-"""Most points of one track, and of several."""
-_FEWEST_POINTS = 60
-_BLOCKS = 12
-"""Stretches left out in turn (delete-one-block jackknife): errors of GNSS and of the map are alike over metres."""
-_CHI2_999 = 13.82
-"""99.9 % of χ² with two degrees of freedom."""
-_AGREE, _SCATTER_QUANTILE = 0.999, 0.1
-"""Runs' own shifts scatter about the common one by at most the 90 % upper limit."""
-_OUTLIER = 3.5
-_SIGMAS = 5.0
-"""Least fall of the misfit in its standard deviations: the best of 600 shifts falls by three by chance."""
-_LEAST_GAIN = -2.0 * np.log(0.9)
-"""A shift that leaves more than 90 % of the misfit is not what was wrong."""
-_RIVAL_SIGMAS = 3.0
-_APART_M = 0.75
-"""Distance [m] at which ground that fits nearly as well makes the place of the track ambiguous."""
-_RIDGE = 1e-12
-_FLAT = 1e-4
-"""The misfits of shifts rise so little along one direction, compared with the other, that the ground does not vary along it."""
-_FEW_BLOCKS = 1.26
-"""Factor of a variance from so few blocks, so that two standard deviations cover 95 % (square of the ratio of Student's t and normal)."""
-_ROUNDS, _REWEIGHTINGS, _LEAST_MISFIT_M = 6, 20, 0.01
-_DRIFT_M = 25.0
-"""Stretches of path in which the track's heights may be off by a constant of their own [m]: those of GNSS drift over tens of seconds."""
-_EDGE_M = 0.75 * _STEP_M
-"""Where the best shift is so far from the best one inside the window's edge, the true one may be larger [m]."""
-_NEAR = 2
-"""A paraboloid is fitted to the misfits of shifts that are so many steps each way from the best."""
-_CLIFF_M = 1.0
-"""Ground that varies more among these shifts is steeper than what is driven on [m]."""
+REACH_M, KNOWN_M = 4.0, 0.25
+"""Shifts are searched this far each way; a direction is not determined if the shift's standard deviation along it is larger [m]."""
+_STEP_M, _NEAR = 0.25, 2
+"""Step of the lattice of shifts [m], and steps each way from the best shift through which the paraboloid is fitted."""
+_SHIFT_M = np.arange(-round(REACH_M / _STEP_M), round(REACH_M / _STEP_M) + 1) * _STEP_M
+_LATTICE_M = np.stack(np.meshgrid(_SHIFT_M, _SHIFT_M), axis=-1)
+"""Shifts to the east and north, by row (north) and column (east), (K, K, 2)."""
+_MIDDLE = len(_SHIFT_M) // 2, len(_SHIFT_M) // 2
 _NORTH_M, _EAST_M = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1) * _STEP_M
 _PARABOLOID = np.linalg.pinv(
     np.stack([np.ones_like(_EAST_M), _EAST_M, _NORTH_M, _EAST_M**2, _EAST_M * _NORTH_M, _NORTH_M**2], axis=1)
 )
+_SPACING_M, _DRIFT_M, _CLIFF_M = 0.5, 25.0, 1.0
+"""Spacing of points; path over which the track's heights have one error; relief among near shifts that no robot drives on [m]."""
+_FEWEST_POINTS, _MOST_POINTS, _MOST_TOGETHER = 60, 1_200, 6_000
+"""Fewest points, and most of one track and of several."""
+_BLOCKS, _FEW_BLOCKS = 12, 1.26
+"""Blocks of the jackknife, and factor of a variance from so few (square of the ratio of Student's t and normal at 95 %)."""
+_SIGMAS, _RIVAL_SIGMAS, _OUTLIER = 5.0, 3.0, 3.5
+"""Standard deviations by which a shift lowers the misfit, and by which it must be better than a rival; of an outlier."""
+_APART_M, _EDGE_M = 0.75, 0.75 * _STEP_M
+"""Least distances of a rival from the best shift, and of the best shift beyond the lattice's edge from the best one inside [m]."""
+_CHI2_999, _AGREE, _SCATTER_QUANTILE = 13.82, 0.999, 0.1
+"""99.9 % of χ² with two degrees of freedom; probabilities that runs agree, and below their scatter."""
+_LEAST_GAIN = -2.0 * np.log(0.9)
+"""A shift that leaves more than 90 % of the misfit is not what was wrong."""
+_FLAT, _RIDGE = 1e-4, 1e-12
+"""Relative curvature of the misfit along a direction in which the ground does not vary; smallest divisor."""
 _UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
 _UNITS |= {1.0 / metres: "m" for metres in _UNITS}
 """Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
 _MAX_UNIT_ERROR = 0.07
-
-_KNOWN_SCALE = 0.03
-_EXPLAINED = 0.9
-"""A scale is known if its standard deviation is 3 % and it explains nine tenths of the variance of the track's heights."""
-
-_MAX_WRONG_STD, _MIN_WRONG_EXPLAINED = 0.1, 0.7
-"""Relative standard deviation and explained share from which a scale far from one is certain."""
+_KNOWN_SCALE, _EXPLAINED, _MAX_WRONG_STD, _MIN_WRONG_EXPLAINED = 0.03, 0.9, 0.1, 0.7
+"""Relative standard deviation and explained share from which a scale is compared with one, and from which one far from it is certain."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeightScale:
-    """Metres that a track rises where the map rises by one, its standard deviation, and the share of the track's variance so explained.
-
-    Where the ground is even the deviation is huge; where the map holds what the track does not (trees), little is explained.
-    """
+    """Metres that a track rises where the map rises by one, its standard deviation, and the explained share of the track's variance."""
 
     value: float
     std: float
@@ -102,7 +76,7 @@ class HeightScale:
         return self.std < _KNOWN_SCALE * max(self.value, 1.0) and self.explained > _EXPLAINED
 
     def is_wrong(self) -> bool:
-        """Whether the map's heights are in another unit, or scaled: noise of the map lowers the value, but not below ``explained``."""
+        """Return whether the map's heights are in another unit, or scaled: noise of the map lowers the value to ``explained`` at most."""
         if self.std > _MAX_WRONG_STD * self.value or self.explained < _MIN_WRONG_EXPLAINED:
             return False
         most, margin = read_threshold("map-height-scale", "max_factor"), 3.0 * self.std
@@ -114,39 +88,24 @@ class HeightScale:
         return next((unit for scale, unit in _UNITS.items() if abs(self.value / scale - 1.0) < error), "")
 
     def is_off(self) -> bool:
-        """Whether map and track surely do not rise alike."""
-        return self.is_known and abs(self.value - 1.0) > max(
-            _SIGMAS * self.std, read_threshold("map-height-scale", "min_error_fraction")
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class _Points:
-    """Positions on the map, (N, 2) [m], and which track each is of, (N,), rising."""
-
-    xy_m: FloatArray
-    track: Rows
-
-    def select(self, rows: Points) -> _Points:
-        """Return the points that are True in a mask."""
-        return _Points(self.xy_m[rows], self.track[rows])
+        """Return whether map and track surely do not rise alike."""
+        least = read_threshold("map-height-scale", "min_error_fraction")
+        return self.is_known and abs(self.value - 1.0) > max(_SIGMAS * self.std, least)
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """How a map lies against a track.
+    """Shift of a map against a track, and what is left.
 
     ``shift_xy_m`` is what to add to the track's positions to find their ground on the map [m, the map's axes], along determined
-    directions only; ``shift_std_m`` its largest standard deviation along them, NaN where none is determined. ``height_offset_m`` is track
-    minus map; ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left without and with the shift,
-    ``shape_misfit_m`` of what is left with the shift, a tilt and a drift. ``significant``: the shift is not chance. ``at_reach``: the best
-    shift lies at the window's edge, the true one may be larger. ``scale`` is of heights. ``information`` is the inverse of the shift's
+    directions only. ``height_offset_m`` is track minus map. ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left
+    without and with the shift, ``shape_misfit_m`` of what is left with the shift, a tilt and a drift. ``significant``: the shift is not
+    chance. ``at_reach``: the true shift may be beyond the lattice. ``scale`` is of heights. ``information`` is the inverse of the shift's
     covariance, (2, 2) [1/m²], 0 along directions that are not determined.
     """
 
     points: int
     shift_xy_m: tuple[float, float]
-    shift_std_m: float
     height_offset_m: float
     misfit_m: float
     shifted_misfit_m: float
@@ -162,11 +121,16 @@ class Registration:
         return float(np.hypot(*self.shift_xy_m))
 
     @property
+    def shift_std_m(self) -> float:
+        """Largest standard deviation of the shift along determined directions [m], NaN where none is determined."""
+        values = np.linalg.eigvalsh(self.information)
+        return float(max(values[values > 1.0 / REACH_M**2] ** -0.5, default=np.nan))
+
+    @property
     def axis_std_m(self) -> FloatArray:
         """Standard deviations of the shift along both axes [m], NaN unless it is determined in both directions."""
-        if _count_known(self.information) < 2:
-            return np.full(2, np.nan)
-        return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information))))
+        known = _count_known(self.information) > 1
+        return np.sqrt(np.diag(np.linalg.inv(self.information))) if known else np.full(2, np.nan)
 
     @property
     def position_std_m(self) -> float:
@@ -180,55 +144,75 @@ class Registration:
 
 
 def register_tracks(source: MapReader, tracks: Sequence[tuple[FloatArray, FloatArray]]) -> Registration | None:
-    """Find the one horizontal shift at which the map's ground fits the heights of tracks best.
+    """Return the one horizontal shift at which the map's ground fits the heights of tracks best.
+
+    None where fewer than 60 points, half a metre apart, lie well inside the map and on its ground.
 
     Parameters
     ----------
     source : the map.
     tracks : of each track the positions in the map's CRS, in the order driven, shape (N, 2) [m], of which what is not finite or not on the
         map is passed over, and their heights above any surface, shape (N,) [m].
-
-    None where fewer than `_FEWEST_POINTS` points, half a metre apart, lie well inside the map and on its ground.
     """
-    level = choose_level(source, _STEP_M)
-    thinned = thin_tracks(tracks)
-    xy_m, height_m = (np.concatenate([track[part] for track in thinned]) for part in (0, 1))
-    number = np.repeat(np.arange(len(thinned)), [len(track[1]) for track in thinned])
-    at = np.flatnonzero(level.grid.contains(xy_m))
-    steps = round(REACH_M / _STEP_M)
-    shift_m = np.arange(-steps, steps + 1, dtype=np.float64) * _STEP_M
-    ground_m = _sample_heights(level, xy_m[at], shift_m)
+    level, thinned = choose_level(source, _STEP_M), thin_tracks(tracks)
+    xy_m, height_m = (np.concatenate([each[part] for each in thinned]) for part in (0, 1))
+    track = np.repeat(np.arange(len(thinned)), [len(each[1]) for each in thinned])
+    rows = np.flatnonzero(level.grid.contains(xy_m))
+    ground_m = _sample_heights(level, xy_m[rows])
     whole = np.isfinite(ground_m).all(axis=(1, 2))
     if whole.sum() < _FEWEST_POINTS:
         return None
-    at, ground_m = at[whole], ground_m[whole]
-    excess_m, points = ground_m - height_m[at][:, None, None], _Points(xy_m[at], number[at])
-    near, good = _find_ground(excess_m, points)
+    rows, ground_m = rows[whole], ground_m[whole]
+    xy_m, height_m, track = xy_m[rows], height_m[rows], track[rows]
+    excess_m = ground_m - height_m[:, None, None]
+    near, good = _find_ground(excess_m, xy_m, track)
     if near.sum() < _FEWEST_POINTS:
         return None
-    scale = _fit_height_scale(ground_m[near], height_m[at][near], xy_m[at][near])
-    return _refine_shift(excess_m, points, (near, good), shift_m, scale)
+    scale = _fit_height_scale(ground_m[near], height_m[near], xy_m[near])
+    return _refine_shift(excess_m[near], excess_m[good], xy_m[good], track[good], scale)
 
 
-def _find_ground(excess_m: FloatArray, points: _Points) -> tuple[Points, Points]:
+def thin_tracks(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> list[tuple[FloatArray, FloatArray]]:
+    """Return finite points of tracks half a metre of path apart, or further where that would be too many."""
+    finite = [np.isfinite(xy_m).all(axis=1) & np.isfinite(z_m) for xy_m, z_m in tracks]
+    tracks = [(xy_m[used], z_m[used]) for (xy_m, z_m), used in zip(tracks, finite, strict=True)]
+    paths_m = [np.append(0.0, np.cumsum(np.hypot(*np.diff(xy_m, axis=0).T)))[: len(xy_m)] for xy_m, _ in tracks]
+    total_m = sum(path_m[-1] for path_m in paths_m if path_m.size)
+    spacing_m = max(_SPACING_M, total_m / (_MOST_POINTS if len(tracks) == 1 else _MOST_TOGETHER))
+    rows = [np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1] for path_m in paths_m]
+    return [(xy_m[at], z_m[at]) for (xy_m, z_m), at in zip(tracks, rows, strict=True)]
+
+
+def _sample_heights(level: MapReader, xy_m: FloatArray) -> FloatArray:
+    """Return the map's heights at every point moved by every pair of shifts (north, east), shape (N, K, K); NaN without data."""
+    px, offset_px = level.grid.px_from_xy(xy_m), _SHIFT_M / level.grid.pixel_size_m
+    reach_px, found = int(np.ceil(offset_px[-1])) + 2, np.empty((len(xy_m), *2 * _SHIFT_M.shape))
+    for group in group_by_tile(px, level):
+        first, last = (np.floor(ends).astype(int) for ends in (px[group].min(axis=0), px[group].max(axis=0) + 1.0))
+        (col0, row0), (col1, row1) = first - reach_px, last + reach_px
+        window = read_window(level, "height", row0, row1, col0, col1).astype(np.float64)
+        x, y = px[group, 0, None] - col0 + offset_px, px[group, 1, None] - row0 - offset_px  # rows run south
+        places = np.broadcast_arrays(y[:, :, None], x[:, None, :])
+        found[group] = map_coordinates(window, places, order=1)
+    return found + level.height_reference_m
+
+
+def _find_ground(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the points on the map's ground at the shift that fits best, (N,), and those of them that determine a shift.
 
     These are not on cliffs, unless too few are left.
     """
-    middle = excess_m.shape[1] // 2
-    flat_m = excess_m - _fit_tilt(points.xy_m, excess_m[:, middle, middle])[:, None, None]
+    flat_m = excess_m - _fit_tilt(xy_m, excess_m[:, *_MIDDLE])[:, None, None]
     best = _find_least(np.median(np.abs(flat_m - np.median(flat_m, axis=0)), axis=0))
-    for _ in range(_ROUNDS):
-        tilt_m = _fit_tilt(points.xy_m, excess_m[:, *best])
-        left = excess_m[:, *best] - tilt_m
+    for _ in range(6):
+        left = excess_m[:, *best] - _fit_tilt(xy_m, excess_m[:, *best])
         left = np.abs(left - np.median(left))
-        relief_m = np.ptp(_take_near(excess_m, best), axis=(1, 2))
-        # steep ground misfits where the shift is off by a step
-        near = left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)
+        relief_m = np.ptp(excess_m[:, *_select_near(best)], axis=(1, 2))
+        near = left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)  # steep ground misfits by a step
         good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
             return near, near
-        before, best = best, _find_least(_flatten(excess_m[good], points.select(good))[0].var(axis=0))
+        before, best = best, _find_least(_flatten(excess_m[good], xy_m[good], track[good])[0].var(axis=0))
         if best == before:
             break
     return near, good
@@ -236,55 +220,42 @@ def _find_ground(excess_m: FloatArray, points: _Points) -> tuple[Points, Points]
 
 def _fit_tilt(xy_m: FloatArray, excess_m: FloatArray) -> FloatArray:
     """Return the tilt of the plane that leaves the least absolute excess, shape (N,) [m]: a bridge or a tree does not turn it."""
-    columns, weight = np.column_stack([xy_m - xy_m.mean(axis=0), np.ones(len(xy_m))]), np.ones(len(xy_m))
-    for _ in range(_REWEIGHTINGS):
-        fitted = np.linalg.lstsq(columns * weight[:, None], excess_m * weight, rcond=None)[0]
-        weight = 1.0 / np.sqrt(np.abs(excess_m - columns @ fitted) + _LEAST_MISFIT_M)
-    return np.asarray(columns[:, :2] @ fitted[:2])
-
-
-def thin_tracks(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> list[tuple[FloatArray, FloatArray]]:
-    """Return finite points of tracks `_SPACING_M` of path apart, or further where that would be too many."""
-    tracks = [
-        (xy[is_finite], z[is_finite]) for xy, z in tracks for is_finite in (np.isfinite(xy).all(1) & np.isfinite(z),)
-    ]
-    paths_m = [
-        np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])[: len(xy)] for xy, _ in tracks
-    ]
-    total_m = sum(path_m[-1] for path_m in paths_m if path_m.size)
-    spacing_m = max(_SPACING_M, total_m / (_MOST_POINTS if len(tracks) == 1 else _MOST_TOGETHER))
-    rows = [np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1] for path_m in paths_m]
-    return [(xy[at], z[at]) for (xy, z), at in zip(tracks, rows, strict=True)]
-
-
-def _sample_heights(level: MapReader, xy_m: FloatArray, shift_m: FloatArray) -> FloatArray:
-    """Return the map's heights at every point moved by every pair of shifts (north, east), shape (N, K, K); NaN without data."""
-    px = level.grid.px_from_xy(xy_m)
-    offset_px = shift_m / level.grid.pixel_size_m
-    reach_px = int(np.ceil(offset_px[-1])) + 2
-    found = np.empty((len(xy_m), shift_m.size, shift_m.size))
-    for group in group_by_tile(px, level):
-        col0, row0 = np.floor(px[group].min(axis=0)).astype(int) - reach_px
-        col1, row1 = np.floor(px[group].max(axis=0)).astype(int) + reach_px + 1
-        window = read_window(level, "height", row0, row1, col0, col1).astype(np.float64)
-        x = px[group, 0, None] - col0 + offset_px
-        y = px[group, 1, None] - row0 - offset_px  # rows run south
-        found[group] = _interpolate_bilinear(window, y[:, :, None], x[:, None, :])
-    return found + level.height_reference_m
-
-
-def _interpolate_bilinear(values: FloatArray, row: FloatArray, col: FloatArray) -> FloatArray:
-    i, j = np.floor(row).astype(np.int64), np.floor(col).astype(np.int64)
-    v, u = row - i, col - j
-    upper = values[i, j] * (1.0 - u) + values[i, j + 1] * u
-    lower = values[i + 1, j] * (1.0 - u) + values[i + 1, j + 1] * u
-    return np.asarray(upper * (1.0 - v) + lower * v)
+    off_m, columns = excess_m - np.median(excess_m), np.column_stack([xy_m - xy_m.mean(axis=0), np.ones(len(xy_m))])
+    plane = least_squares(lambda plane: columns @ plane - off_m, np.zeros(3), loss="soft_l1", f_scale=0.01).x
+    return np.asarray(columns[:, :2] @ plane[:2])
 
 
 def _find_least(spread: FloatArray) -> tuple[int, int]:
     """Return the lattice indices (north, east) of the shift that leaves the least spread."""
     i, j = np.unravel_index(int(spread.argmin()), spread.shape)
     return int(i), int(j)
+
+
+def _select_near(best: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the part of the lattice near a shift."""
+    i, j = (min(max(index, _NEAR), len(_SHIFT_M) - 1 - _NEAR) for index in best)
+    return slice(i - _NEAR, i + _NEAR + 1), slice(j - _NEAR, j + _NEAR + 1)
+
+
+def _flatten(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[FloatArray, FloatArray, Rows]:
+    """Return the excess without drift and tilt, the columns of a tilt, (N, 2), and the stretch of path of each point, (N,), rising.
+
+    Means over stretches are zero: the drift is constant in each.
+    """
+    tracks = np.split(np.arange(len(track)), np.flatnonzero(np.diff(track)) + 1)
+    paths_m = [np.hypot(*np.diff(xy_m[rows], axis=0).T).sum() for rows in tracks]
+    counts = [max(-(-_BLOCKS // len(tracks)), round(float(path_m) / _DRIFT_M)) for path_m in paths_m]
+    parts = [part for rows, count in zip(tracks, counts, strict=True) for part in np.array_split(rows, count)]
+    sizes = np.array([part.size for part in parts if part.size])
+    first, stretch = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
+    flat_m, tilt = (each - (np.add.reduceat(each, first).T / sizes).T[stretch] for each in (excess_m, xy_m))
+    return _remove_tilt(flat_m, tilt), tilt, stretch
+
+
+def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
+    """Return values, shape (N, ...), less the least-squares multiples of a tilt's columns, (N, 2), whose means are zero."""
+    flat = values.reshape(len(values), -1)
+    return np.asarray((flat - tilt @ (np.linalg.pinv(tilt) @ flat)).reshape(values.shape))
 
 
 def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArray) -> HeightScale:
@@ -296,161 +267,107 @@ def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArr
 
 
 def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
-    """Regress the track's heights (N,) on the map's (N, K, K) where both are most alike; how sure, by leaving stretches out."""
+    """Return the regression of the track's heights (N,) on the map's (N, K, K) at the shift where both are most alike."""
     ground, height = ground_m - ground_m.mean(axis=0), height_m - height_m.mean()
     squares, products = np.einsum("nij,nij->ij", ground, ground), np.einsum("nij,n->ij", ground, height)
     explained = np.maximum(products, 0.0) ** 2 / (squares * (height @ height) + _RIDGE)
-    i, j = np.unravel_index(int(explained.argmax()), explained.shape)
-    along, blocks = ground[:, i, j], np.array_split(np.arange(len(height)), _BLOCKS)
-    parts = [(along[block] @ along[block], along[block] @ height[block]) for block in blocks]
-    without = [(products[i, j] - product) / (squares[i, j] - square + _RIDGE) for square, product in parts]
-    std = float(np.sqrt(_estimate_covariance(np.array(without)[:, None])[0, 0]))
-    return HeightScale(float(products[i, j] / (squares[i, j] + _RIDGE)), std, float(explained[i, j]))
+    best = _find_least(-explained)
+    along, first = ground[:, *best], np.arange(_BLOCKS) * len(height) // _BLOCKS
+    without = products[best] - np.add.reduceat(along * height, first)
+    without /= squares[best] - np.add.reduceat(along**2, first) + _RIDGE
+    std = float(np.sqrt(_estimate_covariance(without[:, None])[0, 0]))
+    return HeightScale(float(products[best] / (squares[best] + _RIDGE)), std, float(explained[best]))
 
 
 def _refine_shift(
-    raw_m: FloatArray, points: _Points, chosen: tuple[Points, Points], shift_m: FloatArray, scale: HeightScale
+    near_m: FloatArray, good_m: FloatArray, xy_m: FloatArray, track: Rows, scale: HeightScale
 ) -> Registration:
-    """Refine the best shift of the lattice by the good points, with σ by leaving sections out; misfits are those of near points."""
-    near, good = chosen
-    excess_m, tilt, stretches = _flatten(raw_m[good], points.select(good))
-    variance, middle = excess_m.var(axis=0), (shift_m.size // 2, shift_m.size // 2)
-    best, inner = _find_least(variance), _find_least(variance[_NEAR:-_NEAR, _NEAR:-_NEAR])
-    i, j = inner[0] + _NEAR, inner[1] + _NEAR
-    step_m, covariance, blocks = _descend(
-        _take_near(excess_m, (i, j)), tilt, _group_stretches(points.xy_m[good], stretches)
-    )
+    """Return the best shift of the lattice, refined by the excess at good points; misfits are those of near points."""
+    flat_m, tilt, stretch = _flatten(good_m, xy_m, track)
+    variance, inside = flat_m.var(axis=0), slice(_NEAR, -_NEAR)
+    best, inner = _find_least(variance), _find_least(variance[inside, inside])
+    at = inner[0] + _NEAR, inner[1] + _NEAR
+    fits = [_fit_bottom(flat_m, tilt, block, at) for block in _group_stretches(xy_m, stretch)]
+    step_m, covariance, squares = max(fits, key=lambda fit: float(np.trace(fit[1])))
     variances, axes = np.linalg.eigh(covariance)
     known = axes[:, variances < KNOWN_M**2]
-    if not _is_distinct(excess_m, (i, j), known, shift_m, blocks):
+    if not _is_distinct(squares, at, known):
         known = axes[:, :0]
     step_m = known @ np.clip(known.T @ step_m, -_STEP_M, _STEP_M)
-    unshifted, shifted = _move(excess_m, middle, 0.0 * step_m), _move(excess_m, (i, j), step_m)
-    outside_m = known.T @ (shift_m[[best[1], best[0]]] - shift_m[[j, i]])
-    fitted = known @ known.T @ np.array([shift_m[j], shift_m[i]]) + step_m
-    weight = float(((known.T @ fitted) ** 2 / variances[: known.shape[1]]).sum())
-    gain, sigmas = _compute_gain(unshifted, shifted, blocks)
+    fitted = known @ known.T @ _LATTICE_M[at] + step_m
+    information = (known / variances[: known.shape[1]]) @ known.T
+    gain, sigmas = _compare(squares, _MIDDLE, at)
     return Registration(
-        points=len(excess_m),
+        points=len(flat_m),
         shift_xy_m=(float(fitted[0]), float(fitted[1])),
-        shift_std_m=float(np.sqrt(variances[known.shape[1] - 1])) if known.size else float("nan"),
-        height_offset_m=-float(raw_m[near, i, j].mean()),
-        misfit_m=float(raw_m[near, *middle].std()),
-        shifted_misfit_m=float(_move(raw_m[near], (i, j), step_m).std()),
-        shape_misfit_m=float(shifted.std()),
-        significant=weight > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
-        at_reach=bool((np.abs(outside_m) > _EDGE_M).any()),
+        height_offset_m=-float(near_m[:, *at].mean()),
+        misfit_m=float(near_m[:, *_MIDDLE].std()),
+        shifted_misfit_m=_measure_misfit(near_m, at, step_m),
+        shape_misfit_m=_measure_misfit(flat_m, at, step_m),
+        significant=float(fitted @ information @ fitted) > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
+        at_reach=bool((np.abs(known.T @ (_LATTICE_M[best] - _LATTICE_M[at])) > _EDGE_M).any()),
         scale=scale,
-        information=(known / variances[: known.shape[1]]) @ known.T,
+        information=information,
     )
 
 
-def _move(excess_m: FloatArray, at: tuple[int, int], step_m: FloatArray) -> FloatArray:
-    """Return the excess (N,) [m] at a step [m] beside a shift of the lattice, less its mean."""
-    i, j = at
-    east, north = excess_m[:, i, j + 1] - excess_m[:, i, j - 1], excess_m[:, i + 1, j] - excess_m[:, i - 1, j]
-    moved = excess_m[:, i, j] + np.stack([east, north], axis=1) @ step_m / (2.0 * _STEP_M)
-    return np.asarray(moved - moved.mean())
+def _group_stretches(xy_m: FloatArray, stretch: Rows) -> list[Rows]:
+    """Return the block of each point, (N,), along the path and by place: errors of GNSS are alike in time, those of the map in place."""
+    centre_m = np.stack([np.bincount(stretch, axis_m) for axis_m in xy_m.T]) / np.bincount(stretch)
+    order = np.argsort(compute_morton(*np.floor(centre_m.T - centre_m.min(axis=1)).astype(np.int64).T), kind="stable")
+    blocks = np.array_split(np.arange(len(order)), min(_BLOCKS, len(order)))
+    number = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
+    return [number[stretch], number[np.argsort(order)][stretch]]
 
 
-def _take_near(values: FloatArray, best: tuple[int, int]) -> FloatArray:
-    """Return the values of shifts near the best one, shape (N, K, K)."""
-    i, j = (min(max(index, _NEAR), values.shape[1] - 1 - _NEAR) for index in best)
-    return values[:, i - _NEAR : i + _NEAR + 1, j - _NEAR : j + _NEAR + 1]
+def _fit_bottom(
+    flat_m: FloatArray, tilt: FloatArray, block: Rows, at: tuple[int, int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the step (2,) [m] from a shift to the bottom of a paraboloid, its covariance, and the squared misfits by block, (B, K, K).
 
-
-def _flatten(excess_m: FloatArray, points: _Points) -> tuple[FloatArray, FloatArray, list[Rows]]:
-    """Return the excess without drift and tilt, the columns of a tilt, (N, 2), and the rows of stretches whose means are zero.
-
-    Stretches are of one track, `_DRIFT_M` long, shorter where there would be too few to leave some out.
+    Along a furrow there is no bottom: the step is 0, its standard deviation the lattice's size. The covariance is that of blocks left out,
+    and what independent errors of so many points would give.
     """
-    xy_m, tracks = points.xy_m, np.split(np.arange(len(points.track)), np.flatnonzero(np.diff(points.track)) + 1)
-    paths_m = [np.linalg.norm(np.diff(xy_m[rows], axis=0), axis=1).sum() for rows in tracks]
-    fewest = -(-_BLOCKS // len(tracks))
-    counts = [max(fewest, round(float(path_m) / _DRIFT_M)) for path_m in paths_m]
-    stretches = [part for rows, n in zip(tracks, counts, strict=True) for part in np.array_split(rows, n) if part.size]
-    flat_m, tilt = (
-        np.concatenate([values[rows] - values[rows].mean(axis=0) for rows in stretches]) for values in (excess_m, xy_m)
-    )
-    return _remove_tilt(flat_m, tilt), tilt, stretches
-
-
-def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
-    """Return values, shape (N, ...), less the least-squares multiples of a tilt's columns, (N, 2), whose means are zero."""
-    flat = values.reshape(len(values), -1)
-    return np.asarray((flat - tilt @ (np.linalg.pinv(tilt) @ flat)).reshape(values.shape))
-
-
-def _group_stretches(xy_m: FloatArray, stretches: Sequence[Rows]) -> list[list[Rows]]:
-    """Return stretches in blocks, along the path and by place: errors of GNSS are alike in time, those of the map in place."""
-    centre_m = np.stack([xy_m[rows].mean(axis=0) for rows in stretches])
-    east, north = np.floor(centre_m - centre_m.min(axis=0)).astype(np.int64).T
-    orders = (np.arange(len(centre_m)), np.argsort(compute_morton(east, north), kind="stable"))
-    return [
-        [np.concatenate([stretches[row] for row in block]) for block in np.array_split(order, min(_BLOCKS, len(order)))]
-        for order in orders
-    ]
-
-
-def _descend(
-    excess_m: FloatArray, tilt: FloatArray, groupings: Sequence[list[Rows]]
-) -> tuple[FloatArray, FloatArray, list[Rows]]:
-    """Return the step (2,) [m] from the middle of shifts, (N, K, K), to the least misfit, its covariance, and the blocks that gave it.
-
-    Of the groupings of rows the one counts that gives the larger covariance; it is added to what independent errors would give.
-    """
-    step_m, independent = _find_bottom(excess_m, tilt)
-    found = []
-    for blocks in groupings:
-        without = [_find_bottom(np.delete(excess_m, rows, axis=0), np.delete(tilt, rows, axis=0))[0] for rows in blocks]
-        found.append(_estimate_covariance(np.stack(without)))
-    most = int(np.argmax([np.trace(covariance) for covariance in found]))
-    return step_m, _FEW_BLOCKS * found[most] + independent, groupings[most]
-
-
-def _find_bottom(excess_m: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the step [m] to the bottom of a paraboloid through the squared misfits, and its covariance if errors are independent.
-
-    Along a furrow there is no bottom: the step is 0, its standard deviation the window's size.
-    """
-    misfit = (_remove_tilt(excess_m, tilt) ** 2).sum(axis=0)
-    _, east, north, east2, both, north2 = _PARABOLOID @ misfit.ravel()
-    curvature, axes = np.linalg.eigh(np.array([[2.0 * east2, both], [both, 2.0 * north2]]))
-    is_flat = curvature <= _FLAT * curvature[1] + _RIDGE
+    members = [block == number for number in range(block.max() + 1)]
+    squares = np.stack([np.square(flat_m[rows]).sum(axis=0) for rows in members])
+    near_m, rests = flat_m[:, *_select_near(at)], [np.ones(len(block), np.bool_), *(~rows for rows in members)]
+    misfit = np.stack([np.square(_remove_tilt(near_m[rest], tilt[rest])).sum(axis=0).ravel() for rest in rests])
+    _, east, north, east2, both, north2 = _PARABOLOID @ misfit.T
+    curvature, axes = np.linalg.eigh(np.moveaxis(np.array([[2.0 * east2, both], [both, 2.0 * north2]]), 2, 0))
+    is_flat = curvature <= _FLAT * curvature[:, 1:] + _RIDGE
     inverse = np.where(is_flat, 0.0, 1.0 / np.where(is_flat, 1.0, curvature))
-    variance = np.where(is_flat, REACH_M**2, 2.0 * misfit.min() / len(excess_m) * inverse)
-    return -axes @ (inverse * (axes.T @ [east, north])), (axes * variance) @ axes.T
+    steps_m = -np.einsum("nij,nj,nkj,kn->ni", axes, inverse, axes, np.stack([east, north]))
+    variance = np.where(is_flat[0], REACH_M**2, 2.0 * misfit[0].min() / len(flat_m) * inverse[0])
+    return steps_m[0], _FEW_BLOCKS * _estimate_covariance(steps_m[1:]) + (axes[0] * variance) @ axes[0].T, squares
 
 
-def _is_distinct(
-    excess_m: FloatArray, best: tuple[int, int], known: FloatArray, shift_m: FloatArray, blocks: Sequence[Rows]
-) -> bool:
-    """Tell whether every other shift that fits best around it, away along the known directions, fits clearly worse."""
-    variance = excess_m.var(axis=0)
-    north, east = np.meshgrid(shift_m - shift_m[best[0]], shift_m - shift_m[best[1]], indexing="ij")
-    away = np.linalg.norm(np.stack([east, north], axis=-1) @ known, axis=-1) >= _APART_M
-    rivals = np.argwhere(away & (variance == minimum_filter(variance, 3, mode="nearest")))
-    left = excess_m[:, *best] - excess_m[:, *best].mean()
-    return all(
-        _compute_gain(excess_m[:, a, b] - excess_m[:, a, b].mean(), left, blocks)[1] > _RIVAL_SIGMAS for a, b in rivals
-    )
+def _is_distinct(squares: FloatArray, best: tuple[int, int], known: FloatArray) -> bool:
+    """Return whether every other shift that fits best around it, away along the known directions, fits clearly worse."""
+    total = squares.sum(axis=0)
+    away = np.linalg.norm((_LATTICE_M - _LATTICE_M[best]) @ known, axis=-1) >= _APART_M
+    rivals = np.argwhere(away & (total == minimum_filter(total, 3, mode="nearest"))).tolist()
+    return all(_compare(squares, (i, j), best)[1] > _RIVAL_SIGMAS for i, j in rivals)
 
 
-def _compute_gain(unshifted: FloatArray, shifted: FloatArray, blocks: Sequence[Rows]) -> tuple[float, float]:
-    """Return by how much the log of the mean squared misfit falls, and over how many of its standard deviations."""
-    squares = np.stack([unshifted**2, shifted**2])
-    gain = np.log(squares[0].sum() / squares[1].sum())
-    parts = np.stack([squares[:, block].sum(axis=1) for block in blocks], axis=1)
-    sums = squares.sum(axis=1, keepdims=True) - parts
-    std = np.sqrt(_estimate_covariance(np.log(sums[0] / sums[1])[:, None])[0, 0])
+def _compare(squares: FloatArray, other: tuple[int, int], best: tuple[int, int]) -> tuple[float, float]:
+    """Return by how much the log of the squared misfit falls from another shift to the best, and over how many standard deviations."""
+    total = squares.sum(axis=0)
+    gain, without = np.log(total[other] / total[best]), total - squares
+    std = np.sqrt(_estimate_covariance(np.log(without[:, *other] / without[:, *best])[:, None])[0, 0])
     return float(gain), float(gain / max(std, 1e-12))
 
 
+def _measure_misfit(excess_m: FloatArray, at: tuple[int, int], step_m: FloatArray) -> float:
+    """Return the standard deviation of the excess at a step [m] beside a shift of the lattice [m]."""
+    i, j = at
+    east, north = excess_m[:, i, j + 1] - excess_m[:, i, j - 1], excess_m[:, i + 1, j] - excess_m[:, i - 1, j]
+    return float((excess_m[:, i, j] + np.stack([east, north], axis=1) @ step_m / (2.0 * _STEP_M)).std())
+
+
 def _estimate_covariance(without: FloatArray) -> FloatArray:
-    """Return the covariance of an estimate from its values with each stretch left out, shape (B, K)."""
+    """Return the covariance of an estimate by its values with each block left out, shape (B, K)."""
     spread = without - without.mean(axis=0)
-    covariance: FloatArray = (len(without) - 1) / len(without) * spread.T @ spread
-    return covariance
+    return np.asarray((len(without) - 1) / len(without) * spread.T @ spread)
 
 
 @dataclass(frozen=True, slots=True)
@@ -483,18 +400,18 @@ def share_shift(
         return none
     error_m = shift_m - together.shift_xy_m
 
-    def compare(scatter: float) -> float:
+    def exceed(scatter: float) -> float:
+        """Return by how much the squared errors exceed their lower quantile."""
         squares = _square(error_m, _widen(information, variance + scatter))
         return float(squares.sum() - chi2.ppf(_SCATTER_QUANTILE, freedom))
 
-    scatter = float(brentq(compare, 0.0, 1e6)) if compare(0.0) > 0.0 else 0.0
-    shared = []
-    for own, wider in zip(alone, _widen(together.information[None], variance + scatter), strict=True):
-        moved = replace(own, shift_xy_m=together.shift_xy_m, information=wider)
-        std_m = float(moved.axis_std_m.max())
-        taken = replace(moved, shift_std_m=std_m, shifted_misfit_m=together.shifted_misfit_m)
-        shared.append(SharedShift(taken, float("nan")))
-    return shared
+    scatter = float(brentq(exceed, 0.0, 1e6)) if exceed(0.0) > 0.0 else 0.0
+    widened = _widen(together.information[None], variance + scatter)
+    shift_xy_m, left_m = together.shift_xy_m, together.shifted_misfit_m
+    return [
+        SharedShift(replace(own, shift_xy_m=shift_xy_m, shifted_misfit_m=left_m, information=wider), np.nan)
+        for own, wider in zip(alone, widened, strict=True)
+    ]
 
 
 def _find_contradictions(shift_m: FloatArray, weights: FloatArray) -> list[SharedShift]:
@@ -503,7 +420,7 @@ def _find_contradictions(shift_m: FloatArray, weights: FloatArray) -> list[Share
     error_m = shift_m - (np.median(shift_m[is_known], axis=0) if is_known.any() else shift_m)
     squares = np.where(is_known, _square(error_m, weights), 0.0)
     is_odd = is_known & (squares >= min(_CHI2_999, squares.max()))
-    return [SharedShift(None, difference_m) for difference_m in np.where(is_odd, np.hypot(*error_m.T), np.nan).tolist()]
+    return [SharedShift(None, float(apart_m)) for apart_m in np.where(is_odd, np.hypot(*error_m.T), np.nan)]
 
 
 def _square(error_m: FloatArray, weights: FloatArray) -> FloatArray:
@@ -517,8 +434,6 @@ def _count_known(information: FloatArray) -> Rows:
 
 
 def _widen(information: FloatArray, variance: FloatArray) -> FloatArray:
-    """Return an information (..., 2, 2) [1/m²] with a variance [m²] added along the directions that it determines."""
-    values, axes = np.linalg.eigh(information)
-    is_known = values > 1.0 / REACH_M**2
-    wider = np.where(is_known, 1.0 / (1.0 / np.where(is_known, values, 1.0) + np.expand_dims(variance, -1)), 0.0)
-    return np.asarray((axes * wider[..., None, :]) @ np.swapaxes(axes, -1, -2))
+    """Return an information, (N, 2, 2) [1/m²], with a variance, (N,) [m²], added; what is not determined stays so."""
+    unit = np.eye(2)
+    return np.asarray(np.linalg.inv(np.linalg.inv(information + 1e-6 * unit) + variance[:, None, None] * unit))
