@@ -4,7 +4,7 @@
 
 cosmic-ray says how a file may be changed (`core/ReplaceComparisonOperator_Lt_LtE` and so on); this draws which changes are tried, and
 tries each in a fork of one warm process: the changed source is what the import finds, no file is touched, and only the tests of that
-room run, to the first that fails. numba compiles nothing meanwhile.
+room run, to the first that fails. numba compiles nothing meanwhile, but in `COMPILED`.
 
 Tried are all comparisons and numbers of `THOROUGH`, and of what else can be changed as many as ``--draw`` says, by seed. What is no
 change is left out: annotations, decorators, the bare ``*`` of a signature, and ``is`` for ``==``, which is a matter of the
@@ -28,6 +28,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numba.core.config
+
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "motion": (("tcpipe/motion",), ("tests/unit/motion",)),
@@ -49,9 +51,76 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/unit/stages/test_label_quality.py",
         ),
     ),
+    "geometry": (("tcpipe/geometry",), ("tests/unit/geometry", "tests/property/geometry")),
+    "logs": (
+        tuple(
+            f"tcpipe/logs/{name}.py"
+            for name in (
+                "clocks",
+                "expressions",
+                "extrinsics",
+                "field_mapping",
+                "fix_quality",
+                "messages",
+                "power_fields",
+                "roles",
+                "wire_cursors",
+            )
+        ),
+        ("tests/unit/logs",),
+    ),
+    "fusion": (
+        (
+            *(
+                f"tcpipe/fusion/{name}.py"
+                for name in (
+                    "attitude",
+                    "densities",
+                    "initial",
+                    "level_motion",
+                    "measurements",
+                    "pair_residuals",
+                    "preparation",
+                    "process",
+                    "signals",
+                    "ticks",
+                )
+            ),
+            "tcpipe/fusion/checks",
+        ),
+        (
+            *(
+                f"tests/unit/fusion/test_{name}.py"
+                for name in (
+                    "signals",
+                    "attitude",
+                    "noise_curves",
+                    "preparation",
+                    "pose_increments",
+                    "initial",
+                    "ticks",
+                )
+            ),
+            "tests/unit/fusion/checks",
+            "tests/unit/fusion/test_densities.py",
+        ),
+    ),
+    "kernels": (
+        tuple(f"tcpipe/fusion/{name}.py" for name in ("state", "filter_kernel", "smoother_kernel")),
+        ("tests/unit/fusion/test_filter_kernel.py",),
+    ),
+    "estimator": (
+        tuple(f"tcpipe/fusion/{name}.py" for name in ("error_state", "hypotheses", "parameters", "ukf15")),
+        tuple(
+            f"tests/unit/fusion/test_{name}.py"
+            for name in ("parameters", "process", "error_state", "hypotheses", "ukf15")
+        ),
+    ),
     "verify": (("tcpipe/pipeline/verify.py",), ("tests/unit/pipeline/test_trust.py",)),
 }
 """What is changed, and the tests that are to notice, the quick ones first."""
+COMPILED = ("estimator",)
+"""Rooms without kernels of their own, whose tests take minutes unless numba compiles those that they call."""
 THOROUGH = ("motion", "path", "splits")
 ENOUGH = 0.9
 NOTICED = {1: "a test fails", 2: "it cannot be collected", -signal.SIGXCPU: "it goes on without end"}
@@ -182,7 +251,9 @@ def warm_up(tests: tuple[str, ...]) -> float:
     with os.fdopen(reading) as pipe:
         names = pipe.read().split("\n")
     if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]):
-        sys.exit(f"{' '.join(tests)}: a test fails with nothing changed (NUMBA_DISABLE_JIT=1)")
+        sys.exit(
+            f"{' '.join(tests)}: a test fails with nothing changed (NUMBA_DISABLE_JIT={os.environ['NUMBA_DISABLE_JIT']})"
+        )
     ours = {"tcpipe", "tests", "conftest", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
     for name in names:
         if name.split(".")[0] not in ours:
@@ -201,7 +272,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=11, help="of the draw")
     parser.add_argument("--only-drawn", action="store_true", help="leave out what is tried anyway")
     given = parser.parse_args()
-    os.environ["NUMBA_DISABLE_JIT"] = "1"
     os.chdir(ROOT)
     os.nice(19 - os.nice(0))
     sys.path.insert(0, str(ROOT))
@@ -212,6 +282,8 @@ def main() -> None:
         mine, tests = [mutant for mutant in mutants if mutant.room == room], ROOMS[room][1]
         if not mine:
             continue
+        os.environ["NUMBA_DISABLE_JIT"] = str(int(room not in COMPILED))
+        numba.core.config.reload_config()
         cpu_s = 10 + int(4 * warm_up(tests))
         survivors = 0
         for mutant in mine:

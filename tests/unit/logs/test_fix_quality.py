@@ -41,10 +41,11 @@ def east_std(columns, kind=NAV_SAT_FIX, **std_m):
 @pytest.mark.parametrize(
     ("codes", "values", "wanted"),
     [
-        ("gga", [1, 2, 4, 5, 9], [SINGLE, DIFFERENTIAL, FIXED, FLOAT, DIFFERENTIAL]),
-        ("rtklib", [1, 2, 3, 4, 5], [FIXED, FLOAT, DIFFERENTIAL, DIFFERENTIAL, SINGLE]),
+        ("gga", [1, 2, 3, 4, 5, 9], [SINGLE, DIFFERENTIAL, SINGLE, FIXED, FLOAT, DIFFERENTIAL]),
+        ("rtklib", [1, 2, 3, 4, 5, 6], [FIXED, FLOAT, DIFFERENTIAL, DIFFERENTIAL, SINGLE, FLOAT]),
+        ("gps_common", [0, 1, 18, 19, 20, 33], [SINGLE, DIFFERENTIAL, DIFFERENTIAL, FIXED, FLOAT, DIFFERENTIAL]),
         ("ublox", [0, 1, 2], [SINGLE, FLOAT, FIXED]),
-        ("mavlink", [3, 4, 5, 6], [SINGLE, DIFFERENTIAL, FLOAT, FIXED]),
+        ("mavlink", [2, 3, 4, 5, 6, 7, 8], [SINGLE, SINGLE, DIFFERENTIAL, FLOAT, FIXED, FIXED, FLOAT]),
         ("words", ["RTK fixed", "Float", "NARROW_INT", "3D fix", "DGPS", "RTK_FLOAT", "single"],
          [FIXED, FLOAT, FIXED, SINGLE, DIFFERENTIAL, FLOAT, SINGLE]),
     ],
