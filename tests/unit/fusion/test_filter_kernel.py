@@ -181,7 +181,7 @@ class Problem:
     def __init__(self, seed, mode, ticks=48):
         rng = np.random.default_rng(seed)
         free = {*FAULTY} - {*range(state.FIX_OFFSET, state.FIX_OFFSET + 3), state.SHARED_SCALE, state.VISUAL_SLIP}
-        free -= {state.TURN_SCALE} if mode >= state.GYRO_TURN else {*range(state.GYRO_BIAS, state.ARM)}
+        free -= set() if mode >= state.GYRO_TURN else {*range(state.GYRO_BIAS, state.ARM)}
         walking = {state.WHEEL_SCALE, state.VISUAL_SCALE} | ({*range(state.GYRO_BIAS, state.ARM)} & free)
         std, walk = np.zeros(state.N), np.zeros(state.N)
         std[sorted(free)], walk[sorted(walking)] = 0.01, 0.003
