@@ -216,7 +216,8 @@ class _Section:
 
     def filter(self, start: Memory, hypothesis: Hypothesis, *, judges: bool = False) -> Pass:
         """Return the forward pass under a hypothesis from a start of all errors."""
-        changed, ticks = self.make_model(hypothesis, judges=judges), hypothesis.alter_ticks(self.ticks)
+        changed = self.make_model(hypothesis, judges=judges)
+        ticks = hypothesis.alter_ticks(self.ticks, drifts=not judges)
         std = make_priors(self.measurements, hypothesis.alter_noise(self.noise), ticks)[0]
         return filter_section(ticks, changed, widen_start(start, std).select(changed.active))
 

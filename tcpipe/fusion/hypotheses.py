@@ -103,10 +103,10 @@ class Change:
             if self.last is not None:
                 yield Event(self.last, place, count, std, is_new=place == state.FIX_OFFSET)
 
-    def alter_ticks(self, ticks: Ticks) -> Ticks:
-        """Return the ticks as they are under the change."""
+    def alter_ticks(self, ticks: Ticks, *, drifts: bool) -> Ticks:
+        """Return the ticks as they are under the change; around a step fixes also err as if they drifted (``drifts``)."""
         inputs = ticks.inputs
-        if self.kind in {"noise", "wander", "step"}:
+        if self.kind in {"noise", "wander"} or (self.kind == "step" and drifts):
             kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
             first, last = self.first, kept.size if self.last is None else self.last
             if self.kind == "noise":
@@ -191,10 +191,10 @@ class Hypothesis:
         """What all changes change in the state, in order of time."""
         return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
 
-    def alter_ticks(self, ticks: Ticks) -> Ticks:
-        """Return the ticks as they are under all changes."""
+    def alter_ticks(self, ticks: Ticks, *, drifts: bool = False) -> Ticks:
+        """Return the ticks as they are under all changes; an estimate ``drifts`` around steps, a comparison of hypotheses does not."""
         for change in self.changes:
-            ticks = change.alter_ticks(ticks)
+            ticks = change.alter_ticks(ticks, drifts=drifts)
         return ticks
 
     def alter_noise(self, noise: NoiseModel) -> NoiseModel:
