@@ -70,7 +70,7 @@ from tcpipe.fusion.process import (
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed, make_adjoint, smooth_ticks
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
+from tcpipe.tables.facts import FIX_ERRORS, ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 
 Floats = NDArray[np.float64]
@@ -216,18 +216,19 @@ class _Section:
 
     def filter(self, start: Memory, hypothesis: Hypothesis, *, judges: bool = False) -> Pass:
         """Return the forward pass under a hypothesis from a start of all errors."""
-        changed, ticks = self.make_model(hypothesis, judges=judges), hypothesis.alter_ticks(self.ticks)
+        changed = self.make_model(hypothesis, judges=judges)
+        ticks = hypothesis.alter_ticks(self.ticks, drifts=not judges)
         std = make_priors(self.measurements, hypothesis.alter_noise(self.noise), ticks)[0]
         return filter_section(ticks, changed, widen_start(start, std).select(changed.active))
 
     def prefer_larger_errors(self, hypotheses: list[Hypothesis], start: Memory) -> list[Hypothesis]:
         """Return the hypothesis that fixes err by more throughout, and in steps, where it is the most likely one, else those given.
 
-        Their usual error may be larger ("wander"), and a slow one may come on top. Sets of changes would explain both by inventions: only
-        a single change, or steps of the fixes alone, may be more likely.
+        Their noise may be larger, and a slow error may come on top. Spans of wrong or unused fixes would explain both by inventions: a set
+        of changes that holds one is not believed.
         """
         best, tests = self._judge(_UNCHANGED, start)
-        for kind in ("wander", "slow"):
+        for kind in ("noise", "slow"):
             kept, least = best.changes, best.score + _SHOWS_ERROR
             for size_m in _ERRORS_M:
                 tried, of_tried = self._judge(Hypothesis((*kept, Change(kind, state.FIX, 0, size=size_m)), 0.0), start)
@@ -241,11 +242,12 @@ class _Section:
         best = max(best, stepped, key=lambda each: each.score)
         for each in hypotheses[:1]:
             score = self._judge(each, start)[0].score
-            is_simple = len(each.changes) == 1 or {change.kind for change in each.changes} == {"step"}
-            if is_simple and score > best.score:
+            is_invented = len(each.changes) > 1 and any(c.kind in {"offset", "useless"} for c in each.changes)
+            if score > best.score and not is_invented:
                 return hypotheses
             if score > best.score + _SHOWS_ERROR:
-                best = replace(best, rival_change_count=len(each.changes))
+                count = sum(change.kind not in FIX_ERRORS for change in each.changes)
+                best = replace(best, rival_change_count=count)
         return [best]
 
     def _judge(self, hypothesis: Hypothesis, start: Memory) -> tuple[Hypothesis, Tests]:
@@ -397,7 +399,7 @@ def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Flo
     velocity = np.einsum("nij,nj->ni", imu, x[:, state.U + 6 : state.U + 9])
     gyro = ticks.inputs.has_gyro[at, None]
     bias, scale = x[:, state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9], x[:, state.TURN_SCALE + 6, None]
-    rate = np.where(gyro, ticks.inputs.rate[at] - bias, ticks.inputs.rate[at] * (1.0 - scale))
+    rate = (ticks.inputs.rate[at] - np.where(gyro, bias, 0.0)) * (1.0 - scale)
     return rotation, velocity, rate - np.cross(mount, rate)
 
 

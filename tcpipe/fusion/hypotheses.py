@@ -103,17 +103,22 @@ class Change:
             if self.last is not None:
                 yield Event(self.last, place, count, std, is_new=place == state.FIX_OFFSET)
 
-    def alter_ticks(self, ticks: Ticks) -> Ticks:
-        """Return the ticks as they are under the change."""
+    def alter_ticks(self, ticks: Ticks, *, drifts: bool) -> Ticks:
+        """Return the ticks as they are under the change; around a step fixes also err as if they drifted (``drifts``)."""
         inputs = ticks.inputs
-        if self.kind == "wander":
+        if self.kind in {"noise", "wander"} or (self.kind == "step" and drifts):
             kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
-            span = slice(self.first, self.last)
-            variance[span] = np.maximum(variance[span], np.square(self.size * FIX_AXES))
-            if self.last is not None:
-                kept[self.last] *= np.sqrt(variance[self.last, 0] / variance[self.last - 1, 0])
+            first, last = self.first, kept.size if self.last is None else self.last
+            if self.kind == "noise":
+                kept[:] = np.exp(-inputs.period_s / _NOISE_S)
+            elif self.kind == "step":
+                around = round(_AROUND_STEP_S / inputs.period_s)
+                first, last = max(first - around, 0), min(first + around, kept.size)
+            variance[first:last] = np.maximum(variance[first:last], np.square(self.size * FIX_AXES))
+            if last < kept.size:
+                kept[last] *= np.sqrt(variance[last, 0] / variance[last - 1, 0])
             earlier = np.concatenate((variance[:1], variance[:-1]))
-            noise[self.first :] = np.maximum(variance - kept[:, None] ** 2 * earlier, 0.0)[self.first :]
+            noise[first:] = np.maximum(variance - kept[:, None] ** 2 * earlier, 0.0)[first:]
             return replace(ticks, inputs=inputs._replace(fix_kept=kept, fix_noise=noise), fix_variance_m2=variance)
         if self.jump is not None:
             value, spread = inputs.value.copy(), inputs.variance.copy()
@@ -123,6 +128,10 @@ class Change:
         return ticks
 
 
+_AROUND_STEP_S = 40.0
+"""How long before and after a step fixes may drift by as much [s]: corrections age, and ambiguities are resolved slowly."""
+_NOISE_S = 1.5
+"""Correlation time of a larger noise of fixes [s]: reflected signals change as the antenna moves by a metre."""
 _SLOW_S = 60.0
 """Correlation time of a slow error of fixes [s]: the paths of reflected signals change with the satellites."""
 _UNMEASURED = 1e3  # rad²/s²
@@ -153,6 +162,7 @@ _COSTS = {
     "frame": 14.0,
     "pose": 20.0,
     "wander": 12.0,
+    "noise": 0.0,
     "step": 12.0,
     "slow": 0.0,
     "useless": 12.0,
@@ -181,10 +191,10 @@ class Hypothesis:
         """What all changes change in the state, in order of time."""
         return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
 
-    def alter_ticks(self, ticks: Ticks) -> Ticks:
-        """Return the ticks as they are under all changes."""
+    def alter_ticks(self, ticks: Ticks, *, drifts: bool = False) -> Ticks:
+        """Return the ticks as they are under all changes; an estimate ``drifts`` around steps, a comparison of hypotheses does not."""
         for change in self.changes:
-            ticks = change.alter_ticks(ticks)
+            ticks = change.alter_ticks(ticks, drifts=drifts)
         return ticks
 
     def alter_noise(self, noise: NoiseModel) -> NoiseModel:

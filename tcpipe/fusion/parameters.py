@@ -109,7 +109,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     for place, process in _list_varying_scales(m, noise).items():
         std[place], time_s[place] = np.sqrt(process.variance), process.time_s
     std[state.TURN_SCALE] = turn_scale_std(m)
-    walk[state.TURN_SCALE] = np.sqrt(2.0 / _MINUTE_S) * std[state.TURN_SCALE]
+    # Wheels skid otherwise in each turn.
+    walk[state.TURN_SCALE] = 0.0 if has_imu else np.sqrt(2.0 / _MINUTE_S) * std[state.TURN_SCALE]
     # Where roll and pitch are not known, an antenna that sways looks like one at another height; without yaw, elsewhere.
     if m.gnss is not None and (has_tilt or m.has_attitude):
         known = slice(0, 3 if has_tilt else 2)
@@ -165,7 +166,7 @@ _DEPENDS: Mapping[int, Sequence[int]] = {
         *range(state.POSE_MOUNT, state.POSE_FRAME + 3),
     ),
     MOTION_WITHOUT_GYRO: (*_MOTION, state.TURN_SCALE),
-    MOTION_WITH_GYRO: range(state.MOVING),
+    MOTION_WITH_GYRO: (*range(state.MOVING), state.TURN_SCALE),
 }
 """Errors on which each kind of measurement depends, and motion by odometry and by gyroscope."""
 

@@ -39,6 +39,7 @@ SCALE_STD: Mapping[str, float] = {
     VISUAL: 0.05,  # stereo calibration
 }
 """By odometry, σ of its scale before the run shows it."""
+_GYRO_SCALE_STD = 0.01  # of MEMS gyroscopes, by their datasheets: 1 to 3 %
 _WHEEL_TURN_SCALE_STD = 0.2  # turn rate of skidding wheels
 _VISUAL_TURN_SCALE_STD = 0.03  # turn rate of a camera
 SLOPE_RAD = 0.1  # of ground, where nothing shows it
@@ -128,12 +129,14 @@ def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
 
 
 def turn_scale_std(measurements: Measurements) -> float:
-    """Return the standard deviation of the scale of an odometry's turn rate; 0 where a gyroscope measures it, or no sensor.
+    """Return the standard deviation of the scale of the turn rate: of the gyroscope, else of an odometry; 0 without either.
 
     Without fixes nothing shows it: it stays 1.
     """
-    if measurements.imu is not None or measurements.gnss is None:
+    if measurements.gnss is None:
         return 0.0
+    if measurements.imu is not None:
+        return _GYRO_SCALE_STD
     sources = turn_sources(measurements)
     if not sources:
         return 0.0

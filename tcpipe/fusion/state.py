@@ -129,10 +129,14 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
     """Fill ``out`` with the state after a tick of T seconds.
 
     ``turned``: rotation matrix over the tick by the gyroscope, or the rotation vector by an odometry; ``gained``: velocity and
-    displacement by the accelerometer, shape (6,). Both with the biases still in them.
+    displacement by the accelerometer, shape (6,). Both with the biases and the scale still in them.
     """
     if mode >= GYRO_TURN:
-        make_rotation(-T * x[GYRO_BIAS + 6], -T * x[GYRO_BIAS + 7], -T * x[GYRO_BIAS + 8], out)
+        s = 0.5 * x[TURN_SCALE + 6]  # half of the antisymmetric part is the rotation vector of a small turn
+        c0 = T * x[GYRO_BIAS + 6] + s * (turned[7] - turned[5])
+        c1 = T * x[GYRO_BIAS + 7] + s * (turned[2] - turned[6])
+        c2 = T * x[GYRO_BIAS + 8] + s * (turned[3] - turned[1])
+        make_rotation(-c0, -c1, -c2, out)
         multiply_rotations(turned, out, turn)
     else:
         s = 1.0 - x[TURN_SCALE + 6]

@@ -185,6 +185,7 @@ CHANGES = {
     "offset": "positions are off by a constant",
     "wander": "positions err far more than usual",
     "step": "positions step, and nothing shows which side is right",
+    "noise": "positions err by more than they claim",
     "slow": "positions err slowly, by more than they claim",
     "antenna": "it was moved on the robot",
     "clock": "its clock stepped",

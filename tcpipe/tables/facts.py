@@ -100,6 +100,10 @@ class GateReset:
     size: float
 
 
+FIX_ERRORS = frozenset({"noise", "slow", "wander", "step"})
+"""Kinds of changes by which fixes err for long, and nothing else changes."""
+
+
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
     """A change that explains a contradiction: its kind (``varies`` or one of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
@@ -175,8 +179,8 @@ class StretchFacts:
         )
 
     def count_changes(self) -> int:
-        """Return how many changes the sensors need; larger errors of fixes throughout are none."""
-        return max(self.rival_change_count, sum(each.kind not in {"slow", "wander"} for each in self.changes))
+        """Return how many changes the sensors need; lasting errors of fixes are none, as they only make the position uncertain."""
+        return max(self.rival_change_count, sum(each.kind not in FIX_ERRORS for each in self.changes))
 
 
 @dataclass(frozen=True, slots=True)

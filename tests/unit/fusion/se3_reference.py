@@ -63,12 +63,19 @@ class Tick:
     gained: np.ndarray
 
 
+def correct_gyro(x, tick):
+    """Return the rotation vector by which bias and scale turn a tick of the gyroscope, and that of a scale of 1, shapes (3,)."""
+    turned = tick.turned.reshape(3, 3)
+    small = 0.5 * np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
+    return -tick.T * part(x, state.GYRO_BIAS) - x[state.TURN_SCALE + 6] * small, small
+
+
 def move(x, tick):
     """Return the state after a tick."""
     T, (R, p, u) = tick.T, split(x)
     bg, ba, kappa = part(x, state.GYRO_BIAS), part(x, state.ACCELEROMETER_BIAS), x[state.TURN_SCALE + 6]
     by_gyro = tick.mode >= state.GYRO_TURN
-    D = tick.turned.reshape(3, 3) @ exp(-T * bg) if by_gyro else exp((1 - kappa) * tick.turned[:3])
+    D = tick.turned.reshape(3, 3) @ exp(correct_gyro(x, tick)[0]) if by_gyro else exp((1 - kappa) * tick.turned[:3])
     y = x.copy()
     if tick.mode == state.INERTIAL:
         v, s = tick.gained[:3] - 0.5 * T * np.cross(bg, tick.gained[:3]), tick.gained[3:]
@@ -89,7 +96,9 @@ def differentiate_motion(x, tick):
     # D = D̂ Exp(ψ)
     turn = np.zeros((3, state.N))
     if tick.mode >= state.GYRO_TURN:
-        turn[:, bg] = -T * right_jacobian(-T * b)
+        correction, small = correct_gyro(x, tick)
+        turn[:, bg] = -T * right_jacobian(correction)
+        turn[:, state.TURN_SCALE] = -right_jacobian(correction) @ small
     else:
         turn[:, state.TURN_SCALE] = -tick.turned[:3]
     F[th] = turn
