@@ -5,17 +5,19 @@ Time offsets between the clocks of sensors are taken out before fusion. Power is
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from itertools import chain
+from typing import Any, cast
 
 import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, shift_stamps
+from tcpipe.fusion.checks.lags import find_span_ns
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
-from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, Measurements, Trajectory
 from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
@@ -26,16 +28,19 @@ from tcpipe.stages.fuse_findings import (
     make_fuse_facts,
 )
 from tcpipe.stages.fuse_inputs import (
-    FusionInputs,
+    Section,
     drop_implausible_sensors,
     exclude_sensors,
-    find_longest_epoch,
-    name_pose,
-    prepare_inputs,
-    prepare_pose,
+    find_exclusions,
+    find_fixes_role,
+    find_span_s,
+    merge_findings,
+    prepare_sections,
+    rename_role,
+    use_pose_as_fixes,
 )
-from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
-from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks
+from tcpipe.stages.fuse_sections import Fused, fuse_section, make_rejections_table
+from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks, StageFacts
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, select_findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -43,63 +48,106 @@ from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     """Return the track of a run; rows are in order of clock epoch and stamp.
 
-    Each clock epoch, and each section between long pauses, is fused separately. Stamps are multiples of the track's period; where no sensor
-    measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
+    Each clock epoch, and each part of it between long pauses, is fused separately. Stamps are multiples of the track's period; where no
+    sensor measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
 
-    Raises `FusionError`: no sensor measures motion, or the estimate breaks down.
+    Raises `FusionError`: no sensor measures motion, or the estimate breaks down in every section.
     """
+    fixes = find_fixes_role(streams)
     try:
-        return _fuse(streams, config, run_id)
+        return _fuse(streams, config, run_id, fixes)
     except FusionError as error:
-        raise FusionError(*error.problems, findings=name_pose(error.findings, streams)) from error
+        raise FusionError(*error.problems, findings=rename_role(error.findings, GNSS, fixes)) from error
 
 
-def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
-    # 1. A pose made elsewhere is what the fixes are.
-    #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
-    streams, local = prepare_pose(streams)
-    run = Subject("run", run_id)
-    inputs = drop_implausible_sensors(prepare_inputs(streams, config), streams)
-    # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others,
-    #    and on the clock of a sensor as it is where the estimate finds that it steps: it has no offset.
-    aligned, clocks = correct_clocks(streams, inputs)
-    used, fused = fuse_recovering(aligned, streams, config, run=run)
-    unsteady = {change.role for section in fused.facts for change in section.changes if change.kind == "clock"}
-    if clocks.facts is not None and any(
-        offset.noted for role, offset in clocks.facts.offsets.items() if role in unsteady
-    ):
-        aligned, clocks = correct_clocks(streams, inputs, unsteady)
-        used, fused = fuse_recovering(aligned, streams, config, run=run)
+def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Track:
+    run, read = Subject("run", run_id), streams.report
+    # 1. Streams become sections of measurements: one frame, one set of units, usable variances, without sensors that cannot be right.
+    streams, is_local = use_pose_as_fixes(streams)
+    sections = find_clocks(drop_implausible_sensors(prepare_sections(streams, config), streams))
+    # 2. Initial state, filter and smoother of each section.
+    sections, fused, failures = fuse_sections(sections, streams, config, run=run)
     if not fused.found:
-        raise FusionError("no motion to fuse", findings=(_find_nothing(streams, used, run), *used.excluded.values()))
+        raise FusionError(
+            "no motion to fuse", findings=(_find_nothing(streams, sections, run), *find_exclusions(sections))
+        )
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
-    if local:
+    is_local |= bool(np.isnan(columns["lon_deg"]).all())
+    if is_local:
         columns |= {name: np.full_like(columns[name], np.nan) for name in ("lon_deg", "lat_deg", "alt_m")}
     table = TRACK.table(**columns)
-    datum = None if local or used.datum_deg_m is None else Datum(*used.datum_deg_m, crs=streams.gnss_crs)
-    # 3. What was left out, what the run shows of the sensors, and where the track follows none.
-    summary = make_fuse_facts(used, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    audit = make_audit_findings(fused, used, streams)
+    origin = next((section.datum_deg_m for section in sections if section.datum_deg_m), None)
+    datum = None if is_local or origin is None else Datum(*origin, crs=streams.gnss_crs)
+    # 3. Excluded sensors, what the run shows of the others, and where the track contradicts all of them.
+    summary = make_fuse_facts(sections, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
+    audit = make_audit_findings(fused, sections, streams)
+    exclusions = find_exclusions(sections)
     findings = (
-        *find_fuse_findings(used, summary, run=run),
-        *used.excluded.values(),
-        *find_parameter_findings(used, summary, streams),
+        *find_fuse_findings(sections, summary, run=run),
+        *failures,
+        *exclusions,
+        *find_parameter_findings(sections, summary, streams),
         *([make_finding("direction-assumed", Subject("role", GNSS))] if fused.is_forward_assumed else []),
         *audit.findings,
-        *clocks.findings,
+        *find_offsets(sections, streams),
+        *dict(find_clock_jumps(sections)).values(),
     )
-    checks = SensorChecks({role: finding.code for role, finding in used.excluded.items()})
-    findings = name_pose(findings, streams)
+    facts = StageFacts(
+        fuse=summary,
+        sensor_checks=SensorChecks({finding.subject.name: finding.code for finding in reversed(exclusions)}),
+        audit=audit.facts,
+        clock_offsets=tuple(section.clocks for section in sections if section.clocks is not None),
+    )
+    findings, facts = rename_role((findings, facts), GNSS, fixes)
     facts = replace(
-        streams.report.facts,
-        fuse=name_pose(summary, streams),
-        sensor_checks=name_pose(checks, streams),
-        audit=name_pose(audit.facts, streams),
-        clock_offsets=name_pose(clocks.facts, streams),
+        read.facts,
+        fuse=facts.fuse,
+        sensor_checks=facts.sensor_checks,
+        audit=facts.audit,
+        clock_offsets=facts.clock_offsets,
     )
-    report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
+    report = StageReport((*_drop_places(read.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
-    return Track(table, make_rejections_table(used, fused.found, name_pose(GNSS, streams)), info)
+    return Track(table, make_rejections_table(sections, fused.found, fixes), info)
+
+
+def fuse_sections(
+    sections: Sequence[Section], streams: Streams, config: FuseConfig, *, run: Subject
+) -> tuple[list[Section], Fused, list[Finding]]:
+    """Return the sections as they were fused, their track, and why some have none.
+
+    Each section is fused again without a sensor that leads its track away from all others, and on the clock of a sensor as it is where
+    the estimate finds that it steps: it has no offset. Where one section has a place on the earth, those without fixes are skipped.
+
+    Raises `FusionError`: no section can be fused, and the track of one contradicts every sensor.
+    """
+    given, used, tracks, errors = [*sections], list[Section](), list[Fused](), list[FusionError]()
+    for place in range(len(given)):
+        last = next((track.found[-1] for track in reversed(tracks) if track.found), None)
+        section = correct_clocks(given)[place]
+        used.append(section)
+        tracks.append(Fused())
+        try:
+            used[place], tracks[place] = fuse_recovering(section, streams, config, run=run, last=last)
+            unsteady = {each.role for facts in tracks[place].facts for each in facts.changes if each.kind == "clock"}
+            if (clocks := section.clocks) is not None and not unsteady.isdisjoint(_list_offsets(clocks)):
+                steady = {role: offset for role, offset in clocks.offsets.items() if role not in unsteady}
+                given[place] = replace(given[place], clocks=replace(clocks, offsets=steady))
+                section = correct_clocks(given)[place]
+                used[place], tracks[place] = fuse_recovering(section, streams, config, run=run, last=last)
+        except FusionError as error:
+            errors.append(error)
+            tracks[place] = Fused(skipped_s=find_middle_ns(section.measurements)[1])
+    fused = Fused()
+    has_place = any(section.datum_deg_m and track.found for section, track in zip(used, tracks, strict=True))
+    for section, track in zip(used, tracks, strict=True):
+        is_placeless = has_place and section.datum_deg_m is None
+        fused.append(Fused(skipped_s=find_middle_ns(section.measurements)[1]) if is_placeless else track)
+    if errors and not fused.found:
+        problems, findings = ([*each] for each in zip(*((e.problems, e.findings) for e in errors), strict=True))
+        raise FusionError(*chain(*problems), findings=merge_findings(chain(*findings)))
+    failures = (finding for error in errors for finding in error.findings if finding.severity == "error")
+    return used, fused, [replace(finding, severity="warning") for finding in failures]
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
@@ -114,42 +162,47 @@ def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Itera
             yield replace(finding, remedies=()) if role in estimated else finding
 
 
-def _find_nothing(streams: Streams, inputs: FusionInputs, run: Subject) -> Finding:
+def _find_nothing(streams: Streams, sections: Sequence[Section], run: Subject) -> Finding:
     rows: dict[str, Any] = {f"{role}_row_count": table.num_rows for role, table in streams.tables.items()}
-    rows |= {f"{role}_unusable_count": count["invalid"] for role, count in inputs.counts.items() if count["invalid"]}
+    for role, stamps in (item for section in sections for item in section.invalid_ns.items()):
+        if stamps.size:
+            rows[f"{role}_unusable_count"] = rows.get(f"{role}_unusable_count", 0) + stamps.size
     return make_finding("no-motion", run, **rows)
 
 
 def fuse_recovering(
-    inputs: FusionInputs, streams: Streams, config: FuseConfig, *, run: Subject
-) -> tuple[FusionInputs, Fused]:
-    """Fuse each section; where the track contradicts every sensor, again without the one that misleads it.
+    inputs: Section, streams: Streams, config: FuseConfig, *, run: Subject, last: Trajectory | None = None
+) -> tuple[Section, Fused]:
+    """Fuse a section; where the track contradicts every sensor, again without the one that misleads it.
 
     That is the IMU, which carries the state from tick to tick, if the track recovers without it; else the only sensor without which it
-    does.
+    does. A local frame goes on from the end of ``last``.
 
     Raises `FusionError`: the track contradicts every sensor, whichever is excluded.
     """
-    fused = fuse_sections(inputs, streams, config)
+    fused = fuse_section(inputs, streams, config, last)
     if not is_astray(fused.windows, fused.astray):
         return inputs, fused
     recovered = {}
-    for role in sorted({role for m in inputs.measurements.values() for role in m.sensors()}):
+    for role in sorted(inputs.measurements.sensors()):
         rest = _exclude_misleading(role, inputs, streams)
-        if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
-            tried = fuse_sections(rest, streams, config)
+        if rest.measurements.gnss is not None or rest.measurements.odometries():
+            tried = fuse_section(rest, streams, config, last)
             if tried.found and not is_astray(tried.windows, tried.astray):
                 recovered[role] = rest, tried
     if IMU in recovered:
         return recovered[IMU]
     if len(recovered) == 1:
         return next(iter(recovered.values()))
-    finding = make_finding("track-contradicts-sensors", run, astray_fraction=fused.astray / fused.windows)
+    span_s = find_span_s(*(find_span_ns(inputs.measurements) or (0, 0)), streams)
+    finding = make_finding(
+        "track-contradicts-sensors", run, span_s=span_s, astray_fraction=fused.astray / fused.windows
+    )
     raise FusionError("the track contradicts every sensor", findings=(finding, *inputs.excluded.values()))
 
 
-def _exclude_misleading(role: str, inputs: FusionInputs, streams: Streams) -> FusionInputs:
-    odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference({role})
+def _exclude_misleading(role: str, inputs: Section, streams: Streams) -> Section:
+    odometries = set(inputs.measurements.odometries()).difference({role})
     code = "misleads-track"
     exclusion = make_fix_exclusion(code, odometries) if role == GNSS else SensorExclusion(role, code)
     return exclude_sensors(inputs, [exclusion], streams)
@@ -160,34 +213,60 @@ _JUMP_NS = 500_000_000
 _DRIVES_MPS = 0.3
 
 
-def correct_clocks(
-    streams: Streams, inputs: FusionInputs, unsteady: Collection[str] = ()
-) -> tuple[FusionInputs, StageReport[ClockFacts | None]]:
-    """Return the inputs on one clock, and the offsets that were taken out, by the longest clock epoch.
+def find_clocks(sections: Sequence[Section]) -> list[Section]:
+    """Return the sections with the time offsets between their sensors.
 
-    The remedy that states an offset includes what the recipe adds already. Clocks of ``unsteady`` sensors step: they have no offset.
+    A section decides about its own clocks. A sensor whose clock it cannot compare has the constant offset that a section with a longer
+    drive shows: latency is a constant of the driver. If the clock drifts there, its offset here is unknown, and is doubted.
     """
-    if not inputs.measurements:
-        return inputs, StageReport((), None)
-    epoch = find_longest_epoch(inputs)
-    found = find_clock_offsets(inputs.measurements[epoch], clock_epoch=epoch)
-    found = replace(found, offsets={role: offset for role, offset in found.offsets.items() if role not in unsteady})
-    middle_ns, span_s = find_middle_ns(inputs.measurements[epoch])
-    off = {role: offset for role, offset in found.offsets.items() if offset.noted}
-    findings = [_find_offset(found, role, offset, streams, span_s) for role, offset in off.items()]
-    aligned = {
-        number: m.replace_sensors(
-            {
-                role: replace(sensor, stamp_ns=shift_stamps(sensor.stamp_ns, off[role], middle_ns))
-                for role, sensor in m.sensors().items()
-                if role in off
-            }
-        )
-        for number, m in inputs.measurements.items()
-    }
-    inputs = replace(inputs, measurements=aligned)
-    jumps = dict(find_clock_jumps(inputs))
-    return replace(inputs, cuts_ns=tuple(jumps)), StageReport((*findings, *jumps.values()), found)
+    found = [*sections]
+    shown: dict[str, tuple[ClockOffset, str, int]] = {}
+    for place in sorted(range(len(sections)), key=lambda place: -sections[place].driven_m):
+        m = sections[place].measurements
+        clocks, middle_ns = find_clock_offsets(m, clock_epoch=sections[place].clock_epoch), find_middle_ns(m)[0]
+        own = {role: (clocks.offsets[role], clocks.reference, middle_ns) for role in _list_offsets(clocks)}
+        for role in shown.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}:
+            offset, reference, at_ns = shown[role]
+            if offset.drift_ppm:
+                drift_s = offset.drift_ppm * 1e-6 * (middle_ns - at_ns) * 1e-9
+                offset = ClockOffset(0.0, float(np.hypot(offset.std_s, drift_s)), noted=True, blamed=False)
+            clocks = replace(clocks, reference=clocks.reference or reference, offsets={**clocks.offsets, role: offset})
+        shown = own | shown
+        found[place] = replace(sections[place], clocks=clocks)
+    return found
+
+
+def _list_offsets(clocks: ClockFacts | None) -> list[str]:
+    """Return the roles with an offset that is corrected."""
+    return [role for role, offset in clocks.offsets.items() if offset.noted] if clocks is not None else []
+
+
+def correct_clocks(sections: Sequence[Section]) -> list[Section]:
+    """Return the sections on one clock each: offset and drift of each clock, about the middle of its section, are taken out."""
+    corrected = []
+    for section in sections:
+        sensors, middle_ns = section.measurements.sensors(), find_middle_ns(section.measurements)[0]
+        offsets = {} if section.clocks is None else section.clocks.offsets
+        shifted = {
+            role: replace(sensors[role], stamp_ns=shift_stamps(sensors[role].stamp_ns, offsets[role], middle_ns))
+            for role in _list_offsets(section.clocks)
+            if role in sensors
+        }
+        corrected.append(replace(section, measurements=section.measurements.replace_sensors(shifted)))
+    cuts_ns = tuple(dict(find_clock_jumps(corrected)))
+    return [replace(section, cuts_ns=cuts_ns) for section in corrected]
+
+
+def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]:
+    """Return the findings on clocks; those of several sections name the time of theirs."""
+    findings = []
+    for section in sorted(sections, key=lambda section: -section.driven_m):
+        for role in _list_offsets(section.clocks):
+            clocks, ends_ns = cast("ClockFacts", section.clocks), find_span_ns(section.measurements) or (0, 0)
+            offset, span_s = clocks.offsets[role], find_span_s(*ends_ns, streams)
+            finding = _find_offset(clocks, role, offset, streams, span_s[1] - span_s[0])
+            findings.append(replace(finding, span_s=span_s) if len(sections) > 1 else finding)
+    return merge_findings(findings)
 
 
 def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams, span_s: float) -> Finding:
@@ -203,7 +282,7 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
         by_log = streams.sensors[role].time_source == "log"
         remedies = () if by_log else suggest("use_log_time", {"read.time_source": {role: "log"}})
         return make_finding("clock-drift", subject, action="corrected", names=names, remedies=remedies, drift_s=drift_s)
-    given_s = streams.report.facts.time_offset_s.get(name_pose(role, streams), 0.0)
+    given_s = streams.report.facts.time_offset_s.get(role, 0.0)
     correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)
     return make_finding(
         "time-offset",
@@ -217,22 +296,32 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
     )
 
 
-def find_clock_jumps(inputs: FusionInputs) -> Iterator[tuple[int, Finding]]:
+def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding]]:
     """Yield the first stamps [ns] after the clock of all sensors was set forward, and the findings.
 
     Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
     """
-    sets = [m for m in inputs.measurements.values() if m.sensors()]
-    stamps = [np.unique(np.concatenate([sensor.stamp_ns for sensor in m.sensors().values()])) for m in sets]
-    for m, stamp_ns in zip(sets, stamps, strict=True):
-        odometry = m.first_odometry
-        if m.gnss is None or odometry is None:
+    epochs: dict[int, list[Measurements]] = {}
+    for section in sections:
+        epochs.setdefault(section.clock_epoch, []).append(section.measurements)
+    stamps = {
+        epoch: np.unique(np.concatenate([sensor.stamp_ns for m in of_epoch for sensor in m.sensors().values()]))
+        for epoch, of_epoch in epochs.items()
+        if any(m.sensors() for m in of_epoch)
+    }
+    for epoch, stamp_ns in stamps.items():
+        wheels = [m.first_odometry for m in epochs[epoch] if m.first_odometry is not None]
+        fixes = [m.gnss for m in epochs[epoch] if m.gnss is not None]
+        if not wheels or not fixes:
             continue
+        wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (wheels, fixes))
+        speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in wheels])
+        place_m = np.concatenate([each.position_enu_m[:, :2] for each in fixes])
         for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > _JUMP_NS]:
             step_s = float(np.diff(ends_ns)[0]) * 1e-9
-            at_s = float(ends_ns[1] - min(each[0] for each in stamps)) * 1e-9
-            driven = np.interp(ends_ns, odometry.stamp_ns, odometry.velocity_mps[:, 0])
-            moved_m = [np.diff(np.interp(ends_ns, m.gnss.stamp_ns, axis)) for axis in m.gnss.position_enu_m[:, :2].T]
+            at_s = float(ends_ns[1] - min(each[0] for each in stamps.values())) * 1e-9
+            driven = np.interp(ends_ns, wheels_ns, speed_mps)
+            moved_m = [np.diff(np.interp(ends_ns, fixes_ns, axis)) for axis in place_m.T]
             slowest_mps = float(np.abs(driven).min())
             if slowest_mps > _DRIVES_MPS and np.linalg.norm(moved_m) < 0.5 * slowest_mps * step_s:
                 span_s, names = (at_s, at_s), {"topics": "all topics"}

@@ -191,8 +191,8 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     contains the delay of power.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
-    clocks = info.report.facts.clock_offsets
-    off = clocks is not None and any(offset.noted and not offset.blamed for offset in clocks.offsets.values())
+    offsets = (offset for clocks in info.report.facts.clock_offsets for offset in clocks.offsets.values())
+    off = any(offset.noted and not offset.blamed for offset in offsets)
     # A step of all clocks leaves them together.
     return recorder or off or any(step.topics for step in streams.report.facts.clock_steps)
 

@@ -230,12 +230,12 @@ def find_liveliest_window_ns(m: Measurements) -> Ints | None:
         return None
     first_ns, last_ns = span
     begin = np.arange(first_ns, max(last_ns - _LONGEST_NS, first_ns) + 1, _STEP_NS, dtype=np.int64)
-    way_m = _compute_driven_m(m, np.concatenate((begin, begin + _LONGEST_NS)))
+    way_m = compute_driven_m(m, np.concatenate((begin, begin + _LONGEST_NS)))
     best = int(begin[np.argmax(way_m[begin.size :] - way_m[: begin.size])])
     return make_grid_ns(best, min(last_ns, best + _LONGEST_NS))
 
 
-def _compute_driven_m(m: Measurements, at_ns: Ints) -> NDArray[np.float64]:
+def compute_driven_m(m: Measurements, at_ns: Ints) -> NDArray[np.float64]:
     """Return the distance driven before each time [m], by the first sensor that measures it."""
     source = m.first_odometry
     if source is not None:

@@ -42,6 +42,7 @@ from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
     IMU,
+    PAUSE_NS,
     VISUAL,
     WHEELS,
     BodyVelocities,
@@ -83,20 +84,26 @@ class SensorExclusion:
     is_suspect_excludable: bool = False
 
 
+CONSTANT_FAULTS = frozenset({
+    "drives-backwards", "imu-rotated", "imu-sign", "imu-units", "path-mirrored", "unit-suspected", "velocity-frame", "yaw-rate-sign",
+})  # fmt: skip
+"""Codes of exclusions for units and mounting, which no restart of a clock changes."""
+
 Exclusions = dict[str, SensorExclusion]
 """By role, in order."""
 
 
 @dataclass(frozen=True, slots=True)
-class CommandedSpeed:
-    """Commanded forward velocity: stamps [ns] and values [m/s], in order."""
+class Command:
+    """Commands of a clock epoch: stamps [ns], forward velocity [m/s] and yaw rate [rad/s], in order, shape (N,) each."""
 
     stamp_ns: NDArray[np.int64]
     forward_velocity_mps: Floats
+    yaw_rate_radps: Floats
 
 
 def check_sensors(
-    m: Measurements, *, command: CommandedSpeed | None, stated: Mapping[str, bool], felt: float
+    m: Measurements, *, command: Command | None, stated: Mapping[str, bool], felt: float
 ) -> tuple[Exclusions, dict[str, float]]:
     """Return which sensors of a clock epoch are not to be fused, and the scale of an odometry that is far from 1.
 
@@ -365,11 +372,11 @@ _SAME_WAY = 0.5
 
 
 def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
-    """Return the rate of an IMU whose samples are mostly too far apart to show the motion between them."""
-    step_s = np.diff(stamp_ns) * 1e-9
-    span_s = float(step_s.sum())
-    is_slow = span_s == 0.0 or float(step_s[step_s < _SLOWEST_S].sum()) < 0.5 * span_s
-    return step_s.size / max(span_s, 1.0) if is_slow else None
+    """Return the median rate of an IMU whose samples are mostly too far apart to show the motion between them; pauses do not count."""
+    step_ns = np.diff(stamp_ns)
+    known_s = step_ns[step_ns <= PAUSE_NS] * 1e-9
+    is_slow = known_s.size == 0 or float(known_s[known_s < _SLOWEST_S].sum()) < 0.5 * float(known_s.sum())
+    return 1e9 / float(np.median(step_ns)) if is_slow and step_ns.size else 0.0 if is_slow else None
 
 
 def _find_frozen_imu(imu: InertialMeasurements) -> Exclusions:
@@ -573,7 +580,7 @@ _DRIVES_MPS = 0.3  # motors round slower commands
 _FASTER = 1.03  # of a command: no controller overshoots more
 
 
-def compute_command_ratio(wheels: BodyVelocities, command: CommandedSpeed) -> float | None:
+def compute_command_ratio(wheels: BodyVelocities, command: Command) -> float | None:
     """Return the ratio of the wheels' speed to the commanded speed, where that is surely too fast; else None.
 
     Only times count in which a command has been constant for three seconds: a robot that brakes is faster than its command.

@@ -7,7 +7,7 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages import fuse as stage
-from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_inputs import Section
 from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.findings import Subject
 from tcpipe.tables.levels import Sensor, Streams
@@ -29,7 +29,7 @@ def inputs(*, visual=True, imu=True):
         wheels=odometry(),
         visual=odometry() if visual else None,
     )
-    return FusionInputs((15.0, 47.0, 400.0), {0: heard})
+    return Section(0, heard, datum_deg_m=(15.0, 47.0, 400.0))
 
 
 @pytest.fixture
@@ -39,11 +39,10 @@ def fusing(monkeypatch):
 
     def put(lost=()):
         def fuse(given, *_):
-            (heard,) = given.measurements.values()
-            tried.append(frozenset(heard.sensors()))
+            tried.append(frozenset(given.measurements.sensors()))
             return Fused(found=[None], windows=20, astray=12 if tried[-1] in lost else 0)
 
-        monkeypatch.setattr(stage, "fuse_sections", fuse)
+        monkeypatch.setattr(stage, "fuse_section", fuse)
         return tried
 
     return put
@@ -51,7 +50,7 @@ def fusing(monkeypatch):
 
 def recovered(given):
     found, _ = stage.fuse_recovering(given, STREAMS, FuseConfig(), run=Subject("run", "r"))
-    return set(found.measurements[0].sensors()), {role: of.code for role, of in found.excluded.items()}
+    return set(found.measurements.sensors()), {role: of.code for role, of in found.excluded.items()}
 
 
 def test_a_track_that_follows_its_sensors_is_fused_once(fusing):
