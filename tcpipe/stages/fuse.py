@@ -5,8 +5,9 @@ Time offsets between the clocks of sensors are taken out before fusion. Power is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from typing import Any, cast
 
@@ -15,7 +16,6 @@ import numpy as np
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, shift_stamps
-from tcpipe.fusion.checks.lags import find_span_ns
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, Measurements, Trajectory
 from tcpipe.logs.clocks import LOG_CLOCK
@@ -40,7 +40,7 @@ from tcpipe.stages.fuse_inputs import (
     use_pose_as_fixes,
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_section, make_rejections_table
-from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks, StageFacts
+from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, select_findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -90,23 +90,16 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
         *([make_finding("direction-assumed", Subject("role", GNSS))] if fused.is_forward_assumed else []),
         *audit.findings,
         *find_offsets(sections, streams),
-        *dict(find_clock_jumps(sections)).values(),
+        *sections[0].cuts.values(),
     )
-    facts = StageFacts(
-        fuse=summary,
-        sensor_checks=SensorChecks({finding.subject.name: finding.code for finding in reversed(exclusions)}),
-        audit=audit.facts,
-        clock_offsets=tuple(section.clocks for section in sections if section.clocks is not None),
-    )
+    facts: dict[str, Any] = {
+        "fuse": summary,
+        "sensor_checks": SensorChecks({finding.subject.name: finding.code for finding in reversed(exclusions)}),
+        "audit": audit.facts,
+        "clock_offsets": tuple(section.clocks for section in sections if section.clocks is not None),
+    }
     findings, facts = rename_role((findings, facts), GNSS, fixes)
-    facts = replace(
-        read.facts,
-        fuse=facts.fuse,
-        sensor_checks=facts.sensor_checks,
-        audit=facts.audit,
-        clock_offsets=facts.clock_offsets,
-    )
-    report = StageReport((*_drop_places(read.findings, findings), *findings), facts)
+    report = StageReport((*_drop_places(read.findings, findings), *findings), replace(read.facts, **facts))
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
     return Track(table, make_rejections_table(sections, fused.found, fixes), info)
 
@@ -116,38 +109,49 @@ def fuse_sections(
 ) -> tuple[list[Section], Fused, list[Finding]]:
     """Return the sections as they were fused, their track, and why some have none.
 
-    Each section is fused again without a sensor that leads its track away from all others, and on the clock of a sensor as it is where
-    the estimate finds that it steps: it has no offset. Where one section has a place on the earth, those without fixes are skipped.
+    Where one section has a place on the earth, those without fixes are skipped.
 
     Raises `FusionError`: no section can be fused, and the track of one contradicts every sensor.
     """
-    given, used, tracks, errors = [*sections], list[Section](), list[Fused](), list[FusionError]()
-    for place in range(len(given)):
-        last = next((track.found[-1] for track in reversed(tracks) if track.found), None)
-        section = correct_clocks(given)[place]
-        used.append(section)
-        tracks.append(Fused())
+    used, tracks, errors = correct_clocks(sections), list[Fused](), list[FusionError]()
+    last: Trajectory | None = None
+    for place, section in enumerate(used):
+        fuse = partial(fuse_recovering, streams=streams, config=config, run=run, last=last)
         try:
-            used[place], tracks[place] = fuse_recovering(section, streams, config, run=run, last=last)
-            unsteady = {each.role for facts in tracks[place].facts for each in facts.changes if each.kind == "clock"}
-            if (clocks := section.clocks) is not None and not unsteady.isdisjoint(_list_offsets(clocks)):
-                steady = {role: offset for role, offset in clocks.offsets.items() if role not in unsteady}
-                given[place] = replace(given[place], clocks=replace(clocks, offsets=steady))
-                section = correct_clocks(given)[place]
-                used[place], tracks[place] = fuse_recovering(section, streams, config, run=run, last=last)
+            used[place], track = _fuse_on_steady_clocks(sections, place, fuse)
+            last = track.found[-1] if track.found else last
         except FusionError as error:
             errors.append(error)
-            tracks[place] = Fused(skipped_s=find_middle_ns(section.measurements)[1])
-    fused = Fused()
+            track = _skip(section)
+        tracks.append(track)
     has_place = any(section.datum_deg_m and track.found for section, track in zip(used, tracks, strict=True))
+    fused = Fused()
     for section, track in zip(used, tracks, strict=True):
-        is_placeless = has_place and section.datum_deg_m is None
-        fused.append(Fused(skipped_s=find_middle_ns(section.measurements)[1]) if is_placeless else track)
+        fused.append(_skip(section) if has_place and section.datum_deg_m is None else track)
     if errors and not fused.found:
-        problems, findings = ([*each] for each in zip(*((e.problems, e.findings) for e in errors), strict=True))
-        raise FusionError(*chain(*problems), findings=merge_findings(chain(*findings)))
+        findings = merge_findings(chain(*(error.findings for error in errors)))
+        raise FusionError(*chain(*(error.problems for error in errors)), findings=findings)
     failures = (finding for error in errors for finding in error.findings if finding.severity == "error")
     return used, fused, [replace(finding, severity="warning") for finding in failures]
+
+
+def _skip(section: Section) -> Fused:
+    return Fused(skipped_s=float(np.diff(section.span_ns)[0]) * 1e-9)
+
+
+def _fuse_on_steady_clocks(
+    sections: Sequence[Section], place: int, fuse: Callable[[Section], tuple[Section, Fused]]
+) -> tuple[Section, Fused]:
+    """Fuse one of the sections, and again without the offset of a clock that the estimate finds to step."""
+    section = correct_clocks(sections)[place]
+    used, track = fuse(section)
+    unsteady = {change.role for facts in track.facts for change in facts.changes if change.kind == "clock"}
+    if section.clocks is None or unsteady.isdisjoint(_list_offsets(section.clocks)):
+        return used, track
+    steady = {role: offset for role, offset in section.clocks.offsets.items() if role not in unsteady}
+    given = [*sections]
+    given[place] = replace(given[place], clocks=replace(section.clocks, offsets=steady))
+    return fuse(correct_clocks(given)[place])
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
@@ -164,9 +168,9 @@ def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Itera
 
 def _find_nothing(streams: Streams, sections: Sequence[Section], run: Subject) -> Finding:
     rows: dict[str, Any] = {f"{role}_row_count": table.num_rows for role, table in streams.tables.items()}
-    for role, stamps in (item for section in sections for item in section.invalid_ns.items()):
-        if stamps.size:
-            rows[f"{role}_unusable_count"] = rows.get(f"{role}_unusable_count", 0) + stamps.size
+    for role, each in (item for section in sections for item in section.prepared.items()):
+        if each.invalid_ns.size:
+            rows[f"{role}_unusable_count"] = rows.get(f"{role}_unusable_count", 0) + each.invalid_ns.size
     return make_finding("no-motion", run, **rows)
 
 
@@ -194,7 +198,7 @@ def fuse_recovering(
         return recovered[IMU]
     if len(recovered) == 1:
         return next(iter(recovered.values()))
-    span_s = find_span_s(*(find_span_ns(inputs.measurements) or (0, 0)), streams)
+    span_s = find_span_s(*inputs.span_ns, streams)
     finding = make_finding(
         "track-contradicts-sensors", run, span_s=span_s, astray_fraction=fused.astray / fused.windows
     )
@@ -253,8 +257,8 @@ def correct_clocks(sections: Sequence[Section]) -> list[Section]:
             if role in sensors
         }
         corrected.append(replace(section, measurements=section.measurements.replace_sensors(shifted)))
-    cuts_ns = tuple(dict(find_clock_jumps(corrected)))
-    return [replace(section, cuts_ns=cuts_ns) for section in corrected]
+    cuts = dict(find_clock_jumps(corrected))
+    return [replace(section, cuts=cuts) for section in corrected]
 
 
 def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]:
@@ -262,8 +266,8 @@ def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]
     findings = []
     for section in sorted(sections, key=lambda section: -section.driven_m):
         for role in _list_offsets(section.clocks):
-            clocks, ends_ns = cast("ClockFacts", section.clocks), find_span_ns(section.measurements) or (0, 0)
-            offset, span_s = clocks.offsets[role], find_span_s(*ends_ns, streams)
+            clocks, span_s = cast("ClockFacts", section.clocks), find_span_s(*section.span_ns, streams)
+            offset = clocks.offsets[role]
             finding = _find_offset(clocks, role, offset, streams, span_s[1] - span_s[0])
             findings.append(replace(finding, span_s=span_s) if len(sections) > 1 else finding)
     return merge_findings(findings)

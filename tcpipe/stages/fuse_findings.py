@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -64,10 +63,15 @@ def make_fuse_facts(
 
 
 def _add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
-    total: dict[str, Counter[str]] = {}
-    for role, counts in (item for section in inputs for item in section.counts.items()):
-        total.setdefault(role, Counter()).update(counts)
-    return {role: dict(counts) for role, counts in total.items()}
+    total: dict[str, dict[str, int]] = {}
+    for role, each in (item for section in inputs for item in section.prepared.items()):
+        counts = {
+            "invalid": each.invalid_ns.size,
+            "repeated": each.repeated,
+            "variances_replaced": each.variances_replaced,
+        }
+        total[role] = {name: count + total.get(role, {}).get(name, 0) for name, count in counts.items()}
+    return total
 
 
 def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:

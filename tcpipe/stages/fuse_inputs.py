@@ -59,11 +59,11 @@ class Section:
     ----------
     command : last command of its clock epoch; None without commands.
     datum_deg_m : longitude, latitude, height of the local frame's origin; None without fixes.
-    invalid_ns, counts : by role, stamps of messages without a usable value, and counts of messages that are not used as they are.
+    prepared : by role, messages that are not used as they are.
     excluded : by role, why a sensor is not fused.
     scales : by odometry, the scale that was taken out.
     clocks : time offsets of the sensors; ``measurements`` contain them until `tcpipe.stages.fuse.correct_clocks`.
-    cuts_ns : first stamps after the clock of all sensors was set forward.
+    cuts : by first stamp [ns] after the clock of all sensors was set forward, the finding.
     is_base_free : whether no other section shows where base_link is.
     """
 
@@ -71,20 +71,23 @@ class Section:
     measurements: Measurements = field(default_factory=Measurements)
     command: Command | None = None
     datum_deg_m: tuple[float, float, float] | None = None
-    invalid_ns: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
-    counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    prepared: Mapping[str, Prepared] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     excluded: Mapping[str, Finding] = field(default_factory=dict)
     scales: Mapping[str, float] = field(default_factory=dict)
     clocks: ClockFacts | None = None
-    cuts_ns: tuple[int, ...] = ()
+    cuts: Mapping[int, Finding] = field(default_factory=dict)
     is_base_free: bool = False
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp of a measurement [ns]."""
+        return find_span_ns(self.measurements) or (0, 0)
 
     @property
     def driven_m(self) -> float:
         """Distance that the first sensor of motion measures [m]: how much the section shows of its sensors."""
-        span_ns = find_span_ns(self.measurements)
-        return 0.0 if span_ns is None else float(np.diff(compute_driven_m(self.measurements, np.array(span_ns)))[0])
+        return float(np.diff(compute_driven_m(self.measurements, np.array(self.span_ns)))[0])
 
 
 _PAUSE_NS = 3_600_000_000_000
@@ -122,25 +125,18 @@ def _prepare_section(
     tables: Mapping[str, pa.Table], streams: Streams, config: FuseConfig, datum: tuple[float, float, float] | None
 ) -> Section:
     every = {role: _prepare(role, part, streams.sensors[role], config, datum) for role, part in tables.items()}
+    prepared: dict[str, Prepared] = {role: each for role, (_, each) in every.items()}
     found = {role: sensor for role, (sensor, _) in every.items() if sensor is not None and sensor.stamp_ns.size}
-    counts = {
-        role: {
-            "invalid": prepared.invalid_ns.size,
-            "repeated": prepared.repeated,
-            "variances_replaced": prepared.variances_replaced,
-        }
-        for role, (_, prepared) in every.items()
-    }
-    findings = [finding for _, prepared in every.values() for finding in prepared.findings]
+    findings = [finding for each in prepared.values() for finding in each.findings]
     if config.estimator == "ukf" and DOPPLER in streams.tables:
         names = {"estimator": config.estimator}
         findings.insert(0, make_finding("unused-by-estimator", Subject("role", DOPPLER), names=names))
     gnss, odometry = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL)
     if gnss is not None:
         gnss = align_mounting(gnss, odometry, is_stated=streams.sensors[GNSS].placed_by != "assumed")
-        count = gnss.stamp_ns.size
+        repeated = prepared[GNSS].repeated + gnss.stamp_ns.size
         gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
-        counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
+        prepared[GNSS] = replace(prepared[GNSS], repeated=repeated - gnss.stamp_ns.size)
         findings += [_find_frozen(each, streams) for each in repeats]
     if gnss is not None and odometry is not None:
         gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
@@ -149,8 +145,7 @@ def _prepare_section(
         0,
         Measurements(nonholonomic_std_mps=config.nonholonomic_std_mps).replace_sensors(found | {GNSS: gnss}),
         datum_deg_m=datum,
-        invalid_ns={role: prepared.invalid_ns for role, (_, prepared) in every.items()},
-        counts=counts,
+        prepared=prepared,
         findings=tuple(dict.fromkeys(findings)),
     )
 
@@ -286,26 +281,17 @@ def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
 def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings of several sections, those of one code and subject as one that has the first one's numbers.
 
-    Two time offsets that differ by more than their uncertainty (2σ) are two findings, and none has a remedy: the recipe states one.
+    Time offsets that differ by a tenth of a second stay apart, and have no remedy: the recipe states one.
     """
-    merged: list[Finding] = []
+    merged: dict[tuple[str, Subject, float], Finding] = {}
     for finding in findings:
-        alike = [place for place, other in enumerate(merged) if _is_same(finding, other)]
-        if not alike:
-            merged.append(finding)
-            continue
-        first = merged[alike[0]]
-        spans = [each.span_s for each in (first, finding) if each.span_s is not None]
-        span_s = (min(start for start, _ in spans), max(end for _, end in spans)) if spans else None
-        merged[alike[0]] = replace(first, span_s=span_s)
-    offsets = Counter(finding.subject for finding in merged if "offset_s" in finding.numbers)
-    return [replace(finding, remedies=()) if offsets[finding.subject] > 1 else finding for finding in merged]
-
-
-def _is_same(a: Finding, b: Finding) -> bool:
-    off_s = abs(a.numbers.get("offset_s", 0.0) - b.numbers.get("offset_s", 0.0))
-    within_s = a.numbers.get("offset_2std_s", 0.0) + b.numbers.get("offset_2std_s", 0.0)
-    return (a.code, a.subject) == (b.code, b.subject) and off_s <= within_s
+        key = finding.code, finding.subject, round(finding.numbers.get("offset_s", 0.0), 1)
+        first = merged.setdefault(key, finding)
+        if first.span_s and finding.span_s:
+            (begin_s, end_s), (other_s, last_s) = first.span_s, finding.span_s
+            merged[key] = replace(first, span_s=(min(begin_s, other_s), max(end_s, last_s)))
+    offsets = Counter(finding.subject for finding in merged.values() if "offset_s" in finding.numbers)
+    return [replace(each, remedies=()) if offsets[each.subject] > 1 else each for each in merged.values()]
 
 
 def read_command(streams: Streams, epoch: int) -> Command | None:

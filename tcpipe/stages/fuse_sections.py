@@ -58,7 +58,7 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
     """Fuse each part of a section between pauses; a local frame goes on from the end of ``last``, the track before it."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
-    for part in cut_sections({section.clock_epoch: section.measurements}, section.cuts_ns):
+    for part in cut_sections({section.clock_epoch: section.measurements}, tuple(section.cuts)):
         m, output_ns = part.measurements, make_track_stamps(part, period_ns=period_ns, max_gap_ns=max_gap_ns)
         if output_ns.size == 0 or (section.datum_deg_m is not None and m.gnss is None):
             fused.skipped_s += (part.end_ns - part.start_ns) * 1e-9
@@ -206,7 +206,7 @@ def make_power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *
 def make_rejections_table(sections: Sequence[Section], found: Sequence[Trajectory], fixes: str = GNSS) -> pa.Table:
     """Return every rejected measurement in order of time: by the gate, or without a usable value; ``fixes`` is the role of fixes."""
     parts = [trajectory.rejections for trajectory in found]
-    invalid = [(role, stamps) for section in sections for role, stamps in sorted(section.invalid_ns.items())]
+    invalid = [(role, each.invalid_ns) for section in sections for role, each in sorted(section.prepared.items())]
     size = sum(stamps.size for _, stamps in invalid)
     unknown = np.full(size, np.nan)
     columns = {

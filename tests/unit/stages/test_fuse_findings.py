@@ -14,6 +14,7 @@ from tcpipe.fusion.measurements import (
     Positions,
     TrackSection,
 )
+from tcpipe.fusion.preparation import Prepared
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts
 from tcpipe.stages.fuse_inputs import Section, prepare_sections, read_command
@@ -36,8 +37,8 @@ def warned(inputs, *stretches, skipped_s=0.0):
     return find_fuse_findings([inputs], facts, run=Subject("run", "r"))
 
 
-def counts(**said):
-    return {"invalid": 0, "repeated": 0, "variances_replaced": 0} | said
+def prepared(*, invalid=0, repeated=0, variances_replaced=0):
+    return Prepared(np.zeros(invalid, np.int64), repeated, variances_replaced)
 
 
 def test_changes_of_one_kind_that_overlap_are_one_finding():
@@ -55,13 +56,17 @@ def test_changes_of_one_kind_that_overlap_are_one_finding():
 def test_stretches_add_up_and_their_innovations_are_averaged_by_count():
     first = stretch(nis_mean={"gnss": 1.0, "imu": None}, measurements={"gnss": 30, "imu": 5}, rejected={"gnss": 3})
     second = stretch(nis_mean={"gnss": 2.0}, measurements={"gnss": 10}, rejected={"gnss": 4}, sensors=("gnss",))
-    inputs = Section(0, datum_deg_m=PLACE, counts={"gnss": counts(invalid=2)})
+    inputs = Section(0, datum_deg_m=PLACE, prepared={"gnss": prepared(invalid=2)})
     facts = make_fuse_facts([inputs], [first, second], rows=7, skipped_s=1.5)
     assert facts.measurements == {"gnss": 40, "imu": 5}
     assert facts.rejected == {"gnss": 7, "imu": 0}
     assert facts.nis_mean == {"gnss": pytest.approx(1.25)}
     assert facts.sensors == ALL
-    assert (facts.rows, facts.skipped_s, facts.set_aside) == (7, 1.5, inputs.counts)
+    assert (facts.rows, facts.skipped_s, facts.set_aside) == (
+        7,
+        1.5,
+        {"gnss": {"invalid": 2, "repeated": 0, "variances_replaced": 0}},
+    )
     assert facts.stretches == (first, second)
 
 
@@ -81,7 +86,7 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
 
 
 def test_nothing_is_said_where_nothing_is_odd():
-    inputs = Section(0, datum_deg_m=PLACE, counts={"gnss": counts(repeated=5)})
+    inputs = Section(0, datum_deg_m=PLACE, prepared={"gnss": prepared(repeated=5)})
     assert warned(inputs, stretch(measurements={"gnss": 10}, rejected={"gnss": 1})) == ()
 
 
@@ -117,7 +122,7 @@ def test_without_fixes_they_would_show_the_scale():
 
 def test_a_track_without_a_place_is_a_finding():
     assert warned(Section(0), stretch()) == ()  # a log without fixes was found when it was read
-    (finding,) = warned(Section(0, counts={"gnss": counts()}), stretch())
+    (finding,) = warned(Section(0, prepared={"gnss": prepared()}), stretch())
     assert finding.code == "local-frame"
 
 
@@ -134,7 +139,11 @@ def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was
     inputs = Section(
         0,
         datum_deg_m=PLACE,
-        counts={"gnss": counts(variances_replaced=4), "imu": counts(invalid=2), "visual_odometry": counts(invalid=9)},
+        prepared={
+            "gnss": prepared(variances_replaced=4),
+            "imu": prepared(invalid=2),
+            "visual_odometry": prepared(invalid=9),
+        },
         findings=(sleeps, blind),
         excluded={"visual_odometry": make_finding("imu-no-acceleration", Subject("role", "visual_odometry"))},
     )
