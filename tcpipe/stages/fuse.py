@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from tcpipe.stages.fuse_inputs import (
     find_span_s,
     merge_findings,
     prepare_sections,
+    rank_sections,
     rename_role,
     use_pose_as_fixes,
 )
@@ -96,7 +97,7 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
         "fuse": summary,
         "sensor_checks": SensorChecks({finding.subject.name: finding.code for finding in reversed(exclusions)}),
         "audit": audit.facts,
-        "clock_offsets": tuple(section.clocks for section in sections if section.clocks is not None),
+        "clock_offsets": tuple(section.clocks for section in sections),
     }
     findings, facts = rename_role((findings, facts), GNSS, fixes)
     report = StageReport((*_drop_places(read.findings, findings), *findings), replace(read.facts, **facts))
@@ -146,7 +147,7 @@ def _fuse_on_steady_clocks(
     section = correct_clocks(sections)[place]
     used, track = fuse(section)
     unsteady = {change.role for facts in track.facts for change in facts.changes if change.kind == "clock"}
-    if section.clocks is None or unsteady.isdisjoint(_list_offsets(section.clocks)):
+    if unsteady.isdisjoint(section.offsets):
         return used, track
     steady = {role: offset for role, offset in section.clocks.offsets.items() if role not in unsteady}
     given = [*sections]
@@ -225,11 +226,11 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
     """
     found = [*sections]
     shown: dict[str, tuple[ClockOffset, str, int]] = {}
-    for place in sorted(range(len(sections)), key=lambda place: -sections[place].driven_m):
+    for place in rank_sections(sections):
         m = sections[place].measurements
         clocks, middle_ns = find_clock_offsets(m, clock_epoch=sections[place].clock_epoch), find_middle_ns(m)[0]
-        own = {role: (clocks.offsets[role], clocks.reference, middle_ns) for role in _list_offsets(clocks)}
-        for role in shown.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}:
+        own = {role: (offset, clocks.reference, middle_ns) for role, offset in clocks.offsets.items() if offset.noted}
+        for role in sorted(shown.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}):
             offset, reference, at_ns = shown[role]
             if offset.drift_ppm:
                 drift_s = offset.drift_ppm * 1e-6 * (middle_ns - at_ns) * 1e-9
@@ -240,21 +241,14 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
     return found
 
 
-def _list_offsets(clocks: ClockFacts | None) -> list[str]:
-    """Return the roles with an offset that is corrected."""
-    return [role for role, offset in clocks.offsets.items() if offset.noted] if clocks is not None else []
-
-
 def correct_clocks(sections: Sequence[Section]) -> list[Section]:
     """Return the sections on one clock each: offset and drift of each clock, about the middle of its section, are taken out."""
     corrected = []
     for section in sections:
         sensors, middle_ns = section.measurements.sensors(), find_middle_ns(section.measurements)[0]
-        offsets = {} if section.clocks is None else section.clocks.offsets
         shifted = {
-            role: replace(sensors[role], stamp_ns=shift_stamps(sensors[role].stamp_ns, offsets[role], middle_ns))
-            for role in _list_offsets(section.clocks)
-            if role in sensors
+            role: replace(sensors[role], stamp_ns=shift_stamps(sensors[role].stamp_ns, offset, middle_ns))
+            for role, offset in section.offsets.items()
         }
         corrected.append(replace(section, measurements=section.measurements.replace_sensors(shifted)))
     cuts = dict(find_clock_jumps(corrected))
@@ -264,11 +258,10 @@ def correct_clocks(sections: Sequence[Section]) -> list[Section]:
 def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]:
     """Return the findings on clocks; those of several sections name the time of theirs."""
     findings = []
-    for section in sorted(sections, key=lambda section: -section.driven_m):
-        for role in _list_offsets(section.clocks):
-            clocks, span_s = cast("ClockFacts", section.clocks), find_span_s(*section.span_ns, streams)
-            offset = clocks.offsets[role]
-            finding = _find_offset(clocks, role, offset, streams, span_s[1] - span_s[0])
+    for section in (sections[place] for place in rank_sections(sections)):
+        span_s = find_span_s(*section.span_ns, streams)
+        for role, offset in section.offsets.items():
+            finding = _find_offset(section.clocks, role, offset, streams, span_s[1] - span_s[0])
             findings.append(replace(finding, span_s=span_s) if len(sections) > 1 else finding)
     return merge_findings(findings)
 

@@ -43,7 +43,7 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.arrays import select_rows
 from tcpipe.tables.columns import read_float_columns, to_floats, to_integers
-from tcpipe.tables.facts import ClockFacts
+from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
@@ -75,7 +75,7 @@ class Section:
     findings: tuple[Finding, ...] = ()
     excluded: Mapping[str, Finding] = field(default_factory=dict)
     scales: Mapping[str, float] = field(default_factory=dict)
-    clocks: ClockFacts | None = None
+    clocks: ClockFacts = field(default_factory=lambda: ClockFacts(0, "", (), {}))
     cuts: Mapping[int, Finding] = field(default_factory=dict)
     is_base_free: bool = False
 
@@ -85,9 +85,20 @@ class Section:
         return find_span_ns(self.measurements) or (0, 0)
 
     @property
+    def offsets(self) -> dict[str, ClockOffset]:
+        """By role, the time offsets that are corrected."""
+        sensors = self.measurements.sensors()
+        return {role: offset for role, offset in self.clocks.offsets.items() if offset.noted and role in sensors}
+
+    @property
     def driven_m(self) -> float:
         """Distance that the first sensor of motion measures [m]: how much the section shows of its sensors."""
         return float(np.diff(compute_driven_m(self.measurements, np.array(self.span_ns)))[0])
+
+
+def rank_sections(sections: Sequence[Section]) -> list[int]:
+    """Return the indices of sections from the longest drive to the shortest."""
+    return sorted(range(len(sections)), key=lambda place: -sections[place].driven_m)
 
 
 _PAUSE_NS = 3_600_000_000_000
@@ -220,7 +231,7 @@ def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> l
     judged = list(sections)
     constants: dict[str, SensorExclusion] = {}
     scales: dict[str, float] = {}
-    for place in sorted(range(len(sections)), key=lambda place: -sections[place].driven_m):
+    for place in rank_sections(sections):
         section = sections[place]
         roles = section.measurements.sensors()
         known = {role: scale for role, scale in scales.items() if role in roles}
@@ -274,8 +285,7 @@ def _define_base_by_antenna(sections: Sequence[Section], streams: Streams) -> li
 
 def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
     """Return the findings of all excluded sensors; the same of several sections as one, over the time of all."""
-    longest = sorted(sections, key=lambda section: -section.driven_m)
-    return merge_findings(finding for section in longest for finding in section.excluded.values())
+    return merge_findings(finding for place in rank_sections(sections) for finding in sections[place].excluded.values())
 
 
 def merge_findings(findings: Iterable[Finding]) -> list[Finding]:

@@ -21,6 +21,7 @@ from tcpipe.stages.fuse_findings import make_audit_findings
 from tcpipe.stages.fuse_inputs import Section, drop_implausible_sensors, find_exclusions
 from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import COMMAND, Sensor, Streams
 
 SECONDS = 40.0
@@ -63,6 +64,7 @@ def test_a_few_messages_of_1970_need_no_memory_and_change_nothing_after_them(str
         np.testing.assert_allclose(to_floats(now, name), to_floats(whole.table, name), atol=1e-6)
 
 
+PLACE = ("lon_deg", "lat_deg", "alt_m")
 DAYS_NS = 3 * 86_400 * 10**9
 ROLES = ("gnss", "imu", "wheel_odometry", "visual_odometry", "command")
 FIRST = filled(COMMAND, np.zeros(1, np.int64), forward_velocity_mps=np.zeros(1), yaw_rate_radps=np.zeros(1))
@@ -159,3 +161,21 @@ def test_the_commands_of_the_shorter_epoch_show_that_its_wheels_are_too_fast(sen
     assert audit.facts.undecided == ("wheel_odometry",)
     assert audit.findings[0].numbers["speed_ratio"] == pytest.approx(1.25)
     assert make_audit_findings(Fused(), sections[:1], STREAMS).facts.undecided == ()
+
+
+def test_fixes_that_are_frozen_in_one_epoch_take_no_place_from_the_other(streams):
+    tables = {}
+    for role, table in streams.tables.items():
+        stamp = to_integers(table, "stamp_ns")
+        again = with_columns(table, stamp_ns=stamp + DAYS_NS, clock_epoch=np.ones(stamp.size, np.int16))
+        if role == "gnss":
+            again = with_columns(again, **{name: np.full(stamp.size, to_floats(table, name)[0]) for name in PLACE})
+        tables[role] = pa.concat_tables([table, again])
+    whole = fuse_run(streams, FuseConfig(), run_id="r")
+    track = fuse_run(replace(streams, tables=tables), FuseConfig(), run_id="r")
+    assert track.table.equals(whole.table)
+    assert track.info.datum == whole.info.datum
+    (frozen,) = select_findings(track.info.report.findings, "frozen")
+    assert frozen.span_s[0] == pytest.approx(DAYS_NS * 1e-9, abs=1.0)
+    (skipped,) = select_findings(track.info.report.findings, "sections-skipped")
+    assert skipped.numbers["skipped_s"] == pytest.approx(SECONDS, abs=2.0)

@@ -1,5 +1,7 @@
 """Which sensor is left out where the track contradicts all of them: the one without which it recovers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,3 +87,12 @@ def test_a_track_that_goes_astray_whatever_is_left_out_is_refused(fusing):
         recovered(inputs())
     (finding,) = error.value.findings
     assert (finding.code, finding.numbers) == ("track-contradicts-sensors", {"astray_fraction": 0.6})
+
+
+def test_an_epoch_that_contradicts_every_sensor_costs_only_its_own_track(fusing):
+    roles = frozenset(ROLES) - {"visual_odometry"}
+    fusing(lost=[roles, *(roles - {role} for role in roles)])
+    sections = [inputs(), replace(inputs(visual=False), clock_epoch=1)]
+    _, fused, (failure,) = stage.fuse_sections(sections, STREAMS, FuseConfig(), run=Subject("run", "r"))
+    assert (fused.windows, fused.astray) == (20, 0)
+    assert (failure.code, failure.severity) == ("track-contradicts-sensors", "warning")
