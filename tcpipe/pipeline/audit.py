@@ -14,7 +14,7 @@ from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.fusion.measurements import DOPPLER, FIXES, GNSS, VISUAL, WHEELS, BodyVelocities, Positions
+from tcpipe.fusion.measurements import DOPPLER, FIXES, GNSS, PAUSE_NS, VISUAL, WHEELS, BodyVelocities, Positions
 from tcpipe.fusion.withheld import (
     CHORDS_S,
     END_S,
@@ -111,7 +111,7 @@ def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> It
     facts = track.info.report.facts
     if role == GNSS and facts.sensor_checks is not None and not facts.sensor_checks.excluded.keys().isdisjoint(FIXES):
         raise FusionError("tcpipe excludes the other fixes of the run")
-    rows = _select_rows(track, run.section.clock_epoch)
+    rows = _select_rows(track, run.section)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])
     if not moving.any():
         raise FusionError("the rest has no track in the windows, or the robot is stationary there")
@@ -156,7 +156,7 @@ def _move_origin(fixes: Positions, section: Section, track: Track) -> Positions:
 
 def _compare_lengths(run: _Run) -> dict[str, float]:
     """Return the horizontal length of the track over the distance that each odometry measures, by role."""
-    rows = _select_rows(run.fuse(run.streams), run.section.clock_epoch)
+    rows = _select_rows(run.fuse(run.streams), run.section)
     if rows.stamp_ns.size == 0:
         return {}
     length_m = rows.measure_length_m(int(rows.stamp_ns[0]), int(rows.stamp_ns[-1]) + 1)
@@ -169,8 +169,10 @@ def _compare_lengths(run: _Run) -> dict[str, float]:
     return ratios
 
 
-def _select_rows(track: Track, epoch: int) -> TrackRows:
-    table = select_rows(track.table, "clock_epoch", epoch)
+def _select_rows(track: Track, section: Section) -> TrackRows:
+    table, (start_ns, end_ns) = select_rows(track.table, "clock_epoch", section.clock_epoch), section.span_ns
+    stamp_ns = to_integers(table, "stamp_ns")
+    table = table.filter(number_column((stamp_ns >= start_ns - PAUSE_NS) & (stamp_ns <= end_ns + PAUSE_NS)))
     return TrackRows(to_integers(table, "stamp_ns"), read_float_columns(table), track.info.rate_hz)
 
 

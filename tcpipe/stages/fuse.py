@@ -5,10 +5,9 @@ Time offsets between the clocks of sensors are taken out before fusion. Power is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_findings import (
+    add_counts,
     find_fuse_findings,
     find_parameter_findings,
     make_audit_findings,
@@ -67,11 +67,12 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     streams, is_local = use_pose_as_fixes(streams)
     sections = find_clocks(drop_implausible_sensors(prepare_sections(streams, config), streams))
     # 2. Initial state, filter and smoother of each section.
-    sections, fused, failures = fuse_sections(sections, streams, config, run=run)
+    sections, fused, errors = fuse_sections(sections, streams, config, run=run)
+    failures = merge_findings(finding for error in errors for finding in error.findings)
     if not fused.found:
-        raise FusionError(
-            "no motion to fuse", findings=(_find_nothing(streams, sections, run), *find_exclusions(sections))
-        )
+        problems = [problem for error in errors for problem in error.problems] or ["no motion to fuse"]
+        nothing = [] if errors else [_find_nothing(streams, sections, run), *find_exclusions(sections)]
+        raise FusionError(*problems, findings=(*failures, *nothing))
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
     is_local |= bool(np.isnan(columns["lon_deg"]).all())
     if is_local:
@@ -85,7 +86,7 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     exclusions = find_exclusions(sections)
     findings = (
         *find_fuse_findings(sections, summary, run=run),
-        *failures,
+        *(replace(finding, severity="warning") for finding in failures if finding.severity == "error"),
         *exclusions,
         *find_parameter_findings(sections, summary, streams),
         *([make_finding("direction-assumed", Subject("role", GNSS))] if fused.is_forward_assumed else []),
@@ -107,52 +108,36 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
 
 def fuse_sections(
     sections: Sequence[Section], streams: Streams, config: FuseConfig, *, run: Subject
-) -> tuple[list[Section], Fused, list[Finding]]:
+) -> tuple[list[Section], Fused, list[FusionError]]:
     """Return the sections as they were fused, their track, and why some have none.
 
-    Where one section has a place on the earth, those without fixes are skipped.
-
-    Raises `FusionError`: no section can be fused, and the track of one contradicts every sensor.
+    A section is fused again without the offset of a clock that its estimate finds to step. Where one section has a place on the earth,
+    those without fixes are skipped.
     """
-    used, tracks, errors = correct_clocks(sections), list[Fused](), list[FusionError]()
-    last: Trajectory | None = None
-    for place, section in enumerate(used):
+    given, used, tracks, errors = [*sections], correct_clocks(sections), list[Fused](), list[FusionError]()
+    for place in range(len(given)):
+        last = next((track.found[-1] for track in reversed(tracks) if track.found), None)
         fuse = partial(fuse_recovering, streams=streams, config=config, run=run, last=last)
+        tracks.append(_skip(used[place]))
         try:
-            used[place], track = _fuse_on_steady_clocks(sections, place, fuse)
-            last = track.found[-1] if track.found else last
+            section, track = fuse(used[place])
+            unsteady = {change.role for facts in track.facts for change in facts.changes if change.kind == "clock"}
+            if unsteady & section.offsets.keys():
+                steady = {role: offset for role, offset in section.clocks.offsets.items() if role not in unsteady}
+                given[place] = replace(given[place], clocks=replace(section.clocks, offsets=steady))
+                section, track = fuse(correct_clocks(given)[place])
+            used[place], tracks[place] = section, track
         except FusionError as error:
             errors.append(error)
-            track = _skip(section)
-        tracks.append(track)
     has_place = any(section.datum_deg_m and track.found for section, track in zip(used, tracks, strict=True))
     fused = Fused()
     for section, track in zip(used, tracks, strict=True):
         fused.append(_skip(section) if has_place and section.datum_deg_m is None else track)
-    if errors and not fused.found:
-        findings = merge_findings(chain(*(error.findings for error in errors)))
-        raise FusionError(*chain(*(error.problems for error in errors)), findings=findings)
-    failures = (finding for error in errors for finding in error.findings if finding.severity == "error")
-    return used, fused, [replace(finding, severity="warning") for finding in failures]
+    return used, fused, errors
 
 
 def _skip(section: Section) -> Fused:
     return Fused(skipped_s=float(np.diff(section.span_ns)[0]) * 1e-9)
-
-
-def _fuse_on_steady_clocks(
-    sections: Sequence[Section], place: int, fuse: Callable[[Section], tuple[Section, Fused]]
-) -> tuple[Section, Fused]:
-    """Fuse one of the sections, and again without the offset of a clock that the estimate finds to step."""
-    section = correct_clocks(sections)[place]
-    used, track = fuse(section)
-    unsteady = {change.role for facts in track.facts for change in facts.changes if change.kind == "clock"}
-    if unsteady.isdisjoint(section.offsets):
-        return used, track
-    steady = {role: offset for role, offset in section.clocks.offsets.items() if role not in unsteady}
-    given = [*sections]
-    given[place] = replace(given[place], clocks=replace(section.clocks, offsets=steady))
-    return fuse(correct_clocks(given)[place])
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
@@ -169,9 +154,8 @@ def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Itera
 
 def _find_nothing(streams: Streams, sections: Sequence[Section], run: Subject) -> Finding:
     rows: dict[str, Any] = {f"{role}_row_count": table.num_rows for role, table in streams.tables.items()}
-    for role, each in (item for section in sections for item in section.prepared.items()):
-        if each.invalid_ns.size:
-            rows[f"{role}_unusable_count"] = rows.get(f"{role}_unusable_count", 0) + each.invalid_ns.size
+    counts = add_counts(sections)
+    rows |= {f"{role}_unusable_count": count["invalid"] for role, count in counts.items() if count["invalid"]}
     return make_finding("no-motion", run, **rows)
 
 

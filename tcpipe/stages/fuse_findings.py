@@ -56,13 +56,14 @@ def make_fuse_facts(
         measurements={role: sum(section.measurements.get(role, 0) for section in sections) for role in roles},
         rejected={role: sum(section.rejected.get(role, 0) for section in sections) for role in roles},
         nis_mean=nis,
-        set_aside=_add_counts(inputs),
+        set_aside=add_counts(inputs),
         skipped_s=skipped_s,
         stretches=tuple(sections),
     )
 
 
-def _add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
+def add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
+    """Return by role the counts of messages that are not used as they are."""
     total: dict[str, dict[str, int]] = {}
     for role, each in (item for section in inputs for item in section.prepared.items()):
         counts = {

@@ -254,9 +254,7 @@ def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> l
 
 def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], streams: Streams) -> Section:
     """Return a section without some sensors."""
-    sensors = section.measurements.sensors()
-    found = {each.role: _find_exclusion(each, sensors, streams) for each in exclusions}
-    excluded = {**section.excluded, **found}
+    excluded = {**section.excluded, **{each.role: _find_exclusion(each, section, streams) for each in exclusions}}
     # The receiver's velocity is of the antenna of the fixes.
     gone = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
     section = replace(
@@ -321,7 +319,7 @@ def _compute_median_specific_force(streams: Streams) -> float:
     return float(np.median(np.linalg.norm(force, axis=1)))
 
 
-def _find_exclusion(exclusion: SensorExclusion, used: Mapping[str, Any], streams: Streams) -> Finding:
+def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Streams) -> Finding:
     """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
     sensor, name = streams.sensors[exclusion.role], exclusion.role
     if exclusion.units is not None:
@@ -333,11 +331,11 @@ def _find_exclusion(exclusion: SensorExclusion, used: Mapping[str, Any], streams
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = exclusion.numbers
-    ends_ns = used[name].stamp_ns[[0, -1]] if name in used else None
+    stamp_ns = section.measurements.sensors()[name].stamp_ns
     return make_finding(
         exclusion.code,
         Subject("role", name),
-        span_s=None if ends_ns is None else find_span_s(int(ends_ns[0]), int(ends_ns[1]), streams),
+        span_s=find_span_s(int(stamp_ns[0]), int(stamp_ns[-1]), streams),
         action="excluded",
         severity="note" if exclusion.role == DOPPLER else None,
         names={"topic": sensor.topic, "placed_by": sensor.placed_by, **exclusion.names},

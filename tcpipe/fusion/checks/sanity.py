@@ -287,7 +287,7 @@ def _check_distances(
                 continue
         for role, other, lead in _find_outvoted([names], votes.__getitem__):
             times = ratio if role == names[1] else 1 / ratio
-            _exclude(found, _make_distance_exclusion(role, other, times, is_tie=lead == 0))
+            found.setdefault(role, _make_distance_exclusion(role, other, times, is_tie=lead == 0))
     return scales
 
 
@@ -373,10 +373,10 @@ _SAME_WAY = 0.5
 
 def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
     """Return the median rate of an IMU whose samples are mostly too far apart to show the motion between them; pauses do not count."""
-    step_ns = np.diff(stamp_ns)
-    known_s = step_ns[step_ns <= PAUSE_NS] * 1e-9
-    is_slow = known_s.size == 0 or float(known_s[known_s < _SLOWEST_S].sum()) < 0.5 * float(known_s.sum())
-    return 1e9 / float(np.median(step_ns)) if is_slow and step_ns.size else 0.0 if is_slow else None
+    step_s = np.diff(stamp_ns) * 1e-9
+    known_s = step_s[step_s <= PAUSE_NS * 1e-9]
+    is_slow = step_s.size > 0 and float(known_s[known_s < _SLOWEST_S].sum()) <= 0.5 * float(known_s.sum())
+    return 1.0 / float(np.median(step_s)) if is_slow else None
 
 
 def _find_frozen_imu(imu: InertialMeasurements) -> Exclusions:
@@ -433,7 +433,7 @@ def _check_imu(
     signs = {role: bool(axis.axis[2] > 0) for role, axis in axes.items() if abs(axis.axis[2]) > _SAME_WAY}
     _check_yaw_signs(found, signs, is_stated=is_stated)
     if looks and all(_ASIDE_RAD < abs(each) <= _BACKWARDS_RAD for each in looks.values()):
-        _exclude(found, _make_yaw_exclusion(looks, turned_by))
+        found.setdefault(IMU, _make_yaw_exclusion(looks, turned_by))
     return axes, {} if IMU in found else looks
 
 
@@ -462,10 +462,10 @@ def _check_yaw_signs(found: Exclusions, signs: Mapping[str, bool], *, is_stated:
     against = [role for role, sign in signs.items() if not sign and role != GNSS]
     for role, _, _ in _find_outvoted([(role, IMU) for role in against], count_votes):
         if role == IMU:
-            _exclude(found, SensorExclusion(IMU, "imu-sign", {"reference": ", ".join(against)}))
+            found.setdefault(IMU, SensorExclusion(IMU, "imu-sign", {"reference": ", ".join(against)}))
         else:
             names = {"reference": ", ".join((IMU, *(other for other, sign in signs.items() if sign)))}
-            _exclude(found, SensorExclusion(role, "yaw-rate-sign", names, turned_by=YAW))
+            found.setdefault(role, SensorExclusion(role, "yaw-rate-sign", names, turned_by=YAW))
 
 
 def _make_yaw_exclusion(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
@@ -508,10 +508,8 @@ def _check_directions(
     turned = set()
     for role, other, lead in _find_outvoted([pair for pair, is_same in same.items() if not is_same], count_votes):
         if role == IMU:
-            _exclude(
-                found,
-                _make_yaw_exclusion({each: yaw for each, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}, FORWARD),
-            )
+            backwards = {each: yaw for each, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}
+            found.setdefault(IMU, _make_yaw_exclusion(backwards, FORWARD))
         elif role != COMMAND and role not in turned:
             turned.add(role)
             names = {"reference": other} | ({"suspect": other} if other in forward and lead < 1.0 else {})
@@ -597,8 +595,3 @@ def compute_command_ratio(wheels: BodyVelocities, command: Command) -> float | N
         return None
     ratio = wheels.velocity_mps[rows, 0] / commanded_mps[rows]
     return float(np.median(ratio)) if np.quantile(ratio, 0.25) > _FASTER else None
-
-
-def _exclude(found: Exclusions, exclusion: SensorExclusion) -> None:
-    """Exclude a sensor that is not excluded yet."""
-    found.setdefault(exclusion.role, exclusion)
