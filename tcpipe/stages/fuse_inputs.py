@@ -286,20 +286,28 @@ def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
     return merge_findings(finding for place in rank_sections(sections) for finding in sections[place].excluded.values())
 
 
+_SAME_OFFSET_S = 0.1
+"""Time offsets of two sections that differ by less [s] are one: twice the offset that is noted."""
+
+
 def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings of several sections, those of one code and subject as one that has the first one's numbers.
 
-    Time offsets that differ by a tenth of a second stay apart, and have no remedy: the recipe states one.
+    Time offsets that differ stay apart, and have no remedy: the recipe states one.
     """
-    merged: dict[tuple[str, Subject, float], Finding] = {}
+    merged: list[Finding] = []
     for finding in findings:
-        key = finding.code, finding.subject, round(finding.numbers.get("offset_s", 0.0), 1)
-        first = merged.setdefault(key, finding)
-        if first.span_s and finding.span_s:
-            (begin_s, end_s), (other_s, last_s) = first.span_s, finding.span_s
-            merged[key] = replace(first, span_s=(min(begin_s, other_s), max(end_s, last_s)))
-    offsets = Counter(finding.subject for finding in merged.values() if "offset_s" in finding.numbers)
-    return [replace(each, remedies=()) if offsets[each.subject] > 1 else each for each in merged.values()]
+        for place, first in enumerate(merged):
+            off_s = finding.numbers.get("offset_s", 0.0) - first.numbers.get("offset_s", 0.0)
+            if (first.code, first.subject) == (finding.code, finding.subject) and abs(off_s) < _SAME_OFFSET_S:
+                spans = [each.span_s for each in (first, finding) if each.span_s is not None]
+                span_s = (min(start for start, _ in spans), max(end for _, end in spans)) if spans else None
+                merged[place] = replace(first, span_s=span_s)
+                break
+        else:
+            merged.append(finding)
+    offsets = Counter(finding.subject for finding in merged if "offset_s" in finding.numbers)
+    return [replace(each, remedies=()) if offsets[each.subject] > 1 else each for each in merged]
 
 
 def read_command(streams: Streams, epoch: int) -> Command | None:
