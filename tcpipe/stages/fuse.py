@@ -13,7 +13,8 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
-from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, shift_stamps
+from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, find_other_clocks, shift_sensors
+from tcpipe.fusion.checks.lags import MAX_LAG_S
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU
 from tcpipe.logs.clocks import LOG_CLOCK
@@ -36,7 +37,7 @@ from tcpipe.stages.fuse_inputs import (
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
 from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks
-from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, select_findings
+from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding, select_findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
@@ -59,7 +60,7 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
     streams, local = prepare_pose(streams)
     run = Subject("run", run_id)
-    inputs = drop_implausible_sensors(prepare_inputs(streams, config), streams)
+    inputs = drop_implausible_sensors(exclude_other_clocks(prepare_inputs(streams, config), streams), streams)
     # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others,
     #    and on the clock of a sensor as it is where the estimate finds that it steps: it has no offset.
     aligned, clocks = correct_clocks(streams, inputs)
@@ -155,6 +156,31 @@ def _exclude_misleading(role: str, inputs: FusionInputs, streams: Streams) -> Fu
     return exclude_sensors(inputs, [exclusion], streams)
 
 
+def exclude_other_clocks(inputs: FusionInputs, streams: Streams) -> FusionInputs:
+    """Return the inputs without sensors whose clocks are more than a second off the others', by the longest clock epoch.
+
+    No label of the run is usable until the recipe states the offset, since it is unknown which of the clocks power has.
+    """
+    if not inputs.measurements:
+        return inputs
+    reference, offsets = find_other_clocks(inputs.measurements[find_longest_epoch(inputs)])
+    exclusions = [
+        SensorExclusion(
+            role,
+            "clocks-differ",
+            {"reference": reference},
+            {"offset_s": each.offset_s, "offset_2std_s": 2 * each.std_s},
+        )
+        for role, each in offsets.items()
+    ]
+    inputs = exclude_sensors(inputs, exclusions, streams) if exclusions else inputs
+    findings = {
+        role: replace(finding, severity="error", remedies=_state_offset(role, offsets[role], streams) + finding.remedies)
+        for role, finding in inputs.excluded.items()
+    }
+    return replace(inputs, excluded=findings)
+
+
 _FINE_S = 0.004
 _JUMP_NS = 500_000_000
 _DRIVES_MPS = 0.3
@@ -175,16 +201,7 @@ def correct_clocks(
     middle_ns, span_s = find_middle_ns(inputs.measurements[epoch])
     off = {role: offset for role, offset in found.offsets.items() if offset.noted}
     findings = [_find_offset(found, role, offset, streams, span_s) for role, offset in off.items()]
-    aligned = {
-        number: m.replace_sensors(
-            {
-                role: replace(sensor, stamp_ns=shift_stamps(sensor.stamp_ns, off[role], middle_ns))
-                for role, sensor in m.sensors().items()
-                if role in off
-            }
-        )
-        for number, m in inputs.measurements.items()
-    }
+    aligned = {number: shift_sensors(m, off, middle_ns) for number, m in inputs.measurements.items()}
     inputs = replace(inputs, measurements=aligned)
     jumps = dict(find_clock_jumps(inputs))
     return replace(inputs, cuts_ns=tuple(jumps)), StageReport((*findings, *jumps.values()), found)
@@ -203,18 +220,25 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
         by_log = streams.sensors[role].time_source == "log"
         remedies = () if by_log else suggest("use_log_time", {"read.time_source": {role: "log"}})
         return make_finding("clock-drift", subject, action="corrected", names=names, remedies=remedies, drift_s=drift_s)
-    given_s = streams.report.facts.time_offset_s.get(name_pose(role, streams), 0.0)
-    correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)
     return make_finding(
         "time-offset",
         subject,
         severity="note" if role == DOPPLER else None,
         action="corrected",
         names=names,
-        remedies=suggest("correct", {"read.time_offset_s": {role: correction_s}}),
+        remedies=_state_offset(role, offset, streams),
         offset_s=offset_s,
         offset_2std_s=offset_2std_s,
     )
+
+
+def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Remedy, ...]:
+    """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
+    given_s = streams.report.facts.time_offset_s.get(name_pose(role, streams), 0.0)
+    correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
+    is_far = abs(offset.offset_s) > MAX_LAG_S and role == GNSS and DOPPLER in streams.tables
+    roles = (role, DOPPLER) if is_far else (role,)
+    return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
 
 
 def find_clock_jumps(inputs: FusionInputs) -> Iterator[tuple[int, Finding]]:

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.checks.coarse_lag import find_coarse_offsets
 from tcpipe.fusion.checks.lags import (
     FIXES_S,
     GRID_S,
@@ -55,6 +56,7 @@ _MAX_STD_S = 0.02
 _CLEARLY = 10.0
 _MIN_EXPLAINED = 0.25
 _LEAST_STD_S = 1e-3
+_COARSE_STD_S = 0.1
 _WINDOW_NS, _MARGIN_NS = 600_000_000_000, 5_000_000_000
 _FEWEST_WINDOWS = 3  # that show a drift
 _DRIFT = 1e-3  # of a clock, 1σ
@@ -92,6 +94,31 @@ def find_middle_ns(m: Measurements) -> tuple[int, float]:
     """Return the middle of a set's measurements [ns], and how long they last [s]; 0 without any."""
     first_ns, last_ns = find_span_ns(m) or (0, 0)
     return (first_ns + last_ns) // 2, (last_ns - first_ns) * 1e-9
+
+
+def find_other_clocks(m: Measurements) -> tuple[str, dict[str, ClockOffset]]:
+    """Return a sensor, and the offsets of sensors whose clocks are more than a second from its own; ("", {}) where there are none."""
+    reference, late_s = find_coarse_offsets(m)
+    coarse = {role: ClockOffset(each_s, _COARSE_STD_S, noted=True, blamed=False) for role, each_s in late_s.items()}
+    if not coarse:
+        return reference, {}
+    found = find_clock_offsets(shift_sensors(m, coarse, 0))
+    fine = {found.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(found.offsets)
+    for role in late_s.keys() & fine.keys() if reference in fine else ():
+        offset_s = late_s[role] + fine[role].offset_s - fine[reference].offset_s
+        coarse[role] = replace(coarse[role], offset_s=offset_s, std_s=fine[role].std_s + fine[reference].std_s)
+    return reference, coarse
+
+
+def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns: int) -> Measurements:
+    """Return measurements whose stamps are without the offsets of their sensors, and the drifts about ``middle_ns``."""
+    moved = {role: sensor for role, sensor in m.sensors().items() if role in offsets}
+    return m.replace_sensors(
+        {
+            role: replace(sensor, stamp_ns=shift_stamps(sensor.stamp_ns, offsets[role], middle_ns))
+            for role, sensor in moved.items()
+        }
+    )
 
 
 def shift_stamps(stamp_ns: NDArray[np.int64], offset: ClockOffset, middle_ns: int) -> NDArray[np.int64]:
