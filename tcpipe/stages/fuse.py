@@ -175,7 +175,9 @@ def exclude_other_clocks(inputs: FusionInputs, streams: Streams) -> FusionInputs
     ]
     inputs = exclude_sensors(inputs, exclusions, streams) if exclusions else inputs
     findings = {
-        role: replace(finding, severity="error", remedies=_state_offset(role, offsets[role], streams) + finding.remedies)
+        role: replace(
+            finding, severity="error", remedies=_state_offset(role, offsets[role], streams) + finding.remedies
+        )
         for role, finding in inputs.excluded.items()
     }
     return replace(inputs, excluded=findings)
