@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.coarse_lag import find_coarse_offsets
+from tcpipe.fusion.checks.coarse_lag import NEAR_S, find_coarse_offsets
 from tcpipe.fusion.checks.lags import (
     FIXES_S,
     GRID_S,
@@ -98,16 +98,29 @@ def find_middle_ns(m: Measurements) -> tuple[int, float]:
 
 def find_other_clocks(m: Measurements) -> tuple[str, dict[str, ClockOffset]]:
     """Return a sensor, and the offsets of sensors whose clocks are more than a second from its own; ("", {}) where there are none."""
-    reference, late_s = find_coarse_offsets(m)
-    coarse = {role: ClockOffset(each_s, _COARSE_STD_S, noted=True, blamed=False) for role, each_s in late_s.items()}
-    if not coarse:
-        return reference, {}
+    late_s = find_coarse_offsets(m)
+    if all(abs(each) <= NEAR_S for each in late_s.values()):
+        return "", {}
+    far = {role: offset for role, offset in refine_offsets(m, late_s).items() if abs(late_s[role]) > NEAR_S}
+    return next(role for role, each in late_s.items() if each == 0.0), far
+
+
+def refine_offsets(m: Measurements, late_s: Mapping[str, float]) -> dict[str, ClockOffset]:
+    """Return coarse offsets [s], by role, to a few milliseconds where the fine search determines them."""
+    coarse = {role: ClockOffset(each, _COARSE_STD_S, noted=True, blamed=False) for role, each in late_s.items()}
     found = find_clock_offsets(shift_sensors(m, coarse, 0))
     fine = {found.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(found.offsets)
-    for role in late_s.keys() & fine.keys() if reference in fine else ():
-        offset_s = late_s[role] + fine[role].offset_s - fine[reference].offset_s
-        coarse[role] = replace(coarse[role], offset_s=offset_s, std_s=fine[role].std_s + fine[reference].std_s)
-    return reference, coarse
+    zero = next((fine[role] for role, each in late_s.items() if each == 0.0 and role in fine), None)
+    if zero is None:
+        return coarse
+    refined = {
+        role: replace(
+            offset, offset_s=offset.offset_s + fine[role].offset_s - zero.offset_s, std_s=fine[role].std_s + zero.std_s
+        )
+        for role, offset in coarse.items()
+        if role in fine
+    }
+    return coarse | refined
 
 
 def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns: int) -> Measurements:

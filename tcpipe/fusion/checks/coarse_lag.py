@@ -44,10 +44,10 @@ _APART, _PEAKS = 15, 25
 """Rows between separate peaks, 3 s, and most peaks that are compared with the best."""
 
 
-def find_coarse_offsets(m: Measurements) -> tuple[str, dict[str, float]]:
-    """Return a sensor of the largest group that shares a clock, and how much later the stamps of other sensors are [s].
+def find_coarse_offsets(m: Measurements) -> dict[str, float]:
+    """Return how late sensors' stamps are against those of the largest group that shares a clock [s], those of the group about 0.
 
-    Only offsets beyond the fine search are returned; ("", {}) if there are none, or the pairs of sensors contradict each other.
+    Sensors whose offset is unknown are missing; {} if the pairs of sensors contradict each other.
     """
     at_ns = find_liveliest_window_ns(m)
     signals = {} if at_ns is None else _compute_motion(m, at_ns)
@@ -55,21 +55,16 @@ def find_coarse_offsets(m: Measurements) -> tuple[str, dict[str, float]]:
     for against, late in combinations(signals, 2):
         lag_s = find_coarse_lag(signals[late], signals[against])
         lags |= {} if lag_s is None else {(late, against): lag_s, (against, late): -lag_s}
-    clock_s = next(({late: 0.0} for (late, _), lag_s in lags.items() if abs(lag_s) > NEAR_S), {})
+    late_s = {first: 0.0 for first, _ in sorted(lags, key=lambda pair: abs(lags[pair]) <= NEAR_S)[:1]}
     for _ in signals:
         for (late, against), lag_s in lags.items():
-            if against in clock_s:
-                clock_s.setdefault(late, clock_s[against] + lag_s)
-    if any(abs(clock_s[a] - clock_s[b] - lag_s) > NEAR_S for (a, b), lag_s in lags.items() if a in clock_s):
-        return "", {}
-    others = {
-        reference: {role: s - clock_s[reference] for role, s in clock_s.items() if abs(s - clock_s[reference]) > NEAR_S}
-        for reference in signals
-        if reference in clock_s
-    }
-    return min(
-        others.items(), key=lambda item: len(item[1]), default=("", {})
-    )  # of equal groups, that of the first sensor
+            if against in late_s:
+                late_s.setdefault(late, late_s[against] + lag_s)
+    if any(abs(late_s[a] - late_s[b] - lag_s) > NEAR_S for (a, b), lag_s in lags.items() if a in late_s):
+        return {}
+    groups = [{role: each - late_s[first] for role, each in late_s.items()} for first in signals if first in late_s]
+    # Of equal groups, that of the first sensor.
+    return max(groups, key=lambda group: sum(abs(each) <= NEAR_S for each in group.values()), default={})
 
 
 def _compute_motion(m: Measurements, at_ns: NDArray[np.int64]) -> dict[str, Floats]:
