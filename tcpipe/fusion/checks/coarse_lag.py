@@ -50,7 +50,9 @@ def find_coarse_offsets(m: Measurements) -> dict[str, float]:
     Sensors whose offset is unknown are missing; {} if the pairs of sensors contradict each other.
     """
     at_ns = find_liveliest_window_ns(m)
-    signals = {} if at_ns is None else _compute_motion(m, at_ns)
+    if at_ns is None or at_ns.size * GRID_S < _FEWEST * _ROW_S:
+        return {}
+    signals = _compute_motion(m, at_ns)
     lags = dict[tuple[str, str], float]()
     for against, late in combinations(signals, 2):
         lag_s = find_coarse_lag(signals[late], signals[against])
@@ -105,8 +107,6 @@ def _average(values: Floats, width: int) -> Floats:
 
 def find_coarse_lag(late: Floats, against: Floats) -> float | None:
     """Return how much later the stamps of one sensor are than another's [s], None where this is unknown; signals of shape (2, N)."""
-    if late.shape[1] < _FEWEST:
-        return None
     correlation, rows = _correlate(late, against)
     log_ratio = -0.5 * np.log(1.0 - np.maximum(correlation, 0.0) ** 2)
     score, height = (rows * log_ratio).sum(0) / _INDEPENDENT, log_ratio.sum(0)
