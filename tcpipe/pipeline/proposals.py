@@ -327,7 +327,7 @@ def propose_tables(path: Path) -> ProposedRecipe:
     needless = [line for line in lines if line.key == "stamp_zone"][1:]
     needless += [line for line in lines if line.note == NO_VOLTAGE and make_rail_name(line.table) in rails]
     lines = [line for line in lines if line not in needless]
-    lines, unaligned = _align_clocks(lines, log, apart, reference)
+    lines, unaligned = _align_clocks(lines, log, apart, reference) if len(tables) > 1 else (lines, [])
     lines = _try_lines(lines, log, dict.fromkeys(unaligned, _UNALIGNED))
     found_roles = {*roles, *(line.value for line in lines if line.key == "role")}
     for role in ("gnss", "imu", "wheel_odometry", "power"):
@@ -499,8 +499,9 @@ def _align_clocks(
 ) -> tuple[list[ProposedLine], list[str]]:
     """Return the lines with the offsets of tables on another clock, and the names of tables whose offsets are unknown.
 
-    Speed and turn rate show them, for the tables ``apart`` without time in common with the reference up to five minutes about what lets
-    both begin together. A table without motion has the clock of a table with which it has time in common.
+    Offsets are found by speed and turn rate. The tables ``apart`` have no time in common with the reference: their offsets are searched up
+    to five minutes around the one at which both tables begin together. A table without motion has the clock of a table with which it has
+    time in common.
     """
     from tcpipe.fusion.checks.clock_offsets import refine_offsets  # noqa: PLC0415  kernels load only where there is work
     from tcpipe.fusion.checks.coarse_lag import NEAR_S, find_coarse_offsets  # noqa: PLC0415

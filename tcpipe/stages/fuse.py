@@ -14,7 +14,7 @@ import numpy as np
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, find_other_clocks, shift_sensors
-from tcpipe.fusion.checks.lags import MAX_LAG_S
+from tcpipe.fusion.checks.coarse_lag import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU
 from tcpipe.logs.clocks import LOG_CLOCK
@@ -238,7 +238,7 @@ def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Rem
     """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
     given_s = streams.report.facts.time_offset_s.get(name_pose(role, streams), 0.0)
     correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
-    is_far = abs(offset.offset_s) > MAX_LAG_S and role == GNSS and DOPPLER in streams.tables
+    is_far = abs(offset.offset_s) > NEAR_S and role == GNSS and DOPPLER in streams.tables
     roles = (role, DOPPLER) if is_far else (role,)
     return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
 
