@@ -14,7 +14,8 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
-from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, shift_stamps
+from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_middle_ns, find_other_clocks, shift_sensors
+from tcpipe.fusion.checks.coarse_lag import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, Measurements, Trajectory
 from tcpipe.logs.clocks import LOG_CLOCK
@@ -42,7 +43,7 @@ from tcpipe.stages.fuse_inputs import (
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_section, make_rejections_table
 from tcpipe.tables.facts import ClockFacts, ClockOffset, SensorChecks
-from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, select_findings
+from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding, select_findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
@@ -65,7 +66,8 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     run, read = Subject("run", run_id), streams.report
     # 1. Streams become sections of measurements: one frame, one set of units, usable variances, without sensors that cannot be right.
     streams, is_local = use_pose_as_fixes(streams)
-    sections = find_clocks(drop_implausible_sensors(prepare_sections(streams, config), streams))
+    sections = exclude_other_clocks(prepare_sections(streams, config), streams)
+    sections = find_clocks(drop_implausible_sensors(sections, streams))
     # 2. Initial state, filter and smoother of each section.
     sections, fused, errors = fuse_sections(sections, streams, config, run=run)
     failures = merge_findings(finding for error in errors for finding in error.findings)
@@ -197,6 +199,37 @@ def _exclude_misleading(role: str, inputs: Section, streams: Streams) -> Section
     return exclude_sensors(inputs, [exclusion], streams)
 
 
+def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[Section]:
+    """Return the sections without sensors whose clocks are more than a second off the others', there or where the drive is longer.
+
+    No label of the run is usable until the recipe states the offset, since it is unknown which of the clocks power has.
+    """
+    found, known = [*sections], dict[str, tuple[str, ClockOffset]]()
+    for place in rank_sections(sections):
+        section = sections[place]
+        reference, offsets = find_other_clocks(section.measurements)
+        known |= {role: (reference, each) for role, each in offsets.items()}
+        far = {role: each for role, each in known.items() if role in section.measurements.sensors()}
+        exclusions = [
+            SensorExclusion(
+                role,
+                "clocks-differ",
+                {"reference": against},
+                {"offset_s": each.offset_s, "offset_2std_s": 2 * each.std_s},
+            )
+            for role, (against, each) in far.items()
+        ]
+        section = exclude_sensors(section, exclusions, streams)
+        findings = {
+            role: replace(
+                finding, severity="error", remedies=_state_offset(role, far[role][1], streams) + finding.remedies
+            )
+            for role, finding in section.excluded.items()
+        }
+        found[place] = replace(section, excluded=findings)
+    return found
+
+
 _FINE_S = 0.004
 _JUMP_NS = 500_000_000
 _DRIVES_MPS = 0.3
@@ -229,12 +262,9 @@ def correct_clocks(sections: Sequence[Section]) -> list[Section]:
     """Return the sections on one clock each: offset and drift of each clock, about the middle of its section, are taken out."""
     corrected = []
     for section in sections:
-        sensors, middle_ns = section.measurements.sensors(), find_middle_ns(section.measurements)[0]
-        shifted = {
-            role: replace(sensors[role], stamp_ns=shift_stamps(sensors[role].stamp_ns, offset, middle_ns))
-            for role, offset in section.offsets.items()
-        }
-        corrected.append(replace(section, measurements=section.measurements.replace_sensors(shifted)))
+        middle_ns = find_middle_ns(section.measurements)[0]
+        shifted = shift_sensors(section.measurements, section.offsets, middle_ns)
+        corrected.append(replace(section, measurements=shifted))
     cuts = dict(find_clock_jumps(corrected))
     return [replace(section, cuts=cuts) for section in corrected]
 
@@ -263,18 +293,25 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
         by_log = streams.sensors[role].time_source == "log"
         remedies = () if by_log else suggest("use_log_time", {"read.time_source": {role: "log"}})
         return make_finding("clock-drift", subject, action="corrected", names=names, remedies=remedies, drift_s=drift_s)
-    given_s = streams.report.facts.time_offset_s.get(role, 0.0)
-    correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)
     return make_finding(
         "time-offset",
         subject,
         severity="note" if role == DOPPLER else None,
         action="corrected",
         names=names,
-        remedies=suggest("correct", {"read.time_offset_s": {role: correction_s}}),
+        remedies=_state_offset(role, offset, streams),
         offset_s=offset_s,
         offset_2std_s=offset_2std_s,
     )
+
+
+def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Remedy, ...]:
+    """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
+    given_s = streams.report.facts.time_offset_s.get(role, 0.0)
+    correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
+    is_far = abs(offset.offset_s) > NEAR_S and role == GNSS and DOPPLER in streams.tables
+    roles = (role, DOPPLER) if is_far else (role,)
+    return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
 
 
 def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding]]:

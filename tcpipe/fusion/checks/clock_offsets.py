@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.checks.coarse_lag import NEAR_S, find_coarse_offsets
 from tcpipe.fusion.checks.lags import (
     FIXES_S,
     GRID_S,
@@ -55,6 +56,7 @@ _MAX_STD_S = 0.02
 _CLEARLY = 10.0
 _MIN_EXPLAINED = 0.25
 _LEAST_STD_S = 1e-3
+_COARSE_STD_S = 0.1
 _WINDOW_NS, _MARGIN_NS = 600_000_000_000, 5_000_000_000
 _FEWEST_WINDOWS = 3  # that show a drift
 _DRIFT = 1e-3  # of a clock, 1σ
@@ -92,6 +94,44 @@ def find_middle_ns(m: Measurements) -> tuple[int, float]:
     """Return the middle of a set's measurements [ns], and how long they last [s]; 0 without any."""
     first_ns, last_ns = find_span_ns(m) or (0, 0)
     return (first_ns + last_ns) // 2, (last_ns - first_ns) * 1e-9
+
+
+def find_other_clocks(m: Measurements) -> tuple[str, dict[str, ClockOffset]]:
+    """Return a sensor, and the offsets of sensors whose clocks are more than a second from its own; ("", {}) where there are none."""
+    late_s = find_coarse_offsets(m)
+    if all(abs(each) <= NEAR_S for each in late_s.values()):
+        return "", {}
+    far = {role: offset for role, offset in refine_offsets(m, late_s).items() if abs(late_s[role]) > NEAR_S}
+    return next(role for role, each in late_s.items() if each == 0.0), far
+
+
+def refine_offsets(m: Measurements, late_s: Mapping[str, float]) -> dict[str, ClockOffset]:
+    """Return coarse offsets [s], by role, to a few milliseconds where the fine search determines them."""
+    coarse = {role: ClockOffset(each, _COARSE_STD_S, noted=True, blamed=False) for role, each in late_s.items()}
+    found = find_clock_offsets(shift_sensors(m, coarse, 0))
+    fine = {found.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(found.offsets)
+    zero = next((fine[role] for role, each in late_s.items() if each == 0.0 and role in fine), None)
+    if zero is None:
+        return coarse
+    refined = {
+        role: replace(
+            offset, offset_s=offset.offset_s + fine[role].offset_s - zero.offset_s, std_s=fine[role].std_s + zero.std_s
+        )
+        for role, offset in coarse.items()
+        if role in fine
+    }
+    return coarse | refined
+
+
+def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns: int) -> Measurements:
+    """Return measurements whose stamps are without the offsets of their sensors, and the drifts about ``middle_ns``."""
+    moved = {role: sensor for role, sensor in m.sensors().items() if role in offsets}
+    return m.replace_sensors(
+        {
+            role: replace(sensor, stamp_ns=shift_stamps(sensor.stamp_ns, offsets[role], middle_ns))
+            for role, sensor in moved.items()
+        }
+    )
 
 
 def shift_stamps(stamp_ns: NDArray[np.int64], offset: ClockOffset, middle_ns: int) -> NDArray[np.int64]:

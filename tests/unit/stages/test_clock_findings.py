@@ -12,9 +12,10 @@ from suggested_recipes import proposed
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.fuse import correct_clocks, find_clock_jumps, find_clocks, find_offsets
+from tcpipe.stages.fuse import correct_clocks, find_clock_jumps, find_clocks, find_offsets, fuse_run
 from tcpipe.stages.fuse_inputs import Section, prepare_sections
-from tcpipe.tables.findings import Subject
+from tcpipe.stages.label_motion import is_clock_doubtful
+from tcpipe.tables.findings import Subject, select_findings, sort_findings
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20}
 WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020}
@@ -85,6 +86,24 @@ def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(drive_log):
     assert moved_s == pytest.approx(-LATE_S["wheel_odometry"], abs=WITHIN_S["wheel_odometry"])
     assert measured[1].imu is measured[0].imu
     assert not any(offset.noted for offset in find_clocks(after)[0].clocks.offsets.values())
+
+
+def test_a_sensor_on_another_clock_is_excluded_until_the_recipe_states_the_offset(drive_log):
+    """The remedy includes what the recipe adds already: here all of the offset."""
+    log = drive_log(1, 31)
+    good, off = streams_of(log), streams_of(log, ReadConfig(time_offset_s={"gnss": 18.0}))
+    before, after = (fuse_run(streams, FuseConfig(), run_id="run").info for streams in (good, off))
+    findings = after.report.findings
+    (finding,) = select_findings(findings, "clocks-differ")
+    assert (finding.subject.name, finding.severity, finding.action) == ("gnss", "error", "excluded")
+    assert finding.numbers["offset_s"] == pytest.approx(18.0, abs=0.03)
+    assert proposed(finding)["read"]["time_offset_s"] == {"gnss": pytest.approx(0.0, abs=0.03)}
+    assert sort_findings(findings)[0] is finding
+    more = {each.code for each in findings} - {each.code for each in before.report.findings}
+    assert more <= {"clocks-differ", "local-frame", "odometry-scale-unobservable"}
+    assert "gnss" not in after.report.facts.fuse.sensors
+    assert is_clock_doubtful(off, after)
+    assert not is_clock_doubtful(good, before)
 
 
 def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
