@@ -126,15 +126,16 @@ def fuse_recovering(
     """Fuse each section; where the track contradicts every sensor, again without the one that misleads it.
 
     That is the IMU, which carries the state from tick to tick, if the track recovers without it; else the only sensor without which it
-    does.
+    does. A single sensor of motion that its own track contradicts is not consistent: there is nothing to fuse without it.
 
-    Raises `FusionError`: the track contradicts every sensor, whichever is excluded.
+    Raises `FusionError`: the track contradicts every sensor, whichever is excluded, or the only one.
     """
     fused = fuse_sections(inputs, streams, config)
     if not is_astray(fused.windows, fused.astray):
         return inputs, fused
+    roles = sorted({role for m in inputs.measurements.values() for role in m.sensors()})
     recovered = {}
-    for role in sorted({role for m in inputs.measurements.values() for role in m.sensors()}):
+    for role in roles:
         rest = _exclude_misleading(role, inputs, streams)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
             tried = fuse_sections(rest, streams, config)
@@ -144,8 +145,16 @@ def fuse_recovering(
         return recovered[IMU]
     if len(recovered) == 1:
         return next(iter(recovered.values()))
-    finding = make_finding("track-contradicts-sensors", run, astray_fraction=fused.astray / fused.windows)
-    raise FusionError("the track contradicts every sensor", findings=(finding, *inputs.excluded.values()))
+    motion = [role for role in roles if role not in {IMU, DOPPLER}]
+    code, subject, problem = "track-contradicts-sensors", run, "the track contradicts every sensor"
+    if len(motion) == 1:
+        code, subject, problem = (
+            "sensor-contradicts-itself",
+            Subject("role", motion[0]),
+            f"{motion[0]} contradicts itself",
+        )
+    finding = make_finding(code, subject, astray_fraction=fused.astray / fused.windows)
+    raise FusionError(problem, findings=(finding, *inputs.excluded.values()))
 
 
 def _exclude_misleading(role: str, inputs: FusionInputs, streams: Streams) -> FusionInputs:

@@ -21,12 +21,12 @@ def odometry():
     return BodyVelocities(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3)), np.zeros(5), np.ones(5))
 
 
-def inputs(*, visual=True, imu=True):
+def inputs(*, visual=True, imu=True, wheels=True):
     quat = np.full((5, 4), np.nan)
     heard = Measurements(
         gnss=Positions(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3))),
         imu=InertialMeasurements(STAMP_NS, np.zeros((5, 3)), np.zeros((5, 3)), quat, 0.01, 0.1) if imu else None,
-        wheels=odometry(),
+        wheels=odometry() if wheels else None,
         visual=odometry() if visual else None,
     )
     return FusionInputs((15.0, 47.0, 400.0), {0: heard})
@@ -86,3 +86,12 @@ def test_a_track_that_goes_astray_whatever_is_left_out_is_refused(fusing):
         recovered(inputs())
     (finding,) = error.value.findings
     assert (finding.code, finding.numbers) == ("track-contradicts-sensors", {"astray_fraction": 0.6})
+
+
+@pytest.mark.parametrize("imu", [False, True])
+def test_a_single_sensor_of_motion_that_contradicts_itself_is_named_and_not_to_be_excluded(fusing, imu):
+    fusing(lost=[frozenset({"gnss"}), frozenset({"gnss", "imu"})])
+    with pytest.raises(FusionError) as error:
+        recovered(inputs(imu=imu, visual=False, wheels=False))
+    (finding,) = error.value.findings
+    assert (finding.code, finding.subject.name) == ("sensor-contradicts-itself", "gnss")
