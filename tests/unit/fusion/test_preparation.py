@@ -217,7 +217,7 @@ def test_a_receivers_velocity_has_a_deviation_always_and_a_vast_one_where_it_tel
     assert found.stamp_ns.tolist() == stamps(5)[[0, 1, 4]].tolist()
     assert prepared.invalid_ns.tolist() == stamps(5)[[2, 3]].tolist()
     assert found.velocity_enu_mps.tolist() == [[1.0, 2.0, 0.0], [1.0, 2.0, 0.1], [1.0, 1.0, 0.0]]
-    wanted = [[0.04, 0.04, 1e6], [0.01, 0.01, 0.04], [0.0004, 0.09, 0.16]]
+    wanted = [[0.04, 0.04, 1e6], [0.02, 0.065, 0.16], [0.0004, 0.09, 0.16]]  # unknown: the median of the stated
     assert found.variance_m2ps2 == pytest.approx(np.array(wanted))
 
 
@@ -239,12 +239,13 @@ def test_fixes_that_hang_while_the_robot_drives_are_left_out_and_named():
     assert repeats == (Repeats(int(gnss.stamp_ns[29]), int(gnss.stamp_ns[50]), 21),)
 
 
-def test_a_slow_receiver_that_is_published_more_often_is_slow():
-    """Every second fix is new: nothing hangs."""
-    gnss, wheels = driven_fixes(range(1, 100, 2))
+@pytest.mark.parametrize("often", [2, 12])
+def test_a_slow_receiver_that_is_published_more_often_is_slow(often):
+    """Every second fix, or one in 1.2 s, is new: nothing hangs."""
+    gnss, wheels = driven_fixes(row for row in range(100) if row % often)
     for odometry in (wheels, None):
         found, repeats = drop_repeated_fixes(gnss, odometry)
-        assert found.stamp_ns.tolist() == gnss.stamp_ns[::2].tolist()
+        assert found.stamp_ns.tolist() == gnss.stamp_ns[::often].tolist()
         assert repeats == ()
 
 
