@@ -64,6 +64,18 @@ def test_a_variance_that_says_nothing_is_the_recipes_and_one_too_good_is_floored
     assert prepared.variances_replaced == replaced
 
 
+@pytest.mark.parametrize(("decimals", "most_m"), [(5, 2.0), (6, 0.1), (12, 0.0101)])
+def test_rounded_coordinates_err_as_much_as_their_variance(decimals, most_m):
+    at_s = np.arange(400) * 0.2
+    lon, lat = 15.0 + 1e-5 * at_s, 47.0 + 2e-5 * np.sin(at_s / 7.0)
+    exact, _ = fixes(stamps(400), gnss_columns(lon, lat, 400.0 + 0.0 * lat, 1e-4))
+    rounded, _ = fixes(stamps(400), gnss_columns(lon.round(decimals), lat.round(decimals), 400.0 + 0.0 * lat, 1e-4))
+    error = (rounded.position_enu_m - exact.position_enu_m)[:, :2]
+    std = np.sqrt(rounded.variance_m2[:, :2])
+    assert (np.abs(error - np.median(error, axis=0)) < 2.5 * std).all()
+    assert std.max() < most_m
+
+
 def test_datum_is_the_median_of_the_first_fixes_also_at_the_date_line():
     lon = np.array([179.99999, -179.99999, 179.99998, 0.0, -179.99998, 90.0, 180.0])
     lat = np.array([10.0, 10.0, 10.0, 0.0, 10.0, 10.0, 10.0])
