@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import (
+    bridge_outliers,
     compute_interval_means,
     compute_median_of_five,
     compute_seconds,
@@ -43,6 +44,7 @@ _WINDOW_STEP_NS = 2_000_000_000  # growth of that window
 _TILT_AGREES_RAD = 0.2  # agreement of IMU attitude and gravity
 _GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
 _POSED_YAW_STD_RAD = 0.1  # of a pose: its frame, and how its sensor is turned
+_START_STD_MPS = 1.0  # change of the velocity while the first fixes show it
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
@@ -97,15 +99,21 @@ def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_
 
 
 class _Path:
-    """The path drawn by odometry and gyroscope from the origin with yaw zero: a function of time, held outside the odometry."""
+    """The path drawn by odometry and gyroscope from the origin with yaw zero: a function of time, held outside the odometry.
+
+    Without odometry it goes straight on with the velocity that the first fixes show.
+    """
 
     def __init__(self, measurements: Measurements, start_ns: int, bias: Floats) -> None:
         self.start_ns = start_ns
         self._yaw_s, self._yaw_rate = _collect_yaw_rate(measurements, start_ns, bias)
-        source = measurements.first_odometry
+        source, gnss = measurements.first_odometry, measurements.gnss
         self.known = source is not None
-        self._lever = np.zeros(2) if measurements.gnss is None else np.asarray(measurements.gnss.lever_arm_m)[:2]
+        self._lever = 0j if gnss is None else complex(*gnss.lever_arm_m[:2])
+        self.first_fixes, self._straight, self._straight_std = slice(0, 10), 0j, 0.0
         if source is None:
+            if gnss is not None:
+                self.first_fixes, self._straight, self._straight_std = _fit_first_velocity(gnss)
             return
         self._stamp_s = compute_seconds(source.stamp_ns, start_ns)
         self._speed = source.velocity_mps[:, 0]
@@ -113,36 +121,48 @@ class _Path:
         self._velocity = self._speed[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
 
     def yaw(self, at_s: Floats) -> Floats:
-        """Yaw turned since the start [rad]."""
-        if self._yaw_s.size == 0:
-            return np.zeros(at_s.size)
-        turned = integrate_signal(self._yaw_s, self._yaw_rate, at_s) - integrate_signal(
-            self._yaw_s, self._yaw_rate, np.zeros(1)
-        )
-        return turned[:, 0]
+        """Return the yaw turned since the start [rad]."""
+        return _integrate_since_start(self._yaw_s, self._yaw_rate, at_s)[:, 0]
 
-    def antenna(self, at_s: Floats) -> Plane:
-        """Antenna east + i north [m] as drawn."""
-        antenna = np.asarray(complex(*self._lever) * np.exp(1j * self.yaw(at_s)), np.complex128)
+    def antenna(self, at_s: Floats, yaw: float = 0.0) -> Plane:
+        """Return the antenna east + i north [m] for a yaw at the start [rad]."""
+        antenna = np.asarray(self._lever * np.exp(1j * self.yaw(at_s)), np.complex128)
         if self.known:
-            start = integrate_signal(self._stamp_s, self._velocity, np.zeros(1))
-            xy = integrate_signal(self._stamp_s, self._velocity, at_s) - start
-            antenna += xy[:, 0] + 1j * xy[:, 1]
-        return antenna
+            antenna += _integrate_since_start(self._stamp_s, self._velocity, at_s) @ np.array([1.0, 1j])
+        placed: Plane = antenna * np.exp(1j * yaw) + self._straight * at_s
+        return placed
 
     def length(self, until_s: float) -> float:
-        """Metres driven since the start."""
+        """Return the distance driven since the start [m]."""
         if not self.known:
-            return max(until_s, 0.0)
-        speed = np.abs(self._speed)[:, None]
-        return float(np.diff(integrate_signal(self._stamp_s, speed, np.array([0.0, max(until_s, 0.0)])), axis=0)[0, 0])
+            return abs(self._straight) * max(until_s, 0.0)
+        return float(_integrate_since_start(self._stamp_s, np.abs(self._speed)[:, None], np.array([until_s]))[0, 0])
 
     def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
-        """Velocity at the start [m/s] and its standard deviation."""
+        """Return the velocity at the start and its standard deviation [m/s]."""
         if not self.known:
-            return np.zeros(3), 1.0
+            return np.array([self._straight.real, self._straight.imag, 0.0]), self._straight_std
         speed = float(np.median(self._speed[:5]))
         return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), 0.3
+
+
+def _integrate_since_start(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
+    """Return the integral of samples (N, k) from time zero on, shape (M, k); 0 without samples."""
+    if stamp_s.size == 0:
+        return np.zeros((at_s.size, values.shape[1]))
+    return integrate_signal(stamp_s, values, at_s) - integrate_signal(stamp_s, values, np.zeros(1))
+
+
+def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
+    """Return the fixes of the first second, 3 to 10, and the median of their slopes, east + i north, and its standard deviation [m/s]."""
+    rows = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 10**9, "right"), 3, 10)))
+    at_s, place = compute_seconds(gnss.stamp_ns[rows], int(gnss.stamp_ns[0])), gnss.position_enu_m[rows, :2]
+    if at_s.size < 2:
+        return rows, 0j, _START_STD_MPS
+    i, j = np.triu_indices(at_s.size, 1)
+    east, north = np.median((place[j] - place[i]) / (at_s[j] - at_s[i])[:, None], axis=0)
+    noise_mps = np.sqrt(12.0 / at_s.size * np.median(gnss.variance_m2[rows, :2])) / at_s[-1]
+    return rows, complex(east, north), float(np.hypot(noise_mps, _START_STD_MPS))
 
 
 def _collect_yaw_rate(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
@@ -261,9 +281,9 @@ def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> 
     """base_link at the start and its standard deviation: the median of the first fixes less the displacement since the start."""
     if gnss is None:
         return np.zeros(3), np.full(3, 1e-3)
-    few = slice(0, min(10, gnss.stamp_ns.size))
+    few = path.first_fixes
     at_s = compute_seconds(gnss.stamp_ns[few], path.start_ns)
-    drawn = path.antenna(at_s) * np.exp(1j * yaw)
+    drawn = path.antenna(at_s, yaw)
     position = np.array(
         [
             np.median(gnss.position_enu_m[few, 0] - drawn.real),
@@ -330,8 +350,6 @@ _MOVING_M = 0.3  # shorter baselines show no course
 _MOVING_MPS = 0.2  # slower motion shows no course
 _OFTEN = 0.3  # share of usable baselines before longer ones
 _STEP_S = 1e-6  # step between two rates
-_WILD = 5.0  # σ off its neighbours' line: fix is bridged
-_TURNS_MPS2 = 2.0  # largest bend of that line in a turn
 
 
 def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_ns: int) -> tuple[Floats, Floats]:
@@ -344,7 +362,7 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
     std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
     least_m = max(_MOVING_M, _CLEARLY * std_m)
-    places = _bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)[:, None]
+    places = bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)[:, None]
     for window_s in _WINDOWS_S:
         rows = round(window_s / _GRID_S)
         if grid_s.size <= rows:
@@ -372,21 +390,6 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     stamp_s = np.repeat(at_s, 2) + np.tile([-_STEP_S, _STEP_S], at_s.size)
     rate = np.repeat(np.diff(course) / np.diff(at_s), 2)
     return stamp_s, np.concatenate(([0.0], rate, [0.0]))
-
-
-def _bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
-    """Return places [m], shape (N,), those on the line between their neighbours that lie further off it than noise and a turn explain."""
-    if places.size < 3:
-        return places
-    step_s = stamp_s[2:] - stamp_s[:-2]
-    share = (stamp_s[1:-1] - stamp_s[:-2]) / np.maximum(step_s, _STEP_S)
-    between = places[:-2] + share * (places[2:] - places[:-2])
-    off_m = np.concatenate(([0.0], np.abs(places[1:-1] - between), [0.0]))
-    wild = off_m[1:-1] > _WILD * std_m + _TURNS_MPS2 * step_s**2 / 8
-    wild &= off_m[1:-1] >= np.maximum(off_m[:-2], off_m[2:])  # its neighbours lie half as far off their lines
-    found = places.copy()
-    found[1:-1][wild] = between[wild]
-    return found
 
 
 def compute_course(velocity_mps: Floats) -> Floats:

@@ -1,8 +1,9 @@
 """From a stream's columns to measurements: base_link axes, the datum's plane, usable variances, one row a stamp.
 
-Rows that say nothing (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range) are left out and
-returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, one that is
-too good to be true is raised to a floor: a zero covariance is not trust.
+Rows without a measurement (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range) are excluded and
+returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, or by the median
+of the stated ones where that is larger; one that is too small is raised to a floor: a zero covariance is not trust. Coordinates with few
+decimals err by rounding besides.
 
 By nav_msgs/Odometry a twist is along the axes of its child frame, the robot's. Some drivers write it along those of the pose's frame, as
 the derivative of the position is: then the velocity of a robot that only drives forward turns with its yaw.
@@ -55,11 +56,16 @@ _MAX_VELOCITY_MPS = 50.0  # no robot is faster
 _MAX_RATE_RADPS = 100.0  # no gyroscope measures more
 _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
-_FROZEN_NS = 1_000_000_000  # fixes that repeat for less are those of a slow receiver
+_FROZEN_NS = (
+    1_000_000_000  # fixes that repeat for less, or for less than two of their periods, are those of a slow receiver
+)
 _DRIVES_MPS = 0.1  # mean speed
 _DATUM_FIXES = 10  # the ENU origin is their median
 _NOISE_WINDOW_S = 2.0  # window of noise around each sample
 _TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
+_DEGREE_M = 111_320.0  # one degree of latitude, or of longitude at the equator [m]
+_DECIMALS = 10  # of a degree, 0.01 mm: binary numbers differ by less
+_OFF_GRID = 0.01  # largest distance of a value from its grid, as share of the grid
 _PIECE = 1 << 16
 _FEWEST_ROWS = 20  # second differences for velocity scatter
 _SCATTERS_MORE = 3.0
@@ -126,6 +132,8 @@ def prepare_positions(
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
+    degree_m = _DEGREE_M * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])
+    variance[:, :2] += _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
@@ -143,11 +151,25 @@ def prepare_positions(
     return made, prepared
 
 
+def _compute_rounding_variances(values: Floats) -> Floats:
+    """Return the variance of rounding along each axis of values (N, k), shape (k,): grid²/12 times how many rows in turn have one value.
+
+    All axes have one grid: the smallest step between their values, of which every step is a multiple. Rows with one value have one error,
+    which does not average out.
+    """
+    steps = np.concatenate([np.diff(np.unique(axis.round(_DECIMALS))) for axis in values.T])
+    multiples = steps / steps.min() if steps.size >= _FEWEST_ROWS else np.array([0.5])
+    if (np.abs(multiples - np.rint(multiples)) > _OFF_GRID).any():
+        return np.zeros(values.shape[1])
+    lengths = [np.diff(np.flatnonzero(np.diff(axis, prepend=np.nan, append=np.nan))) for axis in values.T]
+    return np.asarray(steps.min() ** 2 / 12.0 * np.array([np.median(np.repeat(each, each)) for each in lengths]))
+
+
 def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, tuple[Repeats, ...]]:
     """Return the fixes without those that repeat the one before to the last digit, and where they do while the robot drives.
 
-    They carry no information: a receiver that hangs, or a slow one that is published at a higher rate. Without odometry a robot may be
-    stationary where fixes repeat for a second or longer: they are kept. So are fixes that never change.
+    They carry no information: a receiver hangs, or a slow one is published at a higher rate. Without odometry a robot may be stationary
+    where fixes repeat for a second and two of their periods: they are kept. So are fixes that never change.
     """
     stamp_ns = gnss.stamp_ns
     changes = np.concatenate(([True], (np.diff(gnss.position_enu_m, axis=0) != 0.0).any(1)))
@@ -155,7 +177,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     if first.size < 2 or first.size == stamp_ns.size:
         return gnss, ()
     last = np.append(first[1:], stamp_ns.size) - 1
-    lasting = stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS
+    lasting = stamp_ns[last] - stamp_ns[first] >= max(_FROZEN_NS, 2 * compute_median_period_ns(stamp_ns[first]))
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
         return (gnss if kept.all() else select_rows(gnss, kept)), ()
@@ -434,9 +456,10 @@ def _is_known(variance: Floats) -> Mask:
 
 
 def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
-    """Return usable variances (N, k) and how many rows had one replaced."""
+    """Return usable variances (N, k), and how many rows had one replaced: by the default, or the median of the known if that is larger."""
     known = _is_known(variance)
-    filled = np.clip(np.where(known, variance, default), floor, NO_TRUST)
+    usual = [np.median(axis[rows]) if rows.any() else 0.0 for axis, rows in zip(variance.T, known.T, strict=True)]
+    filled = np.clip(np.where(known, variance, np.maximum(default, usual)), floor, NO_TRUST)
     return filled, int((~known).any(1).sum())
 
 

@@ -19,12 +19,12 @@ from tcpipe.fusion.measurements import (
     VISUAL,
     WHEELS,
     BodyVelocities,
-    GroundVelocities,
     InertialMeasurements,
     Measurements,
     Positions,
 )
 from tcpipe.fusion.signals import (
+    bridge_outliers,
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
@@ -33,6 +33,10 @@ from tcpipe.fusion.signals import (
     is_in_gap,
 )
 from tcpipe.robust import estimate_robust_std
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Plane = NDArray[np.complex128]
 
 SCALE_STD: Mapping[str, float] = {
     WHEELS: 0.12,  # a skid-steered robot on grass slips by so much
@@ -56,7 +60,9 @@ _SLIDE = 1e-4  # m²/s³
 _UNSEEN_SLIDE = 4e-4  # m²/s³
 _FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3  # the last in m²/s³
 _SHOWS_COURSE_MPS = 0.2  # worse velocity of fixes shows no course
-_UNSEEN_MPS = 0.5  # of a velocity told by fixes: more, and they do not show how it changes
+_UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show how it changes
+_SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver: half of the change that masks look for
+_HARDEST_MPS2 = 2.5  # a robot that brakes; what fixes show beyond is an outlier
 _LEVEL_STD_RAD = 0.7  # roll and pitch are small to this σ
 _HELD_STD_RAD = 0.05  # the same where only the course gives turns
 _CHORD_S = 4.0  # baseline of slope from fixes
@@ -171,11 +177,11 @@ def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> Mappi
 def make_motion_noise(  # noqa: PLR0917
     m: Measurements,
     noise: NoiseModel,
-    stamp_ns: NDArray[np.int64],
+    stamp_ns: Ints,
     mode: NDArray[np.int8],
-    rate_radps: NDArray[np.float64],
+    rate_radps: Floats,
     period_s: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the variance that motion adds over the tick before each stamp, of rotation [rad²] and body velocity [m²/s²], shape (K, 6).
 
     ``mode`` and ``rate_radps`` are those of the tick, as `tcpipe.fusion.state.move_state` takes them.
@@ -202,7 +208,7 @@ def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
     return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
-def _compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
     """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
     source = m.first_odometry
     if source is None:
@@ -210,9 +216,7 @@ def _compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.floa
     return np.abs(_interpolate_density(source.stamp_ns, source.velocity_mps[:, 0], at_ns))
 
 
-def _make_turn_density(
-    m: Measurements, mode: NDArray[np.int8], rate_radps: NDArray[np.float64], speed_mps: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _make_turn_density(m: Measurements, mode: NDArray[np.int8], rate_radps: Floats, speed_mps: Floats) -> Floats:
     """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 6), its last columns 0."""
     density = np.full((mode.size, 6), 0.0)
     density[:, :3] = _DRIFT
@@ -238,7 +242,7 @@ def _make_turn_density(
     return density
 
 
-_Density = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+_Density = Callable[[Ints], Floats]
 
 
 def _make_accelerometer_density(imu: InertialMeasurements) -> _Density:
@@ -256,10 +260,9 @@ def _make_odometry_density(measurements: Measurements) -> _Density:
     """
     sources = [source for source in measurements.odometries().values() if source.stamp_ns.size > 2]
     slope = [compute_slopes(s.stamp_ns, s.velocity_mps[:, 0], _ACCELERATION_WINDOW_S) for s in sources]
-    doppler = None if sources else measurements.doppler
-    unknown = _make_velocity_density(doppler) if doppler else _make_fix_density(None if sources else measurements.gnss)
+    unknown = _make_receiver_density(Measurements() if sources else measurements)
 
-    def density(at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def density(at_ns: Ints) -> Floats:
         found = np.full(at_ns.size, np.nan)
         for source, acceleration in zip(sources, slope, strict=True):
             covered = ~is_in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
@@ -270,41 +273,47 @@ def _make_odometry_density(measurements: Measurements) -> _Density:
     return density
 
 
-def _make_fix_density(gnss: Positions | None) -> _Density:
-    """Return the noise density without odometry: by the acceleration of the fixes over a second, or over five of them; else the usual.
+def _make_receiver_density(m: Measurements) -> _Density:
+    """Return the noise density without odometry: the square of the acceleration that a receiver shows, times how long it lasts.
 
-    Over a longer window an acceleration of a second looks smaller. Fixes too noisy to show a velocity do not show how steady it is.
+    What a slow receiver shows from fix to fix lasts as long. Fixes too noisy to show a velocity do not show how steady it is.
     """
-    if gnss is None or gnss.stamp_ns.size < _FIXES:
-        return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
-    window_s = _choose_window_s(gnss)
-    found = np.zeros(gnss.stamp_ns.size)
-    for axis in range(2):
-        velocity = compute_slopes(gnss.stamp_ns, gnss.position_enu_m[:, axis], window_s)
-        found += np.square(compute_slopes(gnss.stamp_ns, velocity, window_s))
-    unseen = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
-    found *= (window_s / _FIX_WINDOW_S) ** 2
-    density = np.minimum(np.maximum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, unseen), _UNKNOWN)
-    stamp_ns = gnss.stamp_ns
-    return lambda at_ns: _interpolate_density(stamp_ns, density, at_ns)
-
-
-def _make_velocity_density(doppler: GroundVelocities) -> _Density:
-    """Without odometry: the square of the acceleration that a receiver's own velocity shows, as far as it is not its noise."""
-    stamp_ns, window_s = (
-        doppler.stamp_ns,
-        max(_FIX_WINDOW_S, _FIXES * 1e-9 * compute_median_period_ns(doppler.stamp_ns)),
-    )
+    gnss, least, order = m.gnss, 0.0, 1
+    stamp_ns, values, variance = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
+    if m.doppler is not None:
+        stamp_ns, values, variance = m.doppler.stamp_ns, m.doppler.velocity_enu_mps, m.doppler.variance_m2ps2
+    elif gnss is not None:
+        stamp_ns, values, variance, order = gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, 2
+        least = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
     if stamp_ns.size < _FIXES:
         return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
-    shown = sum(np.square(compute_slopes(stamp_ns, axis, window_s)) for axis in doppler.velocity_enu_mps[:, :2].T)
-    density = np.minimum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * np.asarray(shown), _UNKNOWN)
-    return lambda at_ns: _interpolate_density(stamp_ns, density, at_ns)
+    zero_ns, std = int(stamp_ns[0]), float(np.sqrt(np.median(variance[:, :2])))
+    stamp_s, plane = compute_seconds(stamp_ns, zero_ns), values[:, :2] @ np.array([1.0, 1j])
+    plane = bridge_outliers(stamp_s, plane, std) if order == 2 else plane
+    at_s, acceleration = _compute_accelerations(stamp_s, plane, std, order)
+    lasts_s = max(_UNSEEN_LASTS_S, 1e-9 * compute_median_period_ns(stamp_ns))
+    density = np.maximum(_UNSEEN_STEADY + lasts_s * np.square(np.minimum(acceleration, _HARDEST_MPS2)), least)
+    return lambda at_ns: np.interp(compute_seconds(at_ns, zero_ns), at_s, density)
 
 
-def _interpolate_density(
-    stamp_ns: NDArray[np.int64], values: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _compute_accelerations(stamp_s: Floats, values: Plane, std: float, order: int) -> tuple[Floats, Floats]:
+    """Return times [s] and accelerations [m/s²], shape (M,), by the derivative of this order of samples in the plane, shape (N,).
+
+    Successive means are compared, of so few samples of a standard deviation ``std`` as show an acceleration of `_SHOWN_MPS2`.
+    """
+    wanted = _SHOWN_MPS2 * float(np.median(np.diff(stamp_s))) ** order / std
+    rows = int(
+        np.ceil((np.sqrt(4.0 * order - 2.0) / wanted) ** (1.0 / (order + 0.5)))
+    )  # 1 and 2 differences: √2 and √6 std
+    rows = min(rows, stamp_s.size // (order + 2))
+    at_s, values = (np.convolve(each, np.full(rows, 1.0 / rows), "valid") for each in (stamp_s, values))
+    for _ in range(order):
+        values = (values[rows:] - values[:-rows]) / (at_s[rows:] - at_s[:-rows])
+        at_s = 0.5 * (at_s[rows:] + at_s[:-rows])
+    return at_s, np.abs(values)
+
+
+def _interpolate_density(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
     zero = int(stamp_ns[0])
     return np.interp(compute_seconds(at_ns, zero), compute_seconds(stamp_ns, zero), values)
 

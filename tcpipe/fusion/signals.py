@@ -9,8 +9,11 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Plane = NDArray[np.complex128]
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
+_OUTLIER_STDS = 5.0  # distance of an outlier from the line between its neighbours
+_MAX_ACCELERATION_MPS2 = 2.0  # bends that line by a v²/8 of the time between them
 _MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long
 
 
@@ -112,6 +115,24 @@ def compute_median_of_five(values: Floats) -> Floats:
         return values
     padded = np.pad(values, 2, mode="edge")
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+
+
+def bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
+    """Return places [m], shape (N,), without single outliers, which are moved to the line between their neighbours.
+
+    An outlier is further off that line than noise of ``std_m`` and an acceleration explain.
+    """
+    if places.size < 3:
+        return places
+    step_s = stamp_s[2:] - stamp_s[:-2]
+    share = (stamp_s[1:-1] - stamp_s[:-2]) / np.maximum(step_s, 1e-6)
+    between = places[:-2] + share * (places[2:] - places[:-2])
+    off_m = np.concatenate(([0.0], np.abs(places[1:-1] - between), [0.0]))
+    wild = off_m[1:-1] > _OUTLIER_STDS * std_m + _MAX_ACCELERATION_MPS2 * step_s**2 / 8
+    wild &= off_m[1:-1] >= np.maximum(off_m[:-2], off_m[2:])  # its neighbours lie half as far off their lines
+    found = places.copy()
+    found[1:-1][wild] = between[wild]
+    return found
 
 
 def compute_slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:

@@ -167,15 +167,17 @@ def fuse_recovering(
     """Fuse a section; where the track contradicts every sensor, again without the one that misleads it.
 
     That is the IMU, which carries the state from tick to tick, if the track recovers without it; else the only sensor without which it
-    does. A local frame goes on from the end of ``last``.
+    does. A single sensor of motion that its own track contradicts is not consistent: there is nothing to fuse without it. A local frame
+    goes on from the end of ``last``.
 
-    Raises `FusionError`: the track contradicts every sensor, whichever is excluded.
+    Raises `FusionError`: the track contradicts every sensor, whichever is excluded, or the only one.
     """
     fused = fuse_section(inputs, streams, config, last)
     if not is_astray(fused.windows, fused.astray):
         return inputs, fused
+    roles = sorted(inputs.measurements.sensors())
     recovered = {}
-    for role in sorted(inputs.measurements.sensors()):
+    for role in roles:
         rest = _exclude_misleading(role, inputs, streams)
         if rest.measurements.gnss is not None or rest.measurements.odometries():
             tried = fuse_section(rest, streams, config, last)
@@ -185,11 +187,17 @@ def fuse_recovering(
         return recovered[IMU]
     if len(recovered) == 1:
         return next(iter(recovered.values()))
+    motion = [role for role in roles if role not in {IMU, DOPPLER}]
+    code, subject, problem = "track-contradicts-sensors", run, "the track contradicts every sensor"
+    if len(motion) == 1:
+        code, subject, problem = (
+            "sensor-contradicts-itself",
+            Subject("role", motion[0]),
+            f"{motion[0]} contradicts itself",
+        )
     span_s = find_span_s(*inputs.span_ns, streams)
-    finding = make_finding(
-        "track-contradicts-sensors", run, span_s=span_s, astray_fraction=fused.astray / fused.windows
-    )
-    raise FusionError("the track contradicts every sensor", findings=(finding, *inputs.excluded.values()))
+    finding = make_finding(code, subject, span_s=span_s, astray_fraction=fused.astray / fused.windows)
+    raise FusionError(problem, findings=(finding, *inputs.excluded.values()))
 
 
 def _exclude_misleading(role: str, inputs: Section, streams: Streams) -> Section:

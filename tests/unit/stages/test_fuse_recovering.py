@@ -23,12 +23,12 @@ def odometry():
     return BodyVelocities(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3)), np.zeros(5), np.ones(5))
 
 
-def inputs(*, visual=True, imu=True):
+def inputs(*, visual=True, imu=True, wheels=True):
     quat = np.full((5, 4), np.nan)
     heard = Measurements(
         gnss=Positions(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3))),
         imu=InertialMeasurements(STAMP_NS, np.zeros((5, 3)), np.zeros((5, 3)), quat, 0.01, 0.1) if imu else None,
-        wheels=odometry(),
+        wheels=odometry() if wheels else None,
         visual=odometry() if visual else None,
     )
     return Section(0, heard, datum_deg_m=(15.0, 47.0, 400.0))
@@ -93,6 +93,15 @@ def test_an_epoch_that_contradicts_every_sensor_costs_only_its_own_track(fusing)
     roles = frozenset(ROLES) - {"visual_odometry"}
     fusing(lost=[roles, *(roles - {role} for role in roles)])
     sections = [inputs(), replace(inputs(visual=False), clock_epoch=1)]
-    _, fused, (failure,) = stage.fuse_sections(sections, STREAMS, FuseConfig(), run=Subject("run", "r"))
+    _, fused, (error,) = stage.fuse_sections(sections, STREAMS, FuseConfig(), run=Subject("run", "r"))
     assert (fused.windows, fused.astray) == (20, 0)
-    assert (failure.code, failure.severity) == ("track-contradicts-sensors", "warning")
+    assert [finding.code for finding in error.findings] == ["track-contradicts-sensors"]
+
+
+@pytest.mark.parametrize("imu", [False, True])
+def test_a_single_sensor_of_motion_that_contradicts_itself_is_named_and_not_to_be_excluded(fusing, imu):
+    fusing(lost=[frozenset({"gnss"}), frozenset({"gnss", "imu"})])
+    with pytest.raises(FusionError) as error:
+        recovered(inputs(imu=imu, visual=False, wheels=False))
+    (finding,) = error.value.findings
+    assert (finding.code, finding.subject.name) == ("sensor-contradicts-itself", "gnss")
