@@ -93,6 +93,6 @@ def test_an_epoch_that_contradicts_every_sensor_costs_only_its_own_track(fusing)
     roles = frozenset(ROLES) - {"visual_odometry"}
     fusing(lost=[roles, *(roles - {role} for role in roles)])
     sections = [inputs(), replace(inputs(visual=False), clock_epoch=1)]
-    _, fused, (failure,) = stage.fuse_sections(sections, STREAMS, FuseConfig(), run=Subject("run", "r"))
+    _, fused, (error,) = stage.fuse_sections(sections, STREAMS, FuseConfig(), run=Subject("run", "r"))
     assert (fused.windows, fused.astray) == (20, 0)
-    assert (failure.code, failure.severity) == ("track-contradicts-sensors", "warning")
+    assert [finding.code for finding in error.findings] == ["track-contradicts-sensors"]
