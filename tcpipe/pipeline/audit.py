@@ -109,7 +109,7 @@ def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> It
     step(f"fusing without {role} for {len(windows_ns)} x {length_s:.0f} s")
     track = run.fuse(withhold(run.streams, role, run.section.clock_epoch, windows_ns))
     facts = track.info.report.facts
-    if role == GNSS and facts.sensor_checks is not None and not facts.sensor_checks.excluded.keys().isdisjoint(FIXES):
+    if role == GNSS and facts.fuse is not None and not {*FIXES}.intersection(facts.fuse.sensors):
         raise FusionError("tcpipe excludes the other fixes of the run")
     rows = _select_rows(track, run.section)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])

@@ -205,7 +205,8 @@ def make_audit_findings(fused: Fused, inputs: Sequence[Section], streams: Stream
     first_ns = min((section.start_ns for section in fused.facts), default=0)
     findings = [_find_disagreement(found, first_ns)] if found else []
     # The scale of the wheels is a constant of the robot: any section may show that it is wrong.
-    faster = max((ratio for section in inputs if (ratio := _compute_command_ratio(section)) is not None), default=None)
+    ratios = (compute_command_ratio(section.measurements, section.command) for section in inputs)
+    faster = max((ratio for ratio in ratios if ratio is not None), default=None)
     if faster is not None:
         scale = round((streams.report.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
         remedies = suggest("state_scale", {"read.odometry_scale": {WHEELS: scale}})
@@ -213,14 +214,6 @@ def make_audit_findings(fused: Fused, inputs: Sequence[Section], streams: Stream
         wheels = Subject("role", WHEELS)
         findings.append(make_finding("faster-than-commanded", wheels, remedies=remedies, speed_ratio=faster))
     return StageReport(tuple(findings), AuditFacts(tuple(found), () if faster is None else (WHEELS,)))
-
-
-def _compute_command_ratio(section: Section) -> float | None:
-    """Return the ratio of the wheels' speed to the command where it is too high and no sensor makes the scale observable."""
-    m = section.measurements
-    if m.wheels is None or m.gnss is not None or m.visual is not None or section.command is None:
-        return None
-    return compute_command_ratio(m.wheels, section.command)
 
 
 def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:

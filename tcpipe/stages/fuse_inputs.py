@@ -142,16 +142,20 @@ def _prepare_section(
     if config.estimator == "ukf" and DOPPLER in streams.tables:
         names = {"estimator": config.estimator}
         findings.insert(0, make_finding("unused-by-estimator", Subject("role", DOPPLER), names=names))
-    gnss, odometry = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL)
+    gnss, odometry, fixes = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL), Subject("role", GNSS)
     if gnss is not None:
         gnss = align_mounting(gnss, odometry, is_stated=streams.sensors[GNSS].placed_by != "assumed")
         repeated = prepared[GNSS].repeated + gnss.stamp_ns.size
         gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
         prepared[GNSS] = replace(prepared[GNSS], repeated=repeated - gnss.stamp_ns.size)
-        findings += [_find_frozen(each, streams) for each in repeats]
+        for each in repeats:
+            span_s, frozen = find_span_s(each.start_ns, each.end_ns, streams), {"quantity": "position"}
+            findings.append(make_finding("frozen", fixes, span_s=span_s, names=frozen, message_count=each.messages))
     if gnss is not None and odometry is not None:
         gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
-        findings += _find_jitter(jitter_s)
+        if (jumpy := jitter_s > 0).any():
+            share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
+            findings.append(make_finding("stamp-jitter", fixes, jitter_fraction=share, jitter_s=median_s))
     return Section(
         0,
         Measurements(nonholonomic_std_mps=config.nonholonomic_std_mps).replace_sensors(found | {GNSS: gnss}),
@@ -159,19 +163,6 @@ def _prepare_section(
         prepared=prepared,
         findings=tuple(dict.fromkeys(findings)),
     )
-
-
-def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
-    subject, names = Subject("role", GNSS), {"quantity": "position"}
-    span_s = find_span_s(repeats.start_ns, repeats.end_ns, streams)
-    return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
-
-
-def _find_jitter(jitter_s: NDArray[np.float64]) -> Iterator[Finding]:
-    jumpy = jitter_s > 0
-    if jumpy.any():
-        share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
-        yield make_finding("stamp-jitter", Subject("role", GNSS), jitter_fraction=share, jitter_s=median_s)
 
 
 def find_span_s(start_ns: int, end_ns: int, streams: Streams) -> tuple[float, float]:

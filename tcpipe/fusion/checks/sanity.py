@@ -45,7 +45,6 @@ from tcpipe.fusion.measurements import (
     PAUSE_NS,
     VISUAL,
     WHEELS,
-    BodyVelocities,
     InertialMeasurements,
     Measurements,
     Positions,
@@ -130,7 +129,9 @@ def check_sensors(
     looks: dict[str, float] = {}
     if m.imu is not None:
         drives = any(compare_paths(path, path, _SHORT_S, noise_m2) for path in paths.values())
-        found |= _find_frozen_imu(m.imu) if drives else {}
+        values = {"acceleration": m.imu.specific_force_mps2, "angular_velocity": m.imu.angular_velocity_radps}
+        if drives and (frozen := [quantity for quantity, each in values.items() if _is_constant(each)]):
+            found[IMU] = _make_frozen_exclusion(IMU, frozen[0], len(m.imu.stamp_ns))
         axes, looks = _check_imu(found, m.imu, m.gnss, twists, at_ns, felt=felt, is_stated=stated.get(IMU, False))
     # 2. Paths show what is frozen, in another unit, or of another drive; yaw rates are the gyroscope's where it confirms them.
     if m.imu is not None and IMU not in found:
@@ -379,16 +380,6 @@ def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
     return 1.0 / float(np.median(step_s)) if is_slow else None
 
 
-def _find_frozen_imu(imu: InertialMeasurements) -> Exclusions:
-    for quantity, values in (
-        ("acceleration", imu.specific_force_mps2),
-        ("angular_velocity", imu.angular_velocity_radps),
-    ):
-        if _is_constant(values):
-            return {IMU: _make_frozen_exclusion(IMU, quantity, len(values))}
-    return {}
-
-
 def _check_imu(
     found: Exclusions,
     imu: InertialMeasurements,
@@ -578,12 +569,13 @@ _DRIVES_MPS = 0.3  # motors round slower commands
 _FASTER = 1.03  # of a command: no controller overshoots more
 
 
-def compute_command_ratio(wheels: BodyVelocities, command: Command) -> float | None:
-    """Return the ratio of the wheels' speed to the commanded speed, where that is surely too fast; else None.
+def compute_command_ratio(m: Measurements, command: Command | None) -> float | None:
+    """Return the ratio of the wheels' speed to the command where it is surely too high, and no other sensor shows the scale; else None.
 
     Only times count in which a command has been constant for three seconds: a robot that brakes is faster than its command.
     """
-    if command.stamp_ns.size == 0:
+    wheels = m.wheels
+    if wheels is None or m.gnss is not None or m.visual is not None or command is None or command.stamp_ns.size == 0:
         return None
     commanded_mps = hold_last(command.stamp_ns, command.forward_velocity_mps, wheels.stamp_ns)
     # A difference to an unknown command is NaN, which is a change.

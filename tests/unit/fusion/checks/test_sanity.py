@@ -207,18 +207,18 @@ def driven(over, *, commanded):
 def test_a_robot_that_is_faster_than_its_command_has_other_wheels(over, found):
     jitter = np.random.default_rng(1).normal(0, 0.01, COMMAND_NS.size)
     commanded = np.where(COMMAND_NS % (30 * 10**9) < 24 * 10**9, 1.0 + jitter, 0.0)
-    told = compute_command_ratio(driven(over, commanded=commanded), order(COMMAND_NS, commanded))
+    told = compute_command_ratio(Measurements(wheels=driven(over, commanded=commanded)), order(COMMAND_NS, commanded))
     assert told == (None if found is None else pytest.approx(found, abs=0.02))
 
 
 def test_a_command_that_is_not_what_drives_tells_nothing():
     moving = driven(1.2, commanded=np.ones(COMMAND_NS.size))
-    assert compute_command_ratio(moving, order(COMMAND_NS, np.zeros(COMMAND_NS.size))) is None
-    assert compute_command_ratio(moving, order(COMMAND_NS[:0], np.zeros(0))) is None
+    assert compute_command_ratio(Measurements(wheels=moving), order(COMMAND_NS, np.zeros(COMMAND_NS.size))) is None
+    assert compute_command_ratio(Measurements(wheels=moving), order(COMMAND_NS[:0], np.zeros(0))) is None
 
 
 def test_speeds_while_the_commands_are_silent_prove_no_ratio():
     is_sent = COMMAND_NS % (20 * 10**9) < 6 * 10**9
     another_source = np.where(np.roll(is_sent, 20), 1.0, 1.3)  # it drives until two seconds after the commands return
     command = order(COMMAND_NS[is_sent], np.ones(is_sent.sum()))
-    assert compute_command_ratio(driven(1.0, commanded=another_source), command) is None
+    assert compute_command_ratio(Measurements(wheels=driven(1.0, commanded=another_source)), command) is None
