@@ -163,24 +163,26 @@ def exclude_other_clocks(inputs: FusionInputs, streams: Streams) -> FusionInputs
     """
     if not inputs.measurements:
         return inputs
-    reference, offsets = find_other_clocks(inputs.measurements[find_longest_epoch(inputs)])
-    exclusions = [
-        SensorExclusion(
-            role,
-            "clocks-differ",
-            {"reference": reference},
-            {"offset_s": each.offset_s, "offset_2std_s": 2 * each.std_s},
-        )
-        for role, each in offsets.items()
-    ]
-    inputs = exclude_sensors(inputs, exclusions, streams) if exclusions else inputs
-    findings = {
-        role: replace(
-            finding, severity="error", remedies=_state_offset(role, offsets[role], streams) + finding.remedies
-        )
-        for role, finding in inputs.excluded.items()
-    }
-    return replace(inputs, excluded=findings)
+    offsets = find_other_clocks(inputs.measurements[find_longest_epoch(inputs)])
+    reference = next((role for role, offset in offsets.items() if not offset.noted), "")
+    for role, offset in offsets.items():
+        if offset.noted:
+            numbers = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
+            exclusion = SensorExclusion(role, "clocks-differ", {"reference": reference}, numbers)
+            inputs = exclude_sensors(inputs, [exclusion], streams)
+            remedies = _state_offset(role, offset, streams) + inputs.excluded[role].remedies
+            finding = replace(inputs.excluded[role], severity="error", remedies=remedies)
+            inputs = replace(inputs, excluded={**inputs.excluded, role: finding})
+    return inputs
+
+
+def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
+    """Return how late sensors' stamps are against those of most sensors [s], by role; those whose offset is unknown are missing."""
+    inputs = prepare_inputs(prepare_pose(streams)[0], config)
+    if not inputs.measurements:
+        return {}
+    offsets = find_other_clocks(inputs.measurements[find_longest_epoch(inputs)], always=True)
+    return {name_pose(role, streams): offset.offset_s for role, offset in offsets.items()}
 
 
 _FINE_S = 0.004
