@@ -503,29 +503,22 @@ def _align_clocks(
     to five minutes around the one at which both tables begin together. A table without motion has the clock of a table with which it has
     time in common.
     """
-    from tcpipe.fusion.checks.clock_offsets import refine_offsets  # noqa: PLC0415  kernels load only where there is work
-    from tcpipe.fusion.checks.coarse_lag import NEAR_S, find_coarse_offsets  # noqa: PLC0415
-    from tcpipe.fusion.measurements import Measurements  # noqa: PLC0415
-    from tcpipe.stages.fuse_inputs import prepare_sections, rank_sections, use_pose_as_fixes  # noqa: PLC0415
+    from tcpipe.stages.fuse import find_late_sensors  # noqa: PLC0415  kernels load only where there is work
 
     begin_s = {name: (reference.span_ns[0] - table.span_ns[0]) / 1e9 for name, table in apart.items()}
     together = [ProposedLine(f"tables.{name}", "offset_s", each) for name, each in begin_s.items()]
     offset_s = dict[str, float]()
     with suppress(TcpipeError):
         recipe = _make_recipe([*lines, *together])
-        sections = prepare_sections(use_pose_as_fixes(_read_streams(log, recipe))[0], recipe.fuse)
-        m = sections[rank_sections(sections)[0]].measurements if sections else Measurements()
-        late_s = find_coarse_offsets(m)
-        if apart or any(abs(each) > NEAR_S for each in late_s.values()):
-            refined = refine_offsets(m, late_s).items()
-            offset_s = {name: round(begin_s.get(name, 0.0) - offset.offset_s, 2) for name, offset in refined}
+        late_s = find_late_sensors(_read_streams(log, recipe), recipe.fuse)
+        offset_s = {name: round(begin_s.get(name, 0.0) - each, 2) for name, each in late_s.items()}
     for name, table in apart.items():
         clocks = [each for other, each in offset_s.items() if other in apart and apart[other].overlap_ns(table)]
         offset_s |= {name: clocks[0]} if name not in offset_s and clocks else {}
     aligned = [
         ProposedLine(f"tables.{name}", "offset_s", each, "aligned by speed and turns")
         for name, each in offset_s.items()
-        if name in apart or abs(each) > NEAR_S
+        if name in apart or abs(each) > 1.0  # fusing corrects less
     ]
     return [*lines, *aligned], [name for name in apart if name not in offset_s]
 

@@ -215,27 +215,28 @@ def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[
     found, known = [*sections], dict[str, tuple[str, ClockOffset]]()
     for place in rank_sections(sections):
         section = sections[place]
-        reference, offsets = find_other_clocks(section.measurements)
-        known |= {role: (reference, each) for role, each in offsets.items()}
-        far = {role: each for role, each in known.items() if role in section.measurements.sensors()}
-        exclusions = [
-            SensorExclusion(
-                role,
-                "clocks-differ",
-                {"reference": against},
-                {"offset_s": each.offset_s, "offset_2std_s": 2 * each.std_s},
-            )
-            for role, (against, each) in far.items()
-        ]
-        section = exclude_sensors(section, exclusions, streams)
-        findings = {
-            role: replace(
-                finding, severity="error", remedies=_state_offset(role, far[role][1], streams) + finding.remedies
-            )
-            for role, finding in section.excluded.items()
-        }
-        found[place] = replace(section, excluded=findings)
+        offsets = find_other_clocks(section.measurements)
+        reference = next((role for role, offset in offsets.items() if not offset.noted), "")
+        known |= {role: (reference, offset) for role, offset in offsets.items() if offset.noted}
+        for role in [role for role in known if role in section.measurements.sensors()]:
+            against, offset = known[role]
+            numbers = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
+            exclusion = SensorExclusion(role, "clocks-differ", {"reference": against}, numbers)
+            section = exclude_sensors(section, [exclusion], streams)
+            remedies = _state_offset(role, offset, streams) + section.excluded[role].remedies
+            finding = replace(section.excluded[role], severity="error", remedies=remedies)
+            section = replace(section, excluded={**section.excluded, role: finding})
+        found[place] = section
     return found
+
+
+def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
+    """Return how late sensors' stamps are against those of most sensors [s], by role; those whose offset is unknown are missing."""
+    sections = prepare_sections(use_pose_as_fixes(streams)[0], config)
+    if not sections:
+        return {}
+    offsets = find_other_clocks(sections[rank_sections(sections)[0]].measurements, always=True)
+    return rename_role({role: offset.offset_s for role, offset in offsets.items()}, GNSS, find_fixes_role(streams))
 
 
 _FINE_S = 0.004

@@ -96,42 +96,32 @@ def find_middle_ns(m: Measurements) -> tuple[int, float]:
     return (first_ns + last_ns) // 2, (last_ns - first_ns) * 1e-9
 
 
-def find_other_clocks(m: Measurements) -> tuple[str, dict[str, ClockOffset]]:
-    """Return a sensor, and the offsets of sensors whose clocks are more than a second from its own; ("", {}) where there are none."""
+def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:
+    """Return the offsets of sensors from the largest group that shares a clock, beyond the fine search and within it.
+
+    Those beyond it are noted. Nothing is returned if there are none, unless ``always``; sensors whose offset is unknown are missing.
+    """
     late_s = find_coarse_offsets(m)
-    if all(abs(each) <= NEAR_S for each in late_s.values()):
-        return "", {}
-    far = {role: offset for role, offset in refine_offsets(m, late_s).items() if abs(late_s[role]) > NEAR_S}
-    return next(role for role, each in late_s.items() if each == 0.0), far
-
-
-def refine_offsets(m: Measurements, late_s: Mapping[str, float]) -> dict[str, ClockOffset]:
-    """Return coarse offsets [s], by role, to a few milliseconds where the fine search determines them."""
-    coarse = {role: ClockOffset(each, _COARSE_STD_S, noted=True, blamed=False) for role, each in late_s.items()}
+    coarse = {
+        role: ClockOffset(each, _COARSE_STD_S, noted=abs(each) > NEAR_S, blamed=False) for role, each in late_s.items()
+    }
+    if not always and not any(offset.noted for offset in coarse.values()):
+        return {}
     found = find_clock_offsets(shift_sensors(m, coarse, 0))
     fine = {found.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(found.offsets)
     zero = next((fine[role] for role, each in late_s.items() if each == 0.0 and role in fine), None)
-    if zero is None:
-        return coarse
-    refined = {
-        role: replace(
-            offset, offset_s=offset.offset_s + fine[role].offset_s - zero.offset_s, std_s=fine[role].std_s + zero.std_s
-        )
-        for role, offset in coarse.items()
-        if role in fine
-    }
-    return coarse | refined
+    if zero is not None:
+        for role in coarse.keys() & fine.keys():
+            offset_s = late_s[role] + fine[role].offset_s - zero.offset_s
+            coarse[role] = replace(coarse[role], offset_s=offset_s, std_s=fine[role].std_s + zero.std_s)
+    return coarse
 
 
 def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns: int) -> Measurements:
     """Return measurements whose stamps are without the offsets of their sensors, and the drifts about ``middle_ns``."""
-    moved = {role: sensor for role, sensor in m.sensors().items() if role in offsets}
-    return m.replace_sensors(
-        {
-            role: replace(sensor, stamp_ns=shift_stamps(sensor.stamp_ns, offsets[role], middle_ns))
-            for role, sensor in moved.items()
-        }
-    )
+    off = {role: sensor for role, sensor in m.sensors().items() if role in offsets}
+    stamps = {role: shift_stamps(sensor.stamp_ns, offsets[role], middle_ns) for role, sensor in off.items()}
+    return m.replace_sensors({role: replace(sensor, stamp_ns=stamps[role]) for role, sensor in off.items()})
 
 
 def shift_stamps(stamp_ns: NDArray[np.int64], offset: ClockOffset, middle_ns: int) -> NDArray[np.int64]:
