@@ -338,24 +338,22 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
     std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
     least_m = max(_MOVING_M, _CLEARLY * std_m)
-    places = bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)[:, None]
+    places = bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)
+    values = np.column_stack((places.real, places.imag))
     for window_s in _WINDOWS_S:
         rows = round(window_s / _GRID_S)
         if grid_s.size <= rows:
             return stamp_s[:1], np.zeros(1)
-        means = compute_interval_means(
-            stamp_s, np.column_stack((places.real, places.imag)), grid_s - _GRID_S, grid_s + _GRID_S
-        )
+        means = compute_interval_means(stamp_s, values, grid_s - _GRID_S, grid_s + _GRID_S)
         way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
         at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
         moving = np.abs(way) > least_m
         if moving.mean() > _OFTEN:
             break
     if odometry is not None:
-        start_s, end_s = at_s - window_s / 2, at_s + window_s / 2
-        driven = compute_interval_means(
-            compute_seconds(odometry.stamp_ns, zero_ns), odometry.velocity_mps[:, :1], start_s, end_s
-        )[:, 0]
+        odometry_s = compute_seconds(odometry.stamp_ns, zero_ns)
+        ends_s = at_s - window_s / 2, at_s + window_s / 2
+        driven = compute_interval_means(odometry_s, odometry.velocity_mps[:, :1], *ends_s)[:, 0]
         moving &= np.abs(driven) > _MIN_SPEED_MPS
         way = way * np.sign(driven)
     if moving.sum() < 2:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.attitude import add_attitude, add_turn_variance
+from tcpipe.fusion.attitude import add_attitude, add_turn_variance, compute_turns
 from tcpipe.fusion.measurements import (
     IMU,
     NO_TRUST,
@@ -37,7 +37,7 @@ from tcpipe.fusion.signals import (
     integrate_signal,
 )
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate, rotation_vector_from_quat
+from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -49,6 +49,7 @@ Columns = Mapping[str, Floats]
 """Columns of a stream by name, null as NaN."""
 
 _IMU = Subject("role", IMU)
+_QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
 _VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
 _YAW_RATE_STD_RADPS = 0.1  # default of an odometry without one
 _YAW_RATE_FLOOR_RADPS = 0.02  # no odometry is better
@@ -56,9 +57,7 @@ _MAX_VELOCITY_MPS = 50.0  # no robot is faster
 _MAX_RATE_RADPS = 100.0  # no gyroscope measures more
 _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
-_FROZEN_NS = (
-    1_000_000_000  # fixes that repeat for less, or for less than two of their periods, are those of a slow receiver
-)
+_FROZEN_NS = 1_000_000_000  # fixes that repeat for less, or for two of their periods, are those of a slow receiver
 _DRIVES_MPS = 0.1  # mean speed
 _DATUM_FIXES = 10  # the ENU origin is their median
 _NOISE_WINDOW_S = 2.0  # window of noise around each sample
@@ -139,15 +138,9 @@ def prepare_positions(
     unclaimed_rows = unclaimed if unclaimed.any() else None
     made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
     if "quat_x" in columns:
-        frame, quat, rotation_variance = (
-            _stack_columns(columns, names)[usable]
-            for names in (
-                ("x_m", "y_m"),
-                [f"quat_{c}" for c in "xyzw"],
-                [f"rotation_{axis}_var" for axis in "xyz"],
-            )
-        )
-        made = add_attitude(made, frame, quat, rotation_variance, mounting_xyzw)
+        frame, quat = _stack_columns(columns, ("x_m", "y_m")), _stack_columns(columns, _QUAT)
+        rotation_variance = _stack_columns(columns, [f"rotation_{axis}_var" for axis in "xyz"])
+        made = add_attitude(made, frame[usable], quat[usable], rotation_variance[usable], mounting_xyzw)
     return made, prepared
 
 
@@ -267,7 +260,7 @@ def prepare_body_velocities(
     variance = _stack_columns(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
     subject = Subject("role", WHEELS if only_forward else VISUAL)
     findings: list[Finding] = []
-    quat = normalize(_stack_columns(columns, [f"quat_{c}" for c in "xyzw"]))
+    quat = normalize(_stack_columns(columns, _QUAT))
     rotation = matrix_from_quat(quat_xyzw)
     if not has_twist(_rotate_vectors(rotation, velocity)[:, :1], pose):
         stamp_ns, velocity, rate = compute_increments(stamp_ns, pose, quat)
@@ -353,11 +346,9 @@ def prepare_imu(
     """
     rate = _stack_columns(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _stack_columns(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
-    of_orientation = np.zeros(3, np.bool_)
-    if (np.nan_to_num(rate) == 0.0).all(0).any() and np.nan_to_num(
-        np.diff(force, axis=0)
-    ).any():  # a dead IMU stays dead
-        quat = normalize(_stack_columns(columns, [f"quat_{c}" for c in "xyzw"]))
+    of_orientation, is_alive = np.zeros(3, np.bool_), np.nan_to_num(np.diff(force, axis=0)).any()
+    if is_alive and (np.nan_to_num(rate) == 0.0).all(0).any():
+        quat = normalize(_stack_columns(columns, _QUAT))
         rate, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
     # NaN compares false.
     good: Mask = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
@@ -376,15 +367,9 @@ def prepare_imu(
     for piece in _iterate_slices(usable.size):
         rate[piece], force[piece] = rotate(quat_xyzw, rate[piece]), rotate(quat_xyzw, force[piece])
     _move_to_base_link(stamp_ns[usable], rate, force, np.asarray(xyz_m))
+    quat = _read_orientations(columns, usable, quat_xyzw)
     made = InertialMeasurements(
-        stamp_ns[usable],
-        rate,
-        force,
-        _read_orientations(columns, usable, quat_xyzw),
-        gyro_std,
-        accelerometer_std,
-        weighs,
-        accelerometer_noise_mps2=noise,
+        stamp_ns[usable], rate, force, quat, gyro_std, accelerometer_std, weighs, accelerometer_noise_mps2=noise
     )
     return made, Prepared(stamp_ns[~good], repeated, 0, tuple(findings))
 
@@ -396,7 +381,7 @@ def _iterate_slices(rows: int) -> Iterator[slice]:
 
 def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
     """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it has none."""
-    components = [columns[f"quat_{c}"] for c in "xyzw"]
+    components = [columns[name] for name in _QUAT]
     if any(np.isnan(component).all() for component in components):
         return np.broadcast_to(np.nan, (usable.size, 4))
     found = np.empty((usable.size, 4))
@@ -488,7 +473,7 @@ def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tup
     stamp, position, quat = stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
     step_ns = np.diff(stamp)
     step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
-    turn = rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:]))
+    turn = compute_turns(quat)
     # Half-way between two: the normalized sum of the quaternions of one hemisphere.
     sign = np.where(np.sum(quat[:-1] * quat[1:], axis=-1, keepdims=True) < 0, -1.0, 1.0)
     velocity = rotate(invert(normalize(quat[:-1] + sign * quat[1:])), np.diff(position, axis=0)) / step_s
@@ -508,11 +493,11 @@ def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Flo
     if not zero.any() or known.size < _FEWEST:
         return rate_radps, np.zeros(3, np.bool_)
     stamp, quat = stamp_ns[known], quat_xyzw[known]
-    turned_rad = np.cumsum(rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:])), axis=0)
+    turned_rad = np.cumsum(compute_turns(quat), axis=0)
     turns = zero & (np.ptp(turned_rad, axis=0) > _TURNED_RAD)
     # Over two steps, so that the rate is that in the middle, at the stamp itself.
     step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
-    rate = rotation_vector_from_quat(multiply(invert(quat[:-2]), quat[2:])) / step_s
+    rate = compute_turns(quat, 2) / step_s
     inner, near = known[1:-1], step_s[:, 0] <= _MAX_INCREMENT_S
     rates = np.where(turns, np.nan, rate_radps)
     rates[inner[near]] = np.where(turns, rate[near], rate_radps[inner[near]])
@@ -524,20 +509,21 @@ def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, qua
 
     Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
     """
-    known = np.isfinite(velocity_mps[:, :2]).all(1) & np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1)
-    stamp, place, quat = stamp_ns[known], pose_m[known, :2], quat_xyzw[known]
-    measured_mps = np.nan_to_num(velocity_mps[known])
-    step_s = np.diff(stamp) * 1e-9
-    good = (step_s > 0) & (step_s <= _MAX_INCREMENT_S)
-    way = np.diff(place, axis=0)[good] / step_s[good, None]
-    moving = np.linalg.norm(way, axis=1) > _MOVES_MPS
+    known = np.isfinite(np.hstack((velocity_mps[:, :2], pose_m, quat_xyzw))).all(1)
+    step_s = np.diff(stamp_ns[known])[:, None] * 1e-9
+    good = ((step_s > 0) & (step_s <= _MAX_INCREMENT_S))[:, 0]
+    way = np.diff(pose_m[known, :2], axis=0)[good] / step_s[good]
+    size = np.linalg.norm(way, axis=1)
+    moving = size > _MOVES_MPS
     if moving.sum() < _FEWEST:
         return False
-    turned = rotate(quat, measured_mps)
-    as_stated, as_turned = (
-        _compute_misfit((v[1:] + v[:-1])[good, :2] / 2.0, way, moving) for v in (measured_mps, turned)
-    )
-    return as_stated < _FITS and as_turned > _FITS_NOT
+    measured, misfit = np.nan_to_num(velocity_mps[known]), []
+    for axes in (measured, rotate(quat_xyzw[known], measured)):
+        velocity = ((axes[1:] + axes[:-1])[good, :2] / 2.0)[moving]
+        scale = np.median(np.linalg.norm(velocity, axis=1) / size[moving])
+        rest = np.sum((velocity - scale * way[moving]) ** 2, axis=1) / (scale * size[moving]) ** 2
+        misfit.append(np.median(rest))  # poses may jump
+    return bool(misfit[0] < _FITS and misfit[1] > _FITS_NOT)
 
 
 def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
@@ -545,10 +531,3 @@ def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
     turned = rotate(invert(quat_xyzw), np.nan_to_num(velocity_mps))
     turned[np.isnan(velocity_mps)] = np.nan
     return np.where(np.isfinite(quat_xyzw).all(1, keepdims=True), turned, np.nan)
-
-
-def _compute_misfit(said: Floats, way: Floats, moving: Mask) -> float:
-    """Return the share of the squares of a way that a velocity, whatever its scale, leaves unexplained (medians: poses may jump)."""
-    size = np.linalg.norm(way[moving], axis=1)
-    scale = np.median(np.linalg.norm(said[moving], axis=1) / size)
-    return float(np.median(np.sum((said[moving] - scale * way[moving]) ** 2, axis=1) / (scale * size) ** 2))

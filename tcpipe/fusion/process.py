@@ -55,8 +55,7 @@ _ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration: one row
 _COURSE_TURN = 0.02  # rad²/s: 8° in a second, of a turn that only the course over ground tells
 _DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
 _MAX_GAP_NS = 300_000_000
-_STEADY = 1e-4  # m²/s³: 1 cm/s in a second
-_SLIDE = 1e-4  # m²/s³
+_STEADY = 1e-4  # m²/s³: 1 cm/s in a second, forward and aside
 _UNSEEN_SLIDE = 4e-4  # m²/s³
 _FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3  # the last in m²/s³
 _SHOWS_COURSE_MPS = 0.2  # worse velocity of fixes shows no course
@@ -94,13 +93,10 @@ def is_turned_by_course(measurements: Measurements) -> bool:
 
 
 def _compute_fix_velocity_std_mps(gnss: Positions) -> float:
-    """Return how well the fixes of `_choose_window_s` show a velocity: the slope of a line through them."""
-    fixes = max(2.0, _choose_window_s(gnss) * 1e9 / compute_median_period_ns(gnss.stamp_ns))
-    return float(np.sqrt(12.0 / fixes * np.median(gnss.variance_m2[:, :2]))) / _choose_window_s(gnss)
-
-
-def _choose_window_s(gnss: Positions) -> float:
-    return max(_FIX_WINDOW_S, _FIXES * 1e-9 * compute_median_period_ns(gnss.stamp_ns))
+    """Return the σ of the slope of a line through the fixes of a second [m/s], five at least."""
+    period_s = 1e-9 * compute_median_period_ns(gnss.stamp_ns)
+    window_s = max(_FIX_WINDOW_S, _FIXES * period_s)
+    return float(np.sqrt(12.0 * period_s / window_s * np.median(gnss.variance_m2[:, :2]))) / window_s
 
 
 def estimate_slope_std_rad(measurements: Measurements) -> float | None:
@@ -213,7 +209,7 @@ def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
     source = m.first_odometry
     if source is None:
         return np.ones(at_ns.size)
-    return np.abs(_interpolate_density(source.stamp_ns, source.velocity_mps[:, 0], at_ns))
+    return np.abs(np.interp(at_ns, source.stamp_ns, source.velocity_mps[:, 0]))
 
 
 def _make_turn_density(m: Measurements, mode: NDArray[np.int8], rate_radps: Floats, speed_mps: Floats) -> Floats:
@@ -250,7 +246,7 @@ def _make_accelerometer_density(imu: InertialMeasurements) -> _Density:
     noise = imu.accelerometer_noise_mps2
     density = np.square(np.full(imu.stamp_ns.size, imu.accelerometer_std_mps2) if noise is None else noise)
     density = density / rate_hz + 1e-6
-    return lambda at_ns: _interpolate_density(imu.stamp_ns, density, at_ns)
+    return lambda at_ns: np.interp(at_ns, imu.stamp_ns, density)
 
 
 def _make_odometry_density(measurements: Measurements) -> _Density:
@@ -266,7 +262,7 @@ def _make_odometry_density(measurements: Measurements) -> _Density:
         found = np.full(at_ns.size, np.nan)
         for source, acceleration in zip(sources, slope, strict=True):
             covered = ~is_in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
-            shown = _interpolate_density(source.stamp_ns, np.abs(acceleration), at_ns[covered])
+            shown = np.interp(at_ns[covered], source.stamp_ns, np.abs(acceleration))
             found[covered] = np.fmin(found[covered], shown)
         return np.where(np.isnan(found), unknown(at_ns), _STEADY + _ACCELERATION_LASTS_S * found**2)
 
@@ -278,15 +274,15 @@ def _make_receiver_density(m: Measurements) -> _Density:
 
     What a slow receiver shows from fix to fix lasts as long. Fixes too noisy to show a velocity do not show how steady it is.
     """
-    gnss, least, order = m.gnss, 0.0, 1
-    stamp_ns, values, variance = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
-    if m.doppler is not None:
-        stamp_ns, values, variance = m.doppler.stamp_ns, m.doppler.velocity_enu_mps, m.doppler.variance_m2ps2
-    elif gnss is not None:
-        stamp_ns, values, variance, order = gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, 2
-        least = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
-    if stamp_ns.size < _FIXES:
+    source, least = m.doppler or m.gnss, 0.0
+    if source is None or source.stamp_ns.size < _FIXES:
         return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
+    if isinstance(source, Positions):
+        values, variance, order = source.position_enu_m, source.variance_m2, 2
+        least = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
+    else:
+        values, variance, order = source.velocity_enu_mps, source.variance_m2ps2, 1
+    stamp_ns = source.stamp_ns
     zero_ns, std = int(stamp_ns[0]), float(np.sqrt(np.median(variance[:, :2])))
     stamp_s, plane = compute_seconds(stamp_ns, zero_ns), values[:, :2] @ np.array([1.0, 1j])
     plane = bridge_outliers(stamp_s, plane, std) if order == 2 else plane
@@ -313,14 +309,9 @@ def _compute_accelerations(stamp_s: Floats, values: Plane, std: float, order: in
     return at_s, np.abs(values)
 
 
-def _interpolate_density(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
-    zero = int(stamp_ns[0])
-    return np.interp(compute_seconds(at_ns, zero), compute_seconds(stamp_ns, zero), values)
-
-
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     """Return how fast a body that is held to drive straight comes to slide [m²/s³]: as visual odometry shows it, or a guess."""
     if visual is None or visual.stamp_ns.size < 3:
         return _UNSEEN_SLIDE
     shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _SLIDE_WINDOW_S) for axis in (1, 2)]
-    return max(_SLIDE, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)
+    return max(_STEADY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)
