@@ -58,18 +58,15 @@ _MAX_RATE_RADPS = 100.0  # no gyroscope measures more
 _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _FROZEN_NS = 1_000_000_000  # fixes that repeat for less, or for two of their periods, are those of a slow receiver
-_DRIVES_MPS = 0.1  # mean speed
 _DATUM_FIXES = 10  # the ENU origin is their median
 _NOISE_WINDOW_S = 2.0  # window of noise around each sample
 _TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
 _DEGREE_M = 111_320.0  # one degree of latitude, or of longitude at the equator [m]
-_DECIMALS = 10  # of a degree, 0.01 mm: binary numbers differ by less
-_OFF_GRID = 0.01  # largest distance of a value from its grid, as share of the grid
 _PIECE = 1 << 16
-_FEWEST_ROWS = 20  # second differences for velocity scatter
-_SCATTERS_MORE = 3.0
-"""Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
+_FEWEST = 20  # samples that show a scatter, a grid, a turn, or the axes of a twist
+_SCATTERS_MORE = 3.0  # shown over stated scatter: of counts with every other message, not of a rough road
 _MEAN_S = 0.5  # averaging of such a velocity
+_MOVES_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
 _JITTER_S = 0.05  # less does not matter
 _JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3  # between fixes: so many together, the longest, the slowest
 
@@ -150,9 +147,9 @@ def _compute_rounding_variances(values: Floats) -> Floats:
     All axes have one grid: the smallest step between their values, of which every step is a multiple. Rows with one value have one error,
     which does not average out.
     """
-    steps = np.concatenate([np.diff(np.unique(axis.round(_DECIMALS))) for axis in values.T])
-    multiples = steps / steps.min() if steps.size >= _FEWEST_ROWS else np.array([0.5])
-    if (np.abs(multiples - np.rint(multiples)) > _OFF_GRID).any():
+    steps = np.concatenate([np.diff(np.unique(axis.round(10))) for axis in values.T])  # binary numbers differ by less
+    multiples = steps / steps.min() if steps.size >= _FEWEST else np.array([0.5])
+    if (np.abs(multiples - np.rint(multiples)) > 0.01).any():
         return np.zeros(values.shape[1])
     lengths = [np.diff(np.flatnonzero(np.diff(axis, prepend=np.nan, append=np.nan))) for axis in values.T]
     return np.asarray(steps.min() ** 2 / 12.0 * np.array([np.median(np.repeat(each, each)) for each in lengths]))
@@ -178,7 +175,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
     frozen = np.flatnonzero(
-        lasting & (driven_m[last] - driven_m[first] > _DRIVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
+        lasting & (driven_m[last] - driven_m[first] > _MOVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
     )
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
     return select_rows(gnss, changes), tuple(found)
@@ -187,11 +184,10 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
 def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:
     """Return the fixes with variances raised where their stamps jitter, and the standard deviation of the stamps at each [s], (N,).
 
-    Receivers and localization nodes that stamp a fix when they send it make positions that stand still and then leap. The distance between
-    two fixes is compared with that driven by the odometry (times the local ratio of the two, so that slip does not count). What this
-    residual spreads beyond the claimed noise, divided by the speed, is the jitter. It is 0 where it is small or unknown; while the robot is
-    stationary the value of the nearest motion is held. The variance grows by (2 speed jitter)²: such fixes are late by as much as they
-    scatter, and one late fix follows another, so the filter, for which errors are white, must not average them away.
+    A fix that is stamped when it is sent seems to stand still and then to leap. The distance between two fixes is compared with that of the
+    odometry, times the local ratio of the two (slip). The scatter of this residual beyond the stated noise, over the speed, is the jitter:
+    0 where it is small or unknown, and that of the nearest motion while the robot is stationary. The variance grows by (2 speed jitter)²:
+    late fixes follow each other, and a filter of white errors must not average them.
     """
     zero = int(gnss.stamp_ns[0])
     stamp_s, odometry_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero)
@@ -219,7 +215,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
 
 
 def _make_windows(values: Floats) -> Floats:
-    """Return a window centred on each value, shape (N, 41), the signal mirrored at its ends."""
+    """Return the 41 values around each, shape (N, 41), mirrored at the ends."""
     return np.lib.stride_tricks.sliding_window_view(np.pad(values, _JITTER_STEPS // 2, mode="reflect"), _JITTER_STEPS)
 
 
@@ -316,7 +312,7 @@ def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -
     second = np.abs(np.diff(values[known], n=2))
     moving = second > 0.0
     shown = np.zeros(values.size)
-    if moving.sum() < _FEWEST_ROWS:
+    if moving.sum() < _FEWEST:
         return shown
     noise = estimate_robust_std(second[moving]) / np.sqrt(6.0)
     if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
@@ -450,8 +446,6 @@ def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[F
 
 _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
 _MOVED_M = 0.1  # smaller moves may be stationary
-_FEWEST = 20  # increments that identify the twist's axes
-_MOVES_MPS = 0.2  # slower increments have no direction
 _FITS, _FITS_NOT = 0.1, 0.3  # largest residual share along its axes (18°); smallest along other axes (33°)
 _TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
 

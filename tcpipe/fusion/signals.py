@@ -13,7 +13,8 @@ Plane = NDArray[np.complex128]
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
 _OUTLIER_STDS = 5.0  # distance of an outlier from the line between its neighbours
-_MAX_ACCELERATION_MPS2 = 2.0  # bends that line by a v²/8 of the time between them
+MAX_ACCELERATION_MPS2 = 2.5
+"""Acceleration of a robot that brakes hard; what fixes show beyond it is an outlier [m/s²]."""
 _MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long
 
 
@@ -128,7 +129,7 @@ def bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
     share = (stamp_s[1:-1] - stamp_s[:-2]) / np.maximum(step_s, 1e-6)
     between = places[:-2] + share * (places[2:] - places[:-2])
     off_m = np.concatenate(([0.0], np.abs(places[1:-1] - between), [0.0]))
-    wild = off_m[1:-1] > _OUTLIER_STDS * std_m + _MAX_ACCELERATION_MPS2 * step_s**2 / 8
+    wild = off_m[1:-1] > _OUTLIER_STDS * std_m + MAX_ACCELERATION_MPS2 * step_s**2 / 8
     wild &= off_m[1:-1] >= np.maximum(off_m[:-2], off_m[2:])  # its neighbours lie half as far off their lines
     found = places.copy()
     found[1:-1][wild] = between[wild]
