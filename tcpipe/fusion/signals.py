@@ -138,21 +138,11 @@ def bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
 
 def compute_slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
     """Return the slope [u/s] at each sample of the line through the samples within half a window, shape (N,); 0 where there is one only."""
-    t = compute_seconds(stamp_ns, int(stamp_ns[0]))
-    first = np.searchsorted(t, t - 0.5 * window_s, "left")
-    last = np.searchsorted(t, t + 0.5 * window_s, "right")
-    count = (last - first).astype(np.float64)
-
-    def window(samples: Floats) -> Floats:
-        total = np.concatenate(([0.0], np.cumsum(samples)))
-        mean: Floats = (total[last] - total[first]) / count
-        return mean
-
-    centred = values - values.mean()
-    mean_t = window(t)
-    spread = window(t * t) - mean_t**2
-    covariance = window(t * centred) - mean_t * window(centred)
-    return np.where(spread > 1e-9, covariance / np.maximum(spread, 1e-9), 0.0)
+    t, centred = compute_seconds(stamp_ns, int(stamp_ns[0])), values - values.mean()
+    products = np.column_stack((t, centred, t * t, t * centred))
+    time, value, square, product = compute_window_means(stamp_ns, products, stamp_ns, round(1e9 * window_s)).T
+    spread = square - time**2
+    return np.where(spread > 1e-9, (product - time * value) / np.maximum(spread, 1e-9), 0.0)
 
 
 def estimate_white_noise(values: Floats) -> float:
