@@ -29,7 +29,7 @@ from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.messages import make_streams
 from tcpipe.simulation.sensors import Sensors, record
-from tcpipe.stages.fuse_inputs import prepare_inputs
+from tcpipe.stages.fuse_inputs import prepare_sections
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams
 
@@ -94,7 +94,8 @@ SENSORS: dict[str, Callable[[Measurements], Measurements]] = {
 
 
 def prepare(streams: Streams) -> Iterator[Measurements]:
-    yield from prepare_inputs(streams, Recipe().ingest.fuse).measurements.values()
+    for section in prepare_sections(streams, Recipe().ingest.fuse):
+        yield section.measurements
 
 
 def measure(seed: int, length_m: float) -> Measurements:

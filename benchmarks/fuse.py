@@ -32,7 +32,7 @@ from tcpipe.fusion.ukf15 import run_ukf15
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.fuse_inputs import prepare_inputs
+from tcpipe.stages.fuse_inputs import prepare_sections
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 REPEATS = 7
@@ -148,7 +148,7 @@ class Drive:
 
     def __init__(self, seconds: float) -> None:
         streams = made_streams(seconds)
-        self.measurements = prepare_inputs(streams, FuseConfig()).measurements[0]
+        self.measurements = prepare_sections(streams, FuseConfig())[0].measurements
         start_ns = int(self.measurements.imu.stamp_ns[0])
         standing = find_stationary_intervals(self.measurements)
         self.initial = find_initial_state(self.measurements, standing, start_ns)

@@ -40,7 +40,7 @@ from tcpipe.simulation import Faults, Truth, read_truth, simulate
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.simulation.sensors import Gnss, Imu, Sensors, Visual, Wheels
-from tcpipe.stages.fuse_inputs import drop_implausible_sensors, prepare_inputs
+from tcpipe.stages.fuse_inputs import drop_implausible_sensors, prepare_sections
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams
 
@@ -103,9 +103,9 @@ class Errors:
 def errors(streams: Streams, truth: Truth) -> Errors:
     """Fuse and compare, over every section."""
     config = FuseConfig()
-    inputs = drop_implausible_sensors(prepare_inputs(streams, config), streams)
+    inputs = drop_implausible_sensors(prepare_sections(streams, config), streams)
     parts = []
-    for section in cut_sections(inputs.measurements):
+    for section in cut_sections({each.clock_epoch: each.measurements for each in inputs}):
         output_ns = make_track_stamps(section, period_ns=50_000_000, max_gap_ns=int(config.max_gap_s * 1e9))
         output_ns = output_ns[(output_ns > truth.stamp_ns[0]) & (output_ns < truth.stamp_ns[-1])]
         initial = find_initial_state(
@@ -116,8 +116,8 @@ def errors(streams: Streams, truth: Truth) -> Errors:
         )
         at = truth.at(output_ns)
         position = found.position_enu_m
-        if inputs.datum_deg_m is not None:
-            lon, lat, alt = geodetic_from_enu(position, datum_deg_m=inputs.datum_deg_m)
+        if inputs[0].datum_deg_m is not None:
+            lon, lat, alt = geodetic_from_enu(position, datum_deg_m=inputs[0].datum_deg_m)
             scale = np.array([np.cos(np.radians(at.lat_deg)), np.ones_like(at.lat_deg)]).T * 6_371_000.0
             position_error = np.column_stack(
                 (np.radians(np.stack((lon - at.lon_deg, lat - at.lat_deg), -1)) * scale, alt - at.alt_m)

@@ -28,11 +28,10 @@ Floats = NDArray[np.float64]
 
 STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.1
 _DEFAULT_STD_RAD = 0.01  # scan matching and visual SLAM state none, or any
-_FLOOR_STD_RAD = 0.003
+_FLOOR_STD_RAD = 0.003  # no localization is better
 _FLAT = 1e-6  # of the lowest row of the rotation matrices: a pose in the plane has yaw alone
 _FEWEST = 20  # attitudes, and chords
-_CHORD_NS = 1_000_000_000
-_CHORD_M, _STRAIGHT_RAD = 0.3, 0.1
+_CHORD_NS, _CHORD_M, _STRAIGHT_RAD = 10**9, 0.3, 0.1  # duration and least length of a chord, largest turn along it
 _MISSTATED_RAD = 0.25  # slopes that the robot drives along look like half of that
 
 
@@ -51,13 +50,10 @@ def add_attitude(
     known = np.isfinite(quat_xyzw).all(1)
     if known.sum() < _FEWEST:
         return fixes
-    east, frame = (
-        xy[:, 0] + 1j * xy[:, 1] - np.mean(xy[:, 0] + 1j * xy[:, 1]) for xy in (fixes.position_enu_m, frame_m)
-    )
+    east, frame = ((xy - xy.mean(0))[:, :2] @ np.array([1.0, 1j]) for xy in (fixes.position_enu_m, frame_m))
     grid_north_rad = np.angle(np.sum(east * np.conj(frame)))
     quat = multiply(multiply(quat_from_rpy(0.0, 0.0, grid_north_rad), quat_xyzw), invert(mounting_xyzw))
-    turns = rotation_vector_from_quat(multiply(invert(quat[known][:-1]), quat[known][1:]))
-    shown = np.median(np.square(np.diff(turns, axis=0)), axis=0) / MEDIAN_OF_SQUARES / 6.0
+    shown = np.median(np.square(np.diff(compute_turns(quat[known]), axis=0)), axis=0) / MEDIAN_OF_SQUARES / 6.0
     stated = np.where(np.isfinite(variance_rad2), variance_rad2, _DEFAULT_STD_RAD**2)
     stated[:, :2] = stated[:, :2].mean(1, keepdims=True)  # of roll and pitch, whatever the yaw
     variance = np.maximum(stated, np.maximum(shown, _FLOOR_STD_RAD**2))
@@ -72,12 +68,16 @@ def add_attitude(
     )
 
 
+def compute_turns(quat_xyzw: Floats, rows: int = 1) -> Floats:
+    """Return the rotation vectors [rad], shape (N - rows, 3), from each attitude to that so many rows later, in the axes of the first."""
+    return rotation_vector_from_quat(multiply(invert(quat_xyzw[:-rows]), quat_xyzw[rows:]))
+
+
 def add_turn_variance(fixes: Positions, time_std_s: Floats) -> Positions:
     """Return positions with the variance of the attitude raised by how far the robot turns in a time (N,) [s]."""
     if fixes.quat_xyzw is None or fixes.rotation_variance_rad2 is None:
         return fixes
-    turned = rotation_vector_from_quat(multiply(invert(fixes.quat_xyzw[:-1]), fixes.quat_xyzw[1:]))
-    rate = np.nan_to_num(turned / (np.diff(fixes.stamp_ns) * 1e-9)[:, None])
+    rate = np.nan_to_num(compute_turns(fixes.quat_xyzw) / (np.diff(fixes.stamp_ns) * 1e-9)[:, None])
     largest = np.maximum(np.square(np.append(rate, rate[-1:], axis=0)), np.square(np.append(rate[:1], rate, axis=0)))
     return replace(fixes, rotation_variance_rad2=fixes.rotation_variance_rad2 + largest * time_std_s[:, None] ** 2)
 
@@ -117,9 +117,5 @@ def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stat
     if is_stated and np.linalg.norm(rotation_vector_from_quat(turn)) < _MISSTATED_RAD:
         return fixes
     mounting = tuple(multiply(turn, fixes.mounting_xyzw).tolist())
-    return replace(
-        fixes,
-        quat_xyzw=multiply(quat, invert(turn)),
-        mounting_xyzw=mounting,
-        mounting_std_rad=UNSTATED_MOUNTING_STD_RAD,
-    )
+    quat = multiply(quat, invert(turn))
+    return replace(fixes, quat_xyzw=quat, mounting_xyzw=mounting, mounting_std_rad=UNSTATED_MOUNTING_STD_RAD)

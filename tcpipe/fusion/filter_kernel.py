@@ -324,6 +324,11 @@ def _compare(
             M[a, i] = 0.5 / _SPREAD * (up[a] - down[a])
             for b in range(a + 1):
                 missed[a, b] += (0.5 * (up[a] + down[a]) - y[a]) * (0.5 * (up[b] + down[b]) - y[b]) / 3.0
+    if kind == FIX:  # the product of the errors of yaw and of the distance driven since the last fix is sideways
+        sideways = P[THETA + 2, THETA + 2] * P[RHO, RHO]
+        for a in range(size):
+            for b in range(a + 1):
+                missed[a, b] += sideways * x[3 * a + 1] * x[3 * b + 1]
     _solve_for_map(M, size, L, m, Hs)
     for a in range(size):
         for j in range(n):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import (
+    bridge_outliers,
     compute_interval_means,
     compute_median_of_five,
     compute_seconds,
@@ -37,12 +38,12 @@ Plane = NDArray[np.complex128]
 
 _MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
 _MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°
-_MIN_SPEED_MPS = 0.2  # slower rows do not count (ruling)
-_MAX_WINDOW_NS = 120_000_000_000  # longest search for the start
-_WINDOW_STEP_NS = 2_000_000_000  # growth of that window
+_MIN_SPEED_MPS = 0.2  # slower motion shows no course (ruling)
+_MAX_WINDOW_S, _WINDOW_STEP_S = 120.0, 2.0  # longest window of fixes that shows the yaw; from one window to the next
 _TILT_AGREES_RAD = 0.2  # agreement of IMU attitude and gravity
 _GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
 _POSED_YAW_STD_RAD = 0.1  # of a pose: its frame, and how its sensor is turned
+_START_STD_MPS = 1.0  # change of the velocity while the first fixes show it
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
@@ -53,7 +54,7 @@ def find_initial_state(measurements: Measurements, stationary_ns: Ints, start_ns
     path = _Path(measurements, start_ns, bias)
     yaw, yaw_std, heading_from = _estimate_yaw(measurements, path, start_ns, bias_std)
     quat = quat_from_rpy(roll, pitch, yaw)
-    position, position_std = _position(measurements.gnss, path, quat, yaw)
+    position, position_std = _estimate_position(measurements.gnss, path, quat, yaw)
     velocity, velocity_std = path.start_velocity(yaw, pitch)
     return InitialState(
         position_enu_m=position,
@@ -78,34 +79,44 @@ def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: Ints) -
 
 
 def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_ns: int) -> tuple[float, float, float]:
-    """Roll and pitch [rad] at the start, and their standard deviation."""
+    """Return roll and pitch [rad] at the start, and their standard deviation."""
     if imu is None:
         return 0.0, 0.0, 0.2
     stands = stationary_ns.size > 0 and stationary_ns[0, 0] < start_ns + 2_000_000_000
-    end = int(stationary_ns[0, 1]) if stands else start_ns + 1_500_000_000
-    oriented = np.flatnonzero(np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns) & (imu.stamp_ns <= end))
-    own = rpy_from_quat(imu.quat_xyzw[oriented[0]]) if oriented.size else None
+    first, end = stationary_ns[0].tolist() if stands else (start_ns, start_ns + 1_500_000_000)
+    own = _read_orientation(imu, start_ns, end)
     if not imu.accelerometer_usable:
-        return (0.0, 0.0, 0.2) if own is None else (float(own[0]), float(own[1]), 0.05)
-    stamp_s = compute_seconds(imu.stamp_ns, start_ns)
-    span_s = np.array([(stationary_ns[0, 0] if stands else start_ns) - start_ns, end - start_ns]) * 1e-9
-    fx, fy, fz = compute_interval_means(stamp_s, imu.specific_force_mps2, span_s[:1], span_s[1:])[0]
+        return (0.0, 0.0, 0.2) if own is None else (own[0], own[1], 0.05)
+    span_s = np.array([[first - start_ns], [end - start_ns]]) * 1e-9
+    fx, fy, fz = compute_interval_means(compute_seconds(imu.stamp_ns, start_ns), imu.specific_force_mps2, *span_s)[0]
     roll, pitch = float(np.arctan2(fy, fz)), float(np.arctan2(-fx, np.hypot(fy, fz)))
     if own is not None and max(abs(own[0] - roll), abs(own[1] - pitch)) < _TILT_AGREES_RAD and not stands:
-        return float(own[0]), float(own[1]), 0.05
+        return own[0], own[1], 0.05
     return roll, pitch, 0.03 if stands else 0.08
 
 
+def _read_orientation(imu: InertialMeasurements, start_ns: int, end_ns: int) -> list[float] | None:
+    """Return roll, pitch and yaw [rad] by the first orientation of the unit between two stamps; None without."""
+    known = np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns) & (imu.stamp_ns <= end_ns)
+    return rpy_from_quat(imu.quat_xyzw[np.argmax(known)]).tolist() if known.any() else None
+
+
 class _Path:
-    """The path drawn by odometry and gyroscope from the origin with yaw zero: a function of time, held outside the odometry."""
+    """The path drawn by odometry and gyroscope from the origin with yaw zero: a function of time, held outside the odometry.
+
+    Without odometry it goes straight on with the velocity that the first fixes show.
+    """
 
     def __init__(self, measurements: Measurements, start_ns: int, bias: Floats) -> None:
         self.start_ns = start_ns
         self._yaw_s, self._yaw_rate = _collect_yaw_rate(measurements, start_ns, bias)
-        source = measurements.first_odometry
+        source, gnss = measurements.first_odometry, measurements.gnss
         self.known = source is not None
-        self._lever = np.zeros(2) if measurements.gnss is None else np.asarray(measurements.gnss.lever_arm_m)[:2]
+        self._lever = 0j if gnss is None else complex(*gnss.lever_arm_m[:2])
+        self.first_fixes, self._straight, self._straight_std = slice(0, 10), 0j, 0.0
         if source is None:
+            if gnss is not None:
+                self.first_fixes, self._straight, self._straight_std = _fit_first_velocity(gnss)
             return
         self._stamp_s = compute_seconds(source.stamp_ns, start_ns)
         self._speed = source.velocity_mps[:, 0]
@@ -113,170 +124,156 @@ class _Path:
         self._velocity = self._speed[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
 
     def yaw(self, at_s: Floats) -> Floats:
-        """Yaw turned since the start [rad]."""
-        if self._yaw_s.size == 0:
-            return np.zeros(at_s.size)
-        turned = integrate_signal(self._yaw_s, self._yaw_rate, at_s) - integrate_signal(
-            self._yaw_s, self._yaw_rate, np.zeros(1)
-        )
-        return turned[:, 0]
+        """Return the yaw turned since the start [rad]."""
+        return _integrate_since_start(self._yaw_s, self._yaw_rate, at_s)[:, 0]
 
-    def antenna(self, at_s: Floats) -> Plane:
-        """Antenna east + i north [m] as drawn."""
-        antenna = np.asarray(complex(*self._lever) * np.exp(1j * self.yaw(at_s)), np.complex128)
+    def antenna(self, at_s: Floats, yaw: float = 0.0) -> Plane:
+        """Return the antenna east + i north [m] for a yaw at the start [rad]."""
+        antenna = np.asarray(self._lever * np.exp(1j * self.yaw(at_s)), np.complex128)
         if self.known:
-            start = integrate_signal(self._stamp_s, self._velocity, np.zeros(1))
-            xy = integrate_signal(self._stamp_s, self._velocity, at_s) - start
-            antenna += xy[:, 0] + 1j * xy[:, 1]
-        return antenna
+            antenna += _integrate_since_start(self._stamp_s, self._velocity, at_s) @ np.array([1.0, 1j])
+        placed: Plane = antenna * np.exp(1j * yaw) + self._straight * at_s
+        return placed
 
     def length(self, until_s: float) -> float:
-        """Metres driven since the start."""
+        """Return the distance driven since the start [m]."""
         if not self.known:
-            return max(until_s, 0.0)
-        speed = np.abs(self._speed)[:, None]
-        return float(np.diff(integrate_signal(self._stamp_s, speed, np.array([0.0, max(until_s, 0.0)])), axis=0)[0, 0])
+            return abs(self._straight) * max(until_s, 0.0)
+        return float(_integrate_since_start(self._stamp_s, np.abs(self._speed)[:, None], np.array([until_s]))[0, 0])
 
     def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
-        """Velocity at the start [m/s] and its standard deviation."""
+        """Return the velocity at the start and its standard deviation [m/s]."""
         if not self.known:
-            return np.zeros(3), 1.0
+            return np.array([self._straight.real, self._straight.imag, 0.0]), self._straight_std
         speed = float(np.median(self._speed[:5]))
         return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), 0.3
 
 
+def _integrate_since_start(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
+    """Return the integral of samples (N, k) from time zero on, shape (M, k); 0 without samples."""
+    if stamp_s.size == 0:
+        return np.zeros((at_s.size, values.shape[1]))
+    return integrate_signal(stamp_s, values, at_s) - integrate_signal(stamp_s, values, np.zeros(1))
+
+
+def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
+    """Return the fixes of the first second, 3 to 10, and the median of their slopes, east + i north, and its standard deviation [m/s]."""
+    rows = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 10**9, "right"), 3, 10)))
+    at_s, place = compute_seconds(gnss.stamp_ns[rows], int(gnss.stamp_ns[0])), gnss.position_enu_m[rows, :2]
+    if at_s.size < 2:
+        return rows, 0j, _START_STD_MPS
+    i, j = np.triu_indices(at_s.size, 1)
+    east, north = np.median((place[j] - place[i]) / (at_s[j] - at_s[i])[:, None], axis=0)
+    noise_mps = np.sqrt(12.0 / at_s.size * np.median(gnss.variance_m2[rows, :2])) / at_s[-1]
+    return rows, complex(east, north), float(np.hypot(noise_mps, _START_STD_MPS))
+
+
 def _collect_yaw_rate(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
-    """Return samples of the yaw rate by the gyroscope, and in its gaps by other sensors."""
-    imu = measurements.imu
-    other_s, other_rate = _collect_other_yaw_rate(measurements, start_ns)
-    if imu is None:
-        return other_s, other_rate
-    other_ns = start_ns + np.rint(other_s * 1e9).astype(np.int64)
-    missing = ~is_covered(imu.stamp_ns, other_ns, other_ns)
-    stamp_s = np.concatenate((compute_seconds(imu.stamp_ns, start_ns), other_s[missing]))
-    rate = np.concatenate((imu.angular_velocity_radps[:, 2:] - bias[2], other_rate[missing]))
-    order = np.argsort(stamp_s, kind="stable")
-    return stamp_s[order], rate[order]
-
-
-def _collect_other_yaw_rate(measurements: Measurements, start_ns: int) -> tuple[Floats, Floats]:
-    sources, odometry, gnss = turn_sources(measurements), measurements.first_odometry, measurements.gnss
-    if not sources and odometry is not None and gnss is not None:
+    """Return stamps [s] and yaw rates [rad/s], (N, 1), by the gyroscope, and in its gaps by an odometry or the course over ground."""
+    sources, odometry, gnss, imu = (
+        turn_sources(measurements),
+        measurements.first_odometry,
+        measurements.gnss,
+        measurements.imu,
+    )
+    stamp_s, rate = np.empty(0), np.empty(0)
+    if sources:
+        known = np.isfinite(sources[-1].yaw_rate_radps)
+        stamp_s, rate = compute_seconds(sources[-1].stamp_ns[known], start_ns), sources[-1].yaw_rate_radps[known]
+    elif odometry is not None and gnss is not None:
         stamp_s, rate = compute_course_rate(gnss, odometry, start_ns)
-        return stamp_s, rate[:, None]
-    if not sources:
-        return np.empty(0), np.empty((0, 1))
-    source = sources[-1]
-    known = np.isfinite(source.yaw_rate_radps)
-    return compute_seconds(source.stamp_ns[known], start_ns), source.yaw_rate_radps[known, None]
+    if imu is not None:
+        stamp_ns = start_ns + np.rint(stamp_s * 1e9).astype(np.int64)
+        missing = ~is_covered(imu.stamp_ns, stamp_ns, stamp_ns)
+        stamp_s = np.concatenate((compute_seconds(imu.stamp_ns, start_ns), stamp_s[missing]))
+        rate = np.concatenate((imu.angular_velocity_radps[:, 2] - bias[2], rate[missing]))
+    order = np.argsort(stamp_s, kind="stable")
+    return stamp_s[order], rate[order, None]
 
 
 def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
-    """Yaw at the start [rad], its standard deviation, and where it is from."""
-    own = _read_own_yaw(measurements.imu, start_ns)
-    if measurements.gnss is None:
-        return (0.0, 0.01, "local frame") if own is None else (own, 0.01, "orientation")
-    posed = _read_yaw_of_pose(measurements.gnss, path, start_ns)
-    fit = _fit_course(measurements.gnss, path, start_ns) if path.known or posed is None else None
+    """Return the yaw at the start [rad], its standard deviation, and its source."""
+    gnss, imu = measurements.gnss, measurements.imu
+    rpy = None if imu is None else _read_orientation(imu, start_ns, int(imu.stamp_ns[-1]))
+    own, source = (0.0, "") if rpy is None else (rpy[2], "orientation")
+    if gnss is None:
+        return own, 0.01, source or "local frame"
+    posed = np.flatnonzero(np.isfinite(gnss.quat_xyzw).all(1))[:1] if gnss.quat_xyzw is not None else np.empty(0, int)
+    fit = _fit_course(gnss, path) if path.known or not posed.size else None
     if fit is not None:
         std = float(np.hypot(np.hypot(fit.yaw_std_rad, 0.03), bias_std * fit.centre_s))
         return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
-    if posed is not None:
-        return posed, _POSED_YAW_STD_RAD, "pose"
-    return (0.0, _UNKNOWN_YAW_STD_RAD, "unknown") if own is None else (own, _UNKNOWN_YAW_STD_RAD, "orientation")
-
-
-def _read_yaw_of_pose(gnss: Positions, path: _Path, start_ns: int) -> float | None:
-    """Return yaw at the start by the first attitude of a pose, and what the robot turned until then."""
-    known = np.flatnonzero(np.isfinite(gnss.quat_xyzw).all(1))[:1] if gnss.quat_xyzw is not None else np.empty(0, int)
-    if gnss.quat_xyzw is None or not known.size:
-        return None
-    turned = path.yaw(compute_seconds(gnss.stamp_ns[known], start_ns))
-    return float(rpy_from_quat(gnss.quat_xyzw[known[0]])[2] - turned[0])
-
-
-def _read_own_yaw(imu: InertialMeasurements | None, start_ns: int) -> float | None:
-    if imu is None:
-        return None
-    oriented = np.flatnonzero(np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns))
-    return float(rpy_from_quat(imu.quat_xyzw[oriented[0]])[2]) if oriented.size else None
+    if gnss.quat_xyzw is not None and posed.size:  # the first attitude of a pose, less what the robot turned until then
+        turned = path.yaw(compute_seconds(gnss.stamp_ns[posed], start_ns))
+        return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2] - turned[0]), _POSED_YAW_STD_RAD, "pose"
+    return own, _UNKNOWN_YAW_STD_RAD, source or "unknown"
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
+    """Yaw at the start by a window of fixes, its σ, the RMS distance of the fixes from the path, and the middle of the window."""
+
     yaw_rad: float
     yaw_std_rad: float
     residual_m: float
     centre_s: float
 
 
-def _fit_course(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
-    """Find the first window of fixes that the drawn path fits; the best of all where none fits well."""
-    stamp_s = compute_seconds(gnss.stamp_ns, start_ns)
+def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
+    """Return the fit of the first window of fixes to the drawn path; the best of all where none fits well."""
+    stamp_s = compute_seconds(gnss.stamp_ns, path.start_ns)
     east, north = (compute_median_of_five(axis) for axis in gnss.position_enu_m[:, :2].T)
-    east_north = east + 1j * north
+    fixes = east + 1j * north
     noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
     wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
-    drawn = path.antenna(stamp_s)
-    best: _Fit | None = None
-    first_of_next = gnss.stamp_ns[0]
-    for first in range(gnss.stamp_ns.size):
-        if gnss.stamp_ns[first] < first_of_next:
-            continue
-        first_of_next = gnss.stamp_ns[first] + _WINDOW_STEP_NS
-        last = int(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[first] + _MAX_WINDOW_NS, "right"))
-        far = np.flatnonzero(np.abs(east_north[first:last] - east_north[first]) >= wanted)
+    drawn, turned = path.antenna(stamp_s), path.yaw(stamp_s)
+    found: list[_Fit] = []
+    for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], _WINDOW_STEP_S))):
+        near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + _MAX_WINDOW_S, "right")))
+        far = np.flatnonzero(np.abs(fixes[near] - fixes[first]) >= wanted)
         if far.size == 0:
             continue
-        inside = slice(first, first + int(far[0]) + 1)
-        if path.known:
-            fit = _fit(east_north[inside], drawn[inside], stamp_s[inside], noise)
-            if fit is not None and fit.residual_m <= max(3 * noise, 0.05 * wanted):
+        rows = slice(first, first + int(far[0]) + 1)
+        if not path.known:  # each step between fixes goes forward, turned back by the yaw turned until then
+            if stamp_s[rows][-1] - stamp_s[first] <= wanted / _MIN_SPEED_MPS:
+                back = np.exp(-0.5j * (turned[rows][1:] + turned[rows][:-1]))
+                return _Fit(float(np.angle(np.sum(np.diff(fixes[rows]) * back))), 0.2, 0.0, float(stamp_s[rows].mean()))
+            continue
+        fit = _fit(fixes[rows], drawn[rows], stamp_s[rows], noise)
+        if fit is not None:
+            found.append(fit)
+            if fit.residual_m <= max(3 * noise, 0.05 * wanted):
                 return fit
-            best = min((each for each in (best, fit) if each), key=lambda each: each.residual_m, default=None)
-        elif stamp_s[inside][-1] - stamp_s[first] <= wanted / _MIN_SPEED_MPS:
-            return _fit_course_to_fixes(east_north[inside], path.yaw(stamp_s[inside]), stamp_s[inside])
-    return best
+    return min(found, key=lambda each: each.residual_m, default=None)
 
 
 def _fit(fixes: Plane, drawn: Plane, stamp_s: Floats, noise_m: float) -> _Fit | None:
-    """Lay the drawn path over the fixes by the rotation (and scale) that fits best."""
+    """Return the rotation (and scale) that fits the drawn path to the fixes best; None if the odometry stands while the fixes move."""
     a, b = fixes - fixes.mean(), drawn - drawn.mean()
     extent2 = float(np.sum(np.abs(b) ** 2))
-    if extent2 < 1.0 or np.sqrt(extent2 / fixes.size) < 0.2 * np.sqrt(np.sum(np.abs(a) ** 2) / fixes.size):
-        return None  # the odometry stands while the fixes move
+    if extent2 < 1.0 or np.sqrt(extent2) < 0.2 * np.sqrt(np.sum(np.abs(a) ** 2)):
+        return None
     product = np.sum(a * np.conj(b))
     residual = float(np.sqrt(np.mean(np.abs(a - product / extent2 * b) ** 2)))
     std = max(noise_m, residual) / np.sqrt(extent2 / min(fixes.size, 10))
     return _Fit(float(np.angle(product)), float(std), residual, float(stamp_s.mean()))
 
 
-def _fit_course_to_fixes(fixes: Plane, turned: Floats, stamp_s: Floats) -> _Fit:
-    """Without odometry: each step between fixes goes forward, turned back by the yaw turned until then."""
-    middle = 0.5 * (turned[1:] + turned[:-1])
-    return _Fit(float(np.angle(np.sum(np.diff(fixes) * np.exp(-1j * middle)))), 0.2, 0.0, float(stamp_s.mean()))
-
-
-def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> tuple[Floats, Floats]:
-    """base_link at the start and its standard deviation: the median of the first fixes less the displacement since the start."""
+def _estimate_position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> tuple[Floats, Floats]:
+    """Return base_link at the start and its standard deviation: the median of the first fixes less the displacement since the start."""
     if gnss is None:
         return np.zeros(3), np.full(3, 1e-3)
-    few = slice(0, min(10, gnss.stamp_ns.size))
+    few = path.first_fixes
     at_s = compute_seconds(gnss.stamp_ns[few], path.start_ns)
-    drawn = path.antenna(at_s) * np.exp(1j * yaw)
-    position = np.array(
-        [
-            np.median(gnss.position_enu_m[few, 0] - drawn.real),
-            np.median(gnss.position_enu_m[few, 1] - drawn.imag),
-            np.median(gnss.position_enu_m[few, 2]) - rotate(quat, gnss.lever_arm_m)[2],
-        ]
-    )
-    driven = path.length(float(at_s[-1]))
+    drawn = path.antenna(at_s, yaw)
+    off = gnss.position_enu_m[few] - np.column_stack((drawn.real, drawn.imag, np.zeros(at_s.size)))
+    position: Floats = np.median(off, axis=0) - [0.0, 0.0, rotate(quat, gnss.lever_arm_m)[2]]
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
-    if not gnss.has_heights:  # they count from the start: kilometres of doubt would lean on the plane by every tilt
+    if (
+        not gnss.has_heights
+    ):  # they count from the start: kilometres of uncertainty would lean on the plane by every tilt
         std[2] = 0.0
-    std += np.array([0.1, 0.1, 0.2]) * max(driven, 1.0)
-    return position, std
+    return position, std + np.array([0.1, 0.1, 0.2]) * max(path.length(float(at_s[-1])), 1.0)
 
 
 _WINDOW_NS = 500_000_000  # window of means and scatter
@@ -327,11 +324,8 @@ _GRID_S = 0.5  # grid of the course
 _WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
 _CLEARLY = 3.0  # σ of fixes that a baseline needs
 _MOVING_M = 0.3  # shorter baselines show no course
-_MOVING_MPS = 0.2  # slower motion shows no course
 _OFTEN = 0.3  # share of usable baselines before longer ones
 _STEP_S = 1e-6  # step between two rates
-_WILD = 5.0  # σ off its neighbours' line: fix is bridged
-_TURNS_MPS2 = 2.0  # largest bend of that line in a turn
 
 
 def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_ns: int) -> tuple[Floats, Floats]:
@@ -344,25 +338,23 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
     std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
     least_m = max(_MOVING_M, _CLEARLY * std_m)
-    places = _bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)[:, None]
+    places = bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)
+    values = np.column_stack((places.real, places.imag))
     for window_s in _WINDOWS_S:
         rows = round(window_s / _GRID_S)
         if grid_s.size <= rows:
             return stamp_s[:1], np.zeros(1)
-        means = compute_interval_means(
-            stamp_s, np.column_stack((places.real, places.imag)), grid_s - _GRID_S, grid_s + _GRID_S
-        )
+        means = compute_interval_means(stamp_s, values, grid_s - _GRID_S, grid_s + _GRID_S)
         way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
         at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
         moving = np.abs(way) > least_m
         if moving.mean() > _OFTEN:
             break
     if odometry is not None:
-        start_s, end_s = at_s - window_s / 2, at_s + window_s / 2
-        driven = compute_interval_means(
-            compute_seconds(odometry.stamp_ns, zero_ns), odometry.velocity_mps[:, :1], start_s, end_s
-        )[:, 0]
-        moving &= np.abs(driven) > _MOVING_MPS
+        odometry_s = compute_seconds(odometry.stamp_ns, zero_ns)
+        ends_s = at_s - window_s / 2, at_s + window_s / 2
+        driven = compute_interval_means(odometry_s, odometry.velocity_mps[:, :1], *ends_s)[:, 0]
+        moving &= np.abs(driven) > _MIN_SPEED_MPS
         way = way * np.sign(driven)
     if moving.sum() < 2:
         return stamp_s[:1], np.zeros(1)
@@ -374,24 +366,9 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     return stamp_s, np.concatenate(([0.0], rate, [0.0]))
 
 
-def _bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
-    """Return places [m], shape (N,), those on the line between their neighbours that lie further off it than noise and a turn explain."""
-    if places.size < 3:
-        return places
-    step_s = stamp_s[2:] - stamp_s[:-2]
-    share = (stamp_s[1:-1] - stamp_s[:-2]) / np.maximum(step_s, _STEP_S)
-    between = places[:-2] + share * (places[2:] - places[:-2])
-    off_m = np.concatenate(([0.0], np.abs(places[1:-1] - between), [0.0]))
-    wild = off_m[1:-1] > _WILD * std_m + _TURNS_MPS2 * step_s**2 / 8
-    wild &= off_m[1:-1] >= np.maximum(off_m[:-2], off_m[2:])  # its neighbours lie half as far off their lines
-    found = places.copy()
-    found[1:-1][wild] = between[wild]
-    return found
-
-
 def compute_course(velocity_mps: Floats) -> Floats:
     """Return the direction of horizontal velocities (N, 3) [rad], continuous; that before it where the robot hardly moves."""
-    moving = np.flatnonzero(np.hypot(velocity_mps[:, 0], velocity_mps[:, 1]) > _MOVING_MPS)
+    moving = np.flatnonzero(np.hypot(velocity_mps[:, 0], velocity_mps[:, 1]) > _MIN_SPEED_MPS)
     if moving.size == 0:
         return np.zeros(velocity_mps.shape[0])
     course = np.unwrap(np.arctan2(velocity_mps[moving, 1], velocity_mps[moving, 0]))

@@ -308,7 +308,8 @@ class Trajectory:
     corrected: Measurements | None = None
 
 
-_PAUSE_NS = 5_000_000_000  # a longer pause begins a new section
+PAUSE_NS = 5_000_000_000
+"""A longer pause of all sensors begins a new section [ns]: the estimator does not carry its certainty over it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,7 +333,7 @@ def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int
         stamp = _make_stamps(whole, with_imu=True)
         if stamp.size == 0:
             continue
-        pause = np.flatnonzero((np.diff(stamp) > _PAUSE_NS) | np.isin(stamp[1:], cuts_ns))
+        pause = np.flatnonzero((np.diff(stamp) > PAUSE_NS) | np.isin(stamp[1:], cuts_ns))
         first = stamp[np.concatenate(([0], pause + 1))]
         last = stamp[np.concatenate((pause, [stamp.size - 1]))]
         for start, end in zip(first.tolist(), last.tolist(), strict=True):

@@ -1,8 +1,9 @@
 """From a stream's columns to measurements: base_link axes, the datum's plane, usable variances, one row a stamp.
 
-Rows that say nothing (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range) are left out and
-returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, one that is
-too good to be true is raised to a floor: a zero covariance is not trust.
+Rows without a measurement (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range) are excluded and
+returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, or by the median
+of the stated ones where that is larger; one that is too small is raised to a floor: a zero covariance is not trust. Coordinates with few
+decimals err by rounding besides.
 
 By nav_msgs/Odometry a twist is along the axes of its child frame, the robot's. Some drivers write it along those of the pose's frame, as
 the derivative of the position is: then the velocity of a robot that only drives forward turns with its yaw.
@@ -16,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.attitude import add_attitude, add_turn_variance
+from tcpipe.fusion.attitude import add_attitude, add_turn_variance, compute_turns
 from tcpipe.fusion.measurements import (
     IMU,
     NO_TRUST,
@@ -36,7 +37,7 @@ from tcpipe.fusion.signals import (
     integrate_signal,
 )
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate, rotation_vector_from_quat
+from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -48,6 +49,7 @@ Columns = Mapping[str, Floats]
 """Columns of a stream by name, null as NaN."""
 
 _IMU = Subject("role", IMU)
+_QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
 _VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
 _YAW_RATE_STD_RADPS = 0.1  # default of an odometry without one
 _YAW_RATE_FLOOR_RADPS = 0.02  # no odometry is better
@@ -55,16 +57,16 @@ _MAX_VELOCITY_MPS = 50.0  # no robot is faster
 _MAX_RATE_RADPS = 100.0  # no gyroscope measures more
 _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
-_FROZEN_NS = 1_000_000_000  # fixes that repeat for less are those of a slow receiver
-_DRIVES_MPS = 0.1  # mean speed
+_FROZEN_NS = 1_000_000_000  # fixes that repeat for less, or for two of their periods, are those of a slow receiver
 _DATUM_FIXES = 10  # the ENU origin is their median
 _NOISE_WINDOW_S = 2.0  # window of noise around each sample
 _TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
+_DEGREE_M = 111_320.0  # one degree of latitude, or of longitude at the equator [m]
 _PIECE = 1 << 16
-_FEWEST_ROWS = 20  # second differences for velocity scatter
-_SCATTERS_MORE = 3.0
-"""Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
+_FEWEST = 20  # samples that show a scatter, a grid, a turn, or the axes of a twist
+_SCATTERS_MORE = 3.0  # shown over stated scatter: of counts with every other message, not of a rough road
 _MEAN_S = 0.5  # averaging of such a velocity
+_MOVES_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
 _JITTER_S = 0.05  # less does not matter
 _JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3  # between fixes: so many together, the longest, the slowest
 
@@ -126,28 +128,38 @@ def prepare_positions(
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
+    degree_m = _DEGREE_M * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])
+    variance[:, :2] += _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
     made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
     if "quat_x" in columns:
-        frame, quat, rotation_variance = (
-            _stack_columns(columns, names)[usable]
-            for names in (
-                ("x_m", "y_m"),
-                [f"quat_{c}" for c in "xyzw"],
-                [f"rotation_{axis}_var" for axis in "xyz"],
-            )
-        )
-        made = add_attitude(made, frame, quat, rotation_variance, mounting_xyzw)
+        frame, quat = _stack_columns(columns, ("x_m", "y_m")), _stack_columns(columns, _QUAT)
+        rotation_variance = _stack_columns(columns, [f"rotation_{axis}_var" for axis in "xyz"])
+        made = add_attitude(made, frame[usable], quat[usable], rotation_variance[usable], mounting_xyzw)
     return made, prepared
+
+
+def _compute_rounding_variances(values: Floats) -> Floats:
+    """Return the variance of rounding along each axis of values (N, k), shape (k,): grid²/12 times how many rows in turn have one value.
+
+    All axes have one grid: the smallest step between their values, of which every step is a multiple. Rows with one value have one error,
+    which does not average out.
+    """
+    steps = np.concatenate([np.diff(np.unique(axis.round(10))) for axis in values.T])  # binary numbers differ by less
+    multiples = steps / steps.min() if steps.size >= _FEWEST else np.array([0.5])
+    if (np.abs(multiples - np.rint(multiples)) > 0.01).any():
+        return np.zeros(values.shape[1])
+    lengths = [np.diff(np.flatnonzero(np.diff(axis, prepend=np.nan, append=np.nan))) for axis in values.T]
+    return np.asarray(steps.min() ** 2 / 12.0 * np.array([np.median(np.repeat(each, each)) for each in lengths]))
 
 
 def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, tuple[Repeats, ...]]:
     """Return the fixes without those that repeat the one before to the last digit, and where they do while the robot drives.
 
-    They carry no information: a receiver that hangs, or a slow one that is published at a higher rate. Without odometry a robot may be
-    stationary where fixes repeat for a second or longer: they are kept. So are fixes that never change.
+    They carry no information: a receiver hangs, or a slow one is published at a higher rate. Without odometry a robot may be stationary
+    where fixes repeat for a second and two of their periods: they are kept. So are fixes that never change.
     """
     stamp_ns = gnss.stamp_ns
     changes = np.concatenate(([True], (np.diff(gnss.position_enu_m, axis=0) != 0.0).any(1)))
@@ -155,7 +167,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     if first.size < 2 or first.size == stamp_ns.size:
         return gnss, ()
     last = np.append(first[1:], stamp_ns.size) - 1
-    lasting = stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS
+    lasting = stamp_ns[last] - stamp_ns[first] >= max(_FROZEN_NS, 2 * compute_median_period_ns(stamp_ns[first]))
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
         return (gnss if kept.all() else select_rows(gnss, kept)), ()
@@ -163,7 +175,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
     frozen = np.flatnonzero(
-        lasting & (driven_m[last] - driven_m[first] > _DRIVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
+        lasting & (driven_m[last] - driven_m[first] > _MOVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
     )
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
     return select_rows(gnss, changes), tuple(found)
@@ -172,11 +184,10 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
 def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:
     """Return the fixes with variances raised where their stamps jitter, and the standard deviation of the stamps at each [s], (N,).
 
-    Receivers and localization nodes that stamp a fix when they send it make positions that stand still and then leap. The distance between
-    two fixes is compared with that driven by the odometry (times the local ratio of the two, so that slip does not count). What this
-    residual spreads beyond the claimed noise, divided by the speed, is the jitter. It is 0 where it is small or unknown; while the robot is
-    stationary the value of the nearest motion is held. The variance grows by (2 speed jitter)²: such fixes are late by as much as they
-    scatter, and one late fix follows another, so the filter, for which errors are white, must not average them away.
+    A fix that is stamped when it is sent seems to stand still and then to leap. The distance between two fixes is compared with that of the
+    odometry, times the local ratio of the two (slip). The scatter of this residual beyond the stated noise, over the speed, is the jitter:
+    0 where it is small or unknown, and that of the nearest motion while the robot is stationary. The variance grows by (2 speed jitter)²:
+    late fixes follow each other, and a filter of white errors must not average them.
     """
     zero = int(gnss.stamp_ns[0])
     stamp_s, odometry_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero)
@@ -204,7 +215,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
 
 
 def _make_windows(values: Floats) -> Floats:
-    """Return a window centred on each value, shape (N, 41), the signal mirrored at its ends."""
+    """Return the 41 values around each, shape (N, 41), mirrored at the ends."""
     return np.lib.stride_tricks.sliding_window_view(np.pad(values, _JITTER_STEPS // 2, mode="reflect"), _JITTER_STEPS)
 
 
@@ -245,7 +256,7 @@ def prepare_body_velocities(
     variance = _stack_columns(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
     subject = Subject("role", WHEELS if only_forward else VISUAL)
     findings: list[Finding] = []
-    quat = normalize(_stack_columns(columns, [f"quat_{c}" for c in "xyzw"]))
+    quat = normalize(_stack_columns(columns, _QUAT))
     rotation = matrix_from_quat(quat_xyzw)
     if not has_twist(_rotate_vectors(rotation, velocity)[:, :1], pose):
         stamp_ns, velocity, rate = compute_increments(stamp_ns, pose, quat)
@@ -301,7 +312,7 @@ def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -
     second = np.abs(np.diff(values[known], n=2))
     moving = second > 0.0
     shown = np.zeros(values.size)
-    if moving.sum() < _FEWEST_ROWS:
+    if moving.sum() < _FEWEST:
         return shown
     noise = estimate_robust_std(second[moving]) / np.sqrt(6.0)
     if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
@@ -331,11 +342,9 @@ def prepare_imu(
     """
     rate = _stack_columns(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _stack_columns(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
-    of_orientation = np.zeros(3, np.bool_)
-    if (np.nan_to_num(rate) == 0.0).all(0).any() and np.nan_to_num(
-        np.diff(force, axis=0)
-    ).any():  # a dead IMU stays dead
-        quat = normalize(_stack_columns(columns, [f"quat_{c}" for c in "xyzw"]))
+    of_orientation, is_alive = np.zeros(3, np.bool_), np.nan_to_num(np.diff(force, axis=0)).any()
+    if is_alive and (np.nan_to_num(rate) == 0.0).all(0).any():
+        quat = normalize(_stack_columns(columns, _QUAT))
         rate, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
     # NaN compares false.
     good: Mask = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
@@ -354,15 +363,9 @@ def prepare_imu(
     for piece in _iterate_slices(usable.size):
         rate[piece], force[piece] = rotate(quat_xyzw, rate[piece]), rotate(quat_xyzw, force[piece])
     _move_to_base_link(stamp_ns[usable], rate, force, np.asarray(xyz_m))
+    quat = _read_orientations(columns, usable, quat_xyzw)
     made = InertialMeasurements(
-        stamp_ns[usable],
-        rate,
-        force,
-        _read_orientations(columns, usable, quat_xyzw),
-        gyro_std,
-        accelerometer_std,
-        weighs,
-        accelerometer_noise_mps2=noise,
+        stamp_ns[usable], rate, force, quat, gyro_std, accelerometer_std, weighs, accelerometer_noise_mps2=noise
     )
     return made, Prepared(stamp_ns[~good], repeated, 0, tuple(findings))
 
@@ -374,7 +377,7 @@ def _iterate_slices(rows: int) -> Iterator[slice]:
 
 def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
     """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it has none."""
-    components = [columns[f"quat_{c}"] for c in "xyzw"]
+    components = [columns[name] for name in _QUAT]
     if any(np.isnan(component).all() for component in components):
         return np.broadcast_to(np.nan, (usable.size, 4))
     found = np.empty((usable.size, 4))
@@ -434,16 +437,15 @@ def _is_known(variance: Floats) -> Mask:
 
 
 def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
-    """Return usable variances (N, k) and how many rows had one replaced."""
+    """Return usable variances (N, k), and how many rows had one replaced: by the default, or the median of the known if that is larger."""
     known = _is_known(variance)
-    filled = np.clip(np.where(known, variance, default), floor, NO_TRUST)
+    usual = [np.median(axis[rows]) if rows.any() else 0.0 for axis, rows in zip(variance.T, known.T, strict=True)]
+    filled = np.clip(np.where(known, variance, np.maximum(default, usual)), floor, NO_TRUST)
     return filled, int((~known).any(1).sum())
 
 
 _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
 _MOVED_M = 0.1  # smaller moves may be stationary
-_FEWEST = 20  # increments that identify the twist's axes
-_MOVES_MPS = 0.2  # slower increments have no direction
 _FITS, _FITS_NOT = 0.1, 0.3  # largest residual share along its axes (18°); smallest along other axes (33°)
 _TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
 
@@ -465,7 +467,7 @@ def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tup
     stamp, position, quat = stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
     step_ns = np.diff(stamp)
     step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
-    turn = rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:]))
+    turn = compute_turns(quat)
     # Half-way between two: the normalized sum of the quaternions of one hemisphere.
     sign = np.where(np.sum(quat[:-1] * quat[1:], axis=-1, keepdims=True) < 0, -1.0, 1.0)
     velocity = rotate(invert(normalize(quat[:-1] + sign * quat[1:])), np.diff(position, axis=0)) / step_s
@@ -485,11 +487,11 @@ def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Flo
     if not zero.any() or known.size < _FEWEST:
         return rate_radps, np.zeros(3, np.bool_)
     stamp, quat = stamp_ns[known], quat_xyzw[known]
-    turned_rad = np.cumsum(rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:])), axis=0)
+    turned_rad = np.cumsum(compute_turns(quat), axis=0)
     turns = zero & (np.ptp(turned_rad, axis=0) > _TURNED_RAD)
     # Over two steps, so that the rate is that in the middle, at the stamp itself.
     step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
-    rate = rotation_vector_from_quat(multiply(invert(quat[:-2]), quat[2:])) / step_s
+    rate = compute_turns(quat, 2) / step_s
     inner, near = known[1:-1], step_s[:, 0] <= _MAX_INCREMENT_S
     rates = np.where(turns, np.nan, rate_radps)
     rates[inner[near]] = np.where(turns, rate[near], rate_radps[inner[near]])
@@ -501,20 +503,21 @@ def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, qua
 
     Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
     """
-    known = np.isfinite(velocity_mps[:, :2]).all(1) & np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1)
-    stamp, place, quat = stamp_ns[known], pose_m[known, :2], quat_xyzw[known]
-    measured_mps = np.nan_to_num(velocity_mps[known])
-    step_s = np.diff(stamp) * 1e-9
-    good = (step_s > 0) & (step_s <= _MAX_INCREMENT_S)
-    way = np.diff(place, axis=0)[good] / step_s[good, None]
-    moving = np.linalg.norm(way, axis=1) > _MOVES_MPS
+    known = np.isfinite(np.hstack((velocity_mps[:, :2], pose_m, quat_xyzw))).all(1)
+    step_s = np.diff(stamp_ns[known])[:, None] * 1e-9
+    good = ((step_s > 0) & (step_s <= _MAX_INCREMENT_S))[:, 0]
+    way = np.diff(pose_m[known, :2], axis=0)[good] / step_s[good]
+    size = np.linalg.norm(way, axis=1)
+    moving = size > _MOVES_MPS
     if moving.sum() < _FEWEST:
         return False
-    turned = rotate(quat, measured_mps)
-    as_stated, as_turned = (
-        _compute_misfit((v[1:] + v[:-1])[good, :2] / 2.0, way, moving) for v in (measured_mps, turned)
-    )
-    return as_stated < _FITS and as_turned > _FITS_NOT
+    measured, misfit = np.nan_to_num(velocity_mps[known]), []
+    for axes in (measured, rotate(quat_xyzw[known], measured)):
+        velocity = ((axes[1:] + axes[:-1])[good, :2] / 2.0)[moving]
+        scale = np.median(np.linalg.norm(velocity, axis=1) / size[moving])
+        rest = np.sum((velocity - scale * way[moving]) ** 2, axis=1) / (scale * size[moving]) ** 2
+        misfit.append(np.median(rest))  # poses may jump
+    return bool(misfit[0] < _FITS and misfit[1] > _FITS_NOT)
 
 
 def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
@@ -522,10 +525,3 @@ def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
     turned = rotate(invert(quat_xyzw), np.nan_to_num(velocity_mps))
     turned[np.isnan(velocity_mps)] = np.nan
     return np.where(np.isfinite(quat_xyzw).all(1, keepdims=True), turned, np.nan)
-
-
-def _compute_misfit(said: Floats, way: Floats, moving: Mask) -> float:
-    """Return the share of the squares of a way that a velocity, whatever its scale, leaves unexplained (medians: poses may jump)."""
-    size = np.linalg.norm(way[moving], axis=1)
-    scale = np.median(np.linalg.norm(said[moving], axis=1) / size)
-    return float(np.median(np.sum((said[moving] - scale * way[moving]) ** 2, axis=1) / (scale * size) ** 2))

@@ -7,7 +7,7 @@ body velocity is held, it follows how fast the forward velocity changes there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,13 @@ from tcpipe.fusion.measurements import (
     VISUAL,
     WHEELS,
     BodyVelocities,
-    GroundVelocities,
     InertialMeasurements,
     Measurements,
     Positions,
 )
 from tcpipe.fusion.signals import (
+    MAX_ACCELERATION_MPS2,
+    bridge_outliers,
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
@@ -33,6 +34,10 @@ from tcpipe.fusion.signals import (
     is_in_gap,
 )
 from tcpipe.robust import estimate_robust_std
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Plane = NDArray[np.complex128]
 
 SCALE_STD: Mapping[str, float] = {
     WHEELS: 0.12,  # a skid-steered robot on grass slips by so much
@@ -47,17 +52,18 @@ DOPPLER_LASTS_S = 3.0  # what a correlation that fades in 1.5 s weighs
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
 GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
 _ACCELERATION_WINDOW_S = 0.6  # window of odometry's slope
-_SLIDE_WINDOW_S = 1.0  # window of sideways and upward velocity
 _ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration: one row
 _COURSE_TURN = 0.02  # rad²/s: 8° in a second, of a turn that only the course over ground tells
 _DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
 _MAX_GAP_NS = 300_000_000
-_STEADY = 1e-4  # m²/s³: 1 cm/s in a second
-_SLIDE = 1e-4  # m²/s³
+_STEADY = 1e-4  # m²/s³: 1 cm/s in a second, forward and aside
 _UNSEEN_SLIDE = 4e-4  # m²/s³
-_FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3  # the last in m²/s³
+_FIXES, _WINDOW_S = 5, 1.0  # fixes, and seconds, that show a velocity or how it slides
+_UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows
+_UNSEEN_STEADY = 1e-3  # m²/s³: least density by a receiver
 _SHOWS_COURSE_MPS = 0.2  # worse velocity of fixes shows no course
-_UNSEEN_MPS = 0.5  # of a velocity told by fixes: more, and they do not show how it changes
+_UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show how it changes
+_SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver: half of the change that masks look for
 _LEVEL_STD_RAD = 0.7  # roll and pitch are small to this σ
 _HELD_STD_RAD = 0.05  # the same where only the course gives turns
 _CHORD_S = 4.0  # baseline of slope from fixes
@@ -89,13 +95,10 @@ def is_turned_by_course(measurements: Measurements) -> bool:
 
 
 def _compute_fix_velocity_std_mps(gnss: Positions) -> float:
-    """Return how well the fixes of `_choose_window_s` show a velocity: the slope of a line through them."""
-    fixes = max(2.0, _choose_window_s(gnss) * 1e9 / compute_median_period_ns(gnss.stamp_ns))
-    return float(np.sqrt(12.0 / fixes * np.median(gnss.variance_m2[:, :2]))) / _choose_window_s(gnss)
-
-
-def _choose_window_s(gnss: Positions) -> float:
-    return max(_FIX_WINDOW_S, _FIXES * 1e-9 * compute_median_period_ns(gnss.stamp_ns))
+    """Return the σ of the slope of a line through the fixes of a second [m/s], five at least."""
+    period_s = 1e-9 * compute_median_period_ns(gnss.stamp_ns)
+    window_s = max(_WINDOW_S, _FIXES * period_s)
+    return float(np.sqrt(12.0 * period_s / window_s * np.median(gnss.variance_m2[:, :2]))) / window_s
 
 
 def estimate_slope_std_rad(measurements: Measurements) -> float | None:
@@ -172,13 +175,8 @@ def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> Mappi
 
 
 def make_motion_noise(  # noqa: PLR0917
-    m: Measurements,
-    noise: NoiseModel,
-    stamp_ns: NDArray[np.int64],
-    mode: NDArray[np.int8],
-    rate_radps: NDArray[np.float64],
-    period_s: float,
-) -> NDArray[np.float64]:
+    m: Measurements, noise: NoiseModel, stamp_ns: Ints, mode: NDArray[np.int8], rate_radps: Floats, period_s: float
+) -> Floats:
     """Return the variance that motion adds over the tick before each stamp, of rotation [rad²] and body velocity [m²/s²], shape (K, 6).
 
     ``mode`` and ``rate_radps`` are those of the tick, as `tcpipe.fusion.state.move_state` takes them.
@@ -191,12 +189,11 @@ def make_motion_noise(  # noqa: PLR0917
     density[~by_gyro] = _make_turn_density(m, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
     inertial = mode == state.INERTIAL
     if m.imu is not None and inertial.any():
-        density[inertial, 3:] = _make_accelerometer_density(m.imu)(stamp_ns[inertial])[:, None]
+        density[inertial, 3:] = _compute_accelerometer_density(m.imu, stamp_ns[inertial])[:, None]
     if not inertial.all():
-        forward = _make_odometry_density(m)(stamp_ns[~inertial])
-        aside = _estimate_slide_density(m.visual) + (forward if not m.odometries() else 0.0)
-        density[~inertial, 3] = forward
-        density[~inertial, 4:] = np.broadcast_to(np.reshape(aside, (-1, 1)), (forward.size, 2))
+        density[~inertial, 3:] = _compute_odometry_density(m, stamp_ns[~inertial])[:, None]
+        density[~inertial, 4:] *= not m.odometries()
+        density[~inertial, 4:] += _estimate_slide_density(m.visual)
     return density * period_s
 
 
@@ -205,17 +202,15 @@ def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
     return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
-def _compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
     """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
     source = m.first_odometry
     if source is None:
         return np.ones(at_ns.size)
-    return np.abs(_interpolate_density(source.stamp_ns, source.velocity_mps[:, 0], at_ns))
+    return np.abs(np.interp(at_ns, source.stamp_ns, source.velocity_mps[:, 0]))
 
 
-def _make_turn_density(
-    m: Measurements, mode: NDArray[np.int8], rate_radps: NDArray[np.float64], speed_mps: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _make_turn_density(m: Measurements, mode: NDArray[np.int8], rate_radps: Floats, speed_mps: Floats) -> Floats:
     """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 6), its last columns 0."""
     density = np.full((mode.size, 6), 0.0)
     density[:, :3] = _DRIFT
@@ -241,80 +236,69 @@ def _make_turn_density(
     return density
 
 
-_Density = Callable[[NDArray[np.int64]], NDArray[np.float64]]
-
-
-def _make_accelerometer_density(imu: InertialMeasurements) -> _Density:
-    rate_hz = 1e9 / compute_median_period_ns(imu.stamp_ns)
+def _compute_accelerometer_density(imu: InertialMeasurements, at_ns: Ints) -> Floats:
     noise = imu.accelerometer_noise_mps2
-    density = np.square(np.full(imu.stamp_ns.size, imu.accelerometer_std_mps2) if noise is None else noise)
-    density = density / rate_hz + 1e-6
-    return lambda at_ns: _interpolate_density(imu.stamp_ns, density, at_ns)
+    noise = np.full(imu.stamp_ns.size, imu.accelerometer_std_mps2) if noise is None else noise
+    return np.interp(at_ns, imu.stamp_ns, np.square(noise) * 1e-9 * compute_median_period_ns(imu.stamp_ns) + 1e-6)
 
 
-def _make_odometry_density(measurements: Measurements) -> _Density:
-    """Without an accelerometer: the square of the acceleration around an event, times how long it lasts.
+def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
+    """Return the noise density without an accelerometer: the square of the acceleration around a stamp, times how long it lasts.
 
     Where two odometries differ, the one that shows the least of it is right: wheels that dig in show much.
     """
-    sources = [source for source in measurements.odometries().values() if source.stamp_ns.size > 2]
-    slope = [compute_slopes(s.stamp_ns, s.velocity_mps[:, 0], _ACCELERATION_WINDOW_S) for s in sources]
-    doppler = None if sources else measurements.doppler
-    unknown = _make_velocity_density(doppler) if doppler else _make_fix_density(None if sources else measurements.gnss)
-
-    def density(at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        found = np.full(at_ns.size, np.nan)
-        for source, acceleration in zip(sources, slope, strict=True):
-            covered = ~is_in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
-            shown = _interpolate_density(source.stamp_ns, np.abs(acceleration), at_ns[covered])
-            found[covered] = np.fmin(found[covered], shown)
-        return np.where(np.isnan(found), unknown(at_ns), _STEADY + _ACCELERATION_LASTS_S * found**2)
-
-    return density
+    sources = [source for source in m.odometries().values() if source.stamp_ns.size > 2]
+    found = np.full(at_ns.size, np.nan)
+    for source in sources:
+        covered = ~is_in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
+        slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], _ACCELERATION_WINDOW_S)
+        found[covered] = np.fmin(found[covered], np.interp(at_ns[covered], source.stamp_ns, np.abs(slope)))
+    unseen = np.full(at_ns.size, _UNKNOWN) if sources else _compute_receiver_density(m, at_ns)
+    return np.where(np.isnan(found), unseen, _STEADY + _ACCELERATION_LASTS_S * found**2)
 
 
-def _make_fix_density(gnss: Positions | None) -> _Density:
-    """Return the noise density without odometry: by the acceleration of the fixes over a second, or over five of them; else the usual.
+def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
+    """Return the noise density without odometry: the square of the acceleration that a receiver shows, times how long it lasts.
 
-    Over a longer window an acceleration of a second looks smaller. Fixes too noisy to show a velocity do not show how steady it is.
+    What a slow receiver shows from fix to fix lasts as long. Fixes too noisy to show a velocity do not show how steady it is.
     """
-    if gnss is None or gnss.stamp_ns.size < _FIXES:
-        return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
-    window_s = _choose_window_s(gnss)
-    found = np.zeros(gnss.stamp_ns.size)
-    for axis in range(2):
-        velocity = compute_slopes(gnss.stamp_ns, gnss.position_enu_m[:, axis], window_s)
-        found += np.square(compute_slopes(gnss.stamp_ns, velocity, window_s))
-    unseen = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
-    found *= (window_s / _FIX_WINDOW_S) ** 2
-    density = np.minimum(np.maximum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, unseen), _UNKNOWN)
-    stamp_ns = gnss.stamp_ns
-    return lambda at_ns: _interpolate_density(stamp_ns, density, at_ns)
+    source, least = m.doppler or m.gnss, 0.0
+    if source is None or source.stamp_ns.size < _FIXES:
+        return np.full(at_ns.size, _UNKNOWN)
+    if isinstance(source, Positions):
+        values, variance, order = source.position_enu_m, source.variance_m2, 2
+        least = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
+    else:
+        values, variance, order = source.velocity_enu_mps, source.variance_m2ps2, 1
+    zero_ns, std = int(source.stamp_ns[0]), float(np.sqrt(np.median(variance[:, :2])))
+    stamp_s, plane = compute_seconds(source.stamp_ns, zero_ns), values[:, :2] @ np.array([1.0, 1j])
+    plane = bridge_outliers(stamp_s, plane, std) if order == 2 else plane
+    shown_s, acceleration = _compute_accelerations(stamp_s, plane, std, order)
+    lasts_s = max(_UNSEEN_LASTS_S, 1e-9 * compute_median_period_ns(source.stamp_ns))
+    density = np.maximum(_UNSEEN_STEADY + lasts_s * np.square(np.minimum(acceleration, MAX_ACCELERATION_MPS2)), least)
+    return np.interp(compute_seconds(at_ns, zero_ns), shown_s, density)
 
 
-def _make_velocity_density(doppler: GroundVelocities) -> _Density:
-    """Without odometry: the square of the acceleration that a receiver's own velocity shows, as far as it is not its noise."""
-    stamp_ns, window_s = (
-        doppler.stamp_ns,
-        max(_FIX_WINDOW_S, _FIXES * 1e-9 * compute_median_period_ns(doppler.stamp_ns)),
-    )
-    if stamp_ns.size < _FIXES:
-        return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
-    shown = sum(np.square(compute_slopes(stamp_ns, axis, window_s)) for axis in doppler.velocity_enu_mps[:, :2].T)
-    density = np.minimum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * np.asarray(shown), _UNKNOWN)
-    return lambda at_ns: _interpolate_density(stamp_ns, density, at_ns)
+def _compute_accelerations(stamp_s: Floats, values: Plane, std: float, order: int) -> tuple[Floats, Floats]:
+    """Return times [s] and accelerations [m/s²], shape (M,), by the derivative of this order of samples in the plane, shape (N,).
 
-
-def _interpolate_density(
-    stamp_ns: NDArray[np.int64], values: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    zero = int(stamp_ns[0])
-    return np.interp(compute_seconds(at_ns, zero), compute_seconds(stamp_ns, zero), values)
+    Successive means are compared, of so few samples of a standard deviation ``std`` as show an acceleration of `_SHOWN_MPS2`.
+    """
+    wanted = _SHOWN_MPS2 * float(np.median(np.diff(stamp_s))) ** order / std
+    rows = int(
+        np.ceil((np.sqrt(4.0 * order - 2.0) / wanted) ** (1.0 / (order + 0.5)))
+    )  # 1 and 2 differences: √2 and √6 std
+    rows = min(rows, stamp_s.size // (order + 2))
+    at_s, values = (np.convolve(each, np.full(rows, 1.0 / rows), "valid") for each in (stamp_s, values))
+    for _ in range(order):
+        values = (values[rows:] - values[:-rows]) / (at_s[rows:] - at_s[:-rows])
+        at_s = 0.5 * (at_s[rows:] + at_s[:-rows])
+    return at_s, np.abs(values)
 
 
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     """Return how fast a body that is held to drive straight comes to slide [m²/s³]: as visual odometry shows it, or a guess."""
     if visual is None or visual.stamp_ns.size < 3:
         return _UNSEEN_SLIDE
-    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _SLIDE_WINDOW_S) for axis in (1, 2)]
-    return max(_SLIDE, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)
+    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _WINDOW_S) for axis in (1, 2)]
+    return max(_STEADY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)

@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Plane = NDArray[np.complex128]
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
+_OUTLIER_STDS = 5.0  # distance of an outlier from the line between its neighbours
+MAX_ACCELERATION_MPS2 = 2.5
+"""Acceleration of a robot that brakes hard; what fixes show beyond it is an outlier [m/s²]."""
 _MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long
 
 
@@ -114,23 +118,31 @@ def compute_median_of_five(values: Floats) -> Floats:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
 
 
+def bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
+    """Return places [m], shape (N,), without single outliers, which are moved to the line between their neighbours.
+
+    An outlier is further off that line than noise of ``std_m`` and an acceleration explain.
+    """
+    if places.size < 3:
+        return places
+    step_s = stamp_s[2:] - stamp_s[:-2]
+    share = (stamp_s[1:-1] - stamp_s[:-2]) / np.maximum(step_s, 1e-6)
+    between = places[:-2] + share * (places[2:] - places[:-2])
+    off_m = np.concatenate(([0.0], np.abs(places[1:-1] - between), [0.0]))
+    wild = off_m[1:-1] > _OUTLIER_STDS * std_m + MAX_ACCELERATION_MPS2 * step_s**2 / 8
+    wild &= off_m[1:-1] >= np.maximum(off_m[:-2], off_m[2:])  # its neighbours lie half as far off their lines
+    found = places.copy()
+    found[1:-1][wild] = between[wild]
+    return found
+
+
 def compute_slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
     """Return the slope [u/s] at each sample of the line through the samples within half a window, shape (N,); 0 where there is one only."""
-    t = compute_seconds(stamp_ns, int(stamp_ns[0]))
-    first = np.searchsorted(t, t - 0.5 * window_s, "left")
-    last = np.searchsorted(t, t + 0.5 * window_s, "right")
-    count = (last - first).astype(np.float64)
-
-    def window(samples: Floats) -> Floats:
-        total = np.concatenate(([0.0], np.cumsum(samples)))
-        mean: Floats = (total[last] - total[first]) / count
-        return mean
-
-    centred = values - values.mean()
-    mean_t = window(t)
-    spread = window(t * t) - mean_t**2
-    covariance = window(t * centred) - mean_t * window(centred)
-    return np.where(spread > 1e-9, covariance / np.maximum(spread, 1e-9), 0.0)
+    t, centred = compute_seconds(stamp_ns, int(stamp_ns[0])), values - values.mean()
+    products = np.column_stack((t, centred, t * t, t * centred))
+    time, value, square, product = compute_window_means(stamp_ns, products, stamp_ns, round(1e9 * window_s)).T
+    spread = square - time**2
+    return np.where(spread > 1e-9, (product - time * value) / np.maximum(spread, 1e-9), 0.0)
 
 
 def estimate_white_noise(values: Floats) -> float:

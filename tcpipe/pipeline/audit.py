@@ -14,7 +14,7 @@ from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.fusion.measurements import DOPPLER, FIXES, GNSS, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
+from tcpipe.fusion.measurements import DOPPLER, FIXES, GNSS, PAUSE_NS, VISUAL, WHEELS, BodyVelocities, Positions
 from tcpipe.fusion.withheld import (
     CHORDS_S,
     END_S,
@@ -33,7 +33,7 @@ from tcpipe.pipeline.named_runs import find_named_run, is_path
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, name_pose, prepare_inputs, prepare_pose
+from tcpipe.stages.fuse_inputs import Section, find_fixes_role, prepare_sections, use_pose_as_fixes
 from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.store import is_store
 from tcpipe.tables.arrays import number_column, select_rows
@@ -58,14 +58,12 @@ class WithheldComparisons:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A run, its measurements, and the clock epoch that is judged."""
+    """A run, and the section of it that is judged."""
 
     run_id: str
     streams: Streams
     config: FuseConfig
-    inputs: FusionInputs
-    epoch: int
-    measurements: Measurements
+    section: Section
 
     def fuse(self, streams: Streams) -> Track:
         return fuse_run(streams, self.config, run_id=self.run_id)
@@ -78,18 +76,16 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
 
     Raises `FusionError`: no sensor measures motion.
     """
-    streams, _ = prepare_pose(streams)
-    inputs = prepare_inputs(streams, config)
-    if not inputs.measurements:
+    sections = prepare_sections(use_pose_as_fixes(streams)[0], config)
+    if not sections:
         raise FusionError(f"{run_id}: no sensor measures motion")
-    epoch = find_longest_epoch(inputs)
-    run = _Run(run_id, streams, config, inputs, epoch, inputs.measurements[epoch])
+    run = _Run(run_id, streams, config, max(sections, key=lambda section: section.driven_m))
     comparisons, skipped = list[Comparison](), list[tuple[str, str]]()
-    motion = [role for role in (GNSS, WHEELS, VISUAL) if role in run.measurements.sensors()]
+    motion = [role for role in (GNSS, WHEELS, VISUAL) if role in run.section.measurements.sensors()]
     if len(motion) == 1:
         skipped.append((motion[0], "no other sensor measures motion"))
     for role in motion if len(motion) > 1 else ():
-        stamp_ns = run.measurements.sensors()[role].stamp_ns
+        stamp_ns = run.section.measurements.sensors()[role].stamp_ns
         span_s = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9
         for length_s in WINDOWS_S:
             windows_ns = int(stamp_ns[0]) + np.round(place_windows(span_s, length_s) * 1e9).astype(np.int64)
@@ -111,18 +107,18 @@ _OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}
 
 def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> Iterator[Comparison]:
     step(f"fusing without {role} for {len(windows_ns)} x {length_s:.0f} s")
-    track = run.fuse(withhold(run.streams, role, run.epoch, windows_ns))
+    track = run.fuse(withhold(run.streams, role, run.section.clock_epoch, windows_ns))
     facts = track.info.report.facts
-    if role == GNSS and facts.sensor_checks is not None and not facts.sensor_checks.excluded.keys().isdisjoint(FIXES):
+    if role == GNSS and facts.fuse is not None and not {*FIXES}.intersection(facts.fuse.sensors):
         raise FusionError("tcpipe excludes the other fixes of the run")
-    rows = _select_rows(track, run.epoch)
+    rows = _select_rows(track, run.section)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])
     if not moving.any():
         raise FusionError("the rest has no track in the windows, or the robot is stationary there")
-    numbers, sensor = np.flatnonzero(moving), run.measurements.sensors()[role]
+    numbers, sensor = np.flatnonzero(moving), run.section.measurements.sensors()[role]
     if isinstance(sensor, Positions):
-        sensor = _move_origin(sensor, run.inputs, track)
-        arm_m, arm_std_m = np.asarray(run.streams.sensors[GNSS].xyz_m), np.zeros(3)
+        sensor = _move_origin(sensor, run.section, track)
+        arm_m, arm_std_m = np.asarray(run.streams.sensors[find_fixes_role(run.streams)].xyz_m), np.zeros(3)
         if facts.fuse and any(finding.code in _OTHER_ARM for finding in track.info.report.findings):
             arm = facts.fuse.longest.parameters["antenna"]
             arm_m, arm_std_m = arm_m + arm.value, np.asarray(arm.std)
@@ -148,24 +144,24 @@ def withhold(streams: Streams, role: str, epoch: int, windows_ns: Ints) -> Strea
     )
 
 
-def _move_origin(fixes: Positions, inputs: FusionInputs, track: Track) -> Positions:
+def _move_origin(fixes: Positions, section: Section, track: Track) -> Positions:
     """Return the fixes in the track's own plane: its origin is the first fixes, of which some may be withheld."""
     datum = track.info.datum
-    if datum is None or inputs.datum_deg_m is None:
+    if datum is None or section.datum_deg_m is None:
         raise FusionError("the track of the rest has only local coordinates")
-    places = geodetic_from_enu(fixes.position_enu_m, datum_deg_m=inputs.datum_deg_m)
+    places = geodetic_from_enu(fixes.position_enu_m, datum_deg_m=section.datum_deg_m)
     moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
     return replace(fixes, position_enu_m=moved)
 
 
 def _compare_lengths(run: _Run) -> dict[str, float]:
     """Return the horizontal length of the track over the distance that each odometry measures, by role."""
-    rows = _select_rows(run.fuse(run.streams), run.epoch)
+    rows = _select_rows(run.fuse(run.streams), run.section)
     if rows.stamp_ns.size == 0:
         return {}
     length_m = rows.measure_length_m(int(rows.stamp_ns[0]), int(rows.stamp_ns[-1]) + 1)
     ratios = {}
-    for role, odometry in run.measurements.odometries().items():
+    for role, odometry in run.section.measurements.odometries().items():
         speed = np.abs(odometry.velocity_mps[:, 0])
         odometer_m = float(integrate_between(odometry.stamp_ns, speed, rows.stamp_ns[:1], rows.stamp_ns[-1:])[0])
         if odometer_m > LEAST_WINDOW_M:
@@ -173,8 +169,10 @@ def _compare_lengths(run: _Run) -> dict[str, float]:
     return ratios
 
 
-def _select_rows(track: Track, epoch: int) -> TrackRows:
-    table = select_rows(track.table, "clock_epoch", epoch)
+def _select_rows(track: Track, section: Section) -> TrackRows:
+    table, (start_ns, end_ns) = select_rows(track.table, "clock_epoch", section.clock_epoch), section.span_ns
+    stamp_ns = to_integers(table, "stamp_ns")
+    table = table.filter(number_column((stamp_ns >= start_ns - PAUSE_NS) & (stamp_ns <= end_ns + PAUSE_NS)))
     return TrackRows(to_integers(table, "stamp_ns"), read_float_columns(table), track.info.rate_hz)
 
 
@@ -249,11 +247,12 @@ def audit(
     name = format_path(run)
     streams, config = read_audited(run, recipe, robot=robot, message_definitions=message_definitions, store=store)
     found = compare_withheld(streams, config, run_id=name)
-    skipped = tuple(f"{name_pose(role, streams)}, {reason}" for role, reason in found.skipped)
+    fixes = {GNSS: find_fixes_role(streams)}
+    skipped = tuple(f"{fixes.get(role, role)}, {reason}" for role, reason in found.skipped)
     if not found.comparisons and not found.length_ratios:
         raise UsageError(f"{name}: nothing can be withheld and compared", *skipped)
     scores = (score_comparisons([each]) for each in found.comparisons)
-    named = tuple(replace(score, role=name_pose(score.role, streams)) for score in scores)
+    named = tuple(replace(score, role=fixes.get(score.role, score.role)) for score in scores)
     return Audit(name, streams.robot, named, skipped, found.length_ratios)
 
 

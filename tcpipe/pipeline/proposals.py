@@ -7,6 +7,7 @@ import shlex
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from os.path import commonprefix
 from pathlib import Path
@@ -52,6 +53,7 @@ from tcpipe.stages.read import decide_roles, find_read_config, read_run
 from tcpipe.stages.read_sources import place_frames
 from tcpipe.store import is_store
 from tcpipe.tables.findings import Finding
+from tcpipe.tables.levels import Streams
 
 if TYPE_CHECKING:
     from tcpipe.formats.logs.log_file import Log
@@ -267,10 +269,15 @@ class _Table:
     stamp_lines: RecipeKeys
     duplicates: Mapping[str, str]
 
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last time [ns]."""
+        ns = self.clock.ns.drop_nulls().to_numpy()
+        return int(ns.min()), int(ns.max())
+
     def overlap_ns(self, other: _Table) -> int:
         """Return the time that two tables have in common; that of stamps of different kinds, but for counters, is unknown."""
-        known = (table.clock.ns.drop_nulls().to_numpy() for table in (self, other))
-        spans = [(int(ns.min()), int(ns.max())) for ns in known]
+        spans = [self.span_ns, other.span_ns]
         kinds = {self.clock.kind, other.clock.kind}
         if len(kinds) > 1:
             return 0 if "counter" in kinds else min(end_ns - start_ns for start_ns, end_ns in spans)
@@ -306,12 +313,12 @@ def propose_tables(path: Path) -> ProposedRecipe:
         what = f"{path}: it contains no log, and no table with stamps and columns of known names"
         raise UsageError(what, *filter(None, head))
     reference = max(next(iter(roles.values())), key=lambda candidate: candidate[0].clock.count_stamps())[0]
-    lines, log, used, reasons = list[ProposedLine](), path, set[str](), dict[str, str]()
+    lines, log, used, apart = list[ProposedLine](), path, set[str](), dict[str, _Table]()
     for role, candidates in roles.items():
         candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(reference), -candidate[0].clock.count_stamps()))
         table, mine = candidates[0]
         if not table.overlap_ns(reference):
-            reasons[role] = "no time in common with the others: another clock, or another drive"
+            apart[role] = table
         lines += mine
         used |= {line.value for line in mine if isinstance(line.value, str)}
         log = table.path if "*" in table.file else log
@@ -320,7 +327,8 @@ def propose_tables(path: Path) -> ProposedRecipe:
     needless = [line for line in lines if line.key == "stamp_zone"][1:]
     needless += [line for line in lines if line.note == NO_VOLTAGE and make_rail_name(line.table) in rails]
     lines = [line for line in lines if line not in needless]
-    lines = _try_lines(lines, log, reasons)
+    lines, unaligned = _align_clocks(lines, log, apart, reference) if len(tables) > 1 else (lines, [])
+    lines = _try_lines(lines, log, dict.fromkeys(unaligned, _UNALIGNED))
     found_roles = {*roles, *(line.value for line in lines if line.key == "role")}
     for role in ("gnss", "imu", "wheel_odometry", "power"):
         lines += [] if role in found_roles else _propose_rest(role, tables, " ".join(used))
@@ -483,20 +491,56 @@ def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[Pr
         return
 
 
+_UNALIGNED = "no time in common with the others: another clock, or another drive"
+
+
+def _align_clocks(
+    lines: Sequence[ProposedLine], log: Path, apart: Mapping[str, _Table], reference: _Table
+) -> tuple[list[ProposedLine], list[str]]:
+    """Return the lines with the offsets of tables on another clock, and the names of tables whose offsets are unknown.
+
+    Offsets are found by speed and turn rate. The tables ``apart`` have no time in common with the reference: their offsets are searched up
+    to five minutes around the one at which both tables begin together. A table without motion has the clock of a table with which it has
+    time in common.
+    """
+    from tcpipe.stages.fuse import find_late_sensors  # noqa: PLC0415  kernels load only where there is work
+
+    begin_s = {name: (reference.span_ns[0] - table.span_ns[0]) / 1e9 for name, table in apart.items()}
+    together = [ProposedLine(f"tables.{name}", "offset_s", each) for name, each in begin_s.items()]
+    offset_s = dict[str, float]()
+    with suppress(TcpipeError):
+        recipe = _make_recipe([*lines, *together])
+        late_s = find_late_sensors(_read_streams(log, recipe), recipe.fuse)
+        offset_s = {name: round(begin_s.get(name, 0.0) - each, 2) for name, each in late_s.items()}
+    for name, table in apart.items():
+        clocks = [each for other, each in offset_s.items() if other in apart and apart[other].overlap_ns(table)]
+        offset_s |= {name: clocks[0]} if name not in offset_s and clocks else {}
+    aligned = [
+        ProposedLine(f"tables.{name}", "offset_s", each, "aligned by speed and turns")
+        for name, each in offset_s.items()
+        if name in apart or abs(each) > 1.0  # fusing corrects less
+    ]
+    return [*lines, *aligned], [name for name in apart if name not in offset_s]
+
+
+def _make_recipe(lines: Sequence[ProposedLine]) -> Recipe:
+    """Return the recipe of the tables in lines that are certain, or become so when they are tried."""
+    tried = [line for line in lines if line.is_certain or line.key in ("stamp_zone", "stamp_format")]
+    text = ProposedRecipe([], [replace(line, is_certain=True) for line in tried], "").toml()
+    tables = {name: of for name, of in tomllib.loads(text).get("tables", {}).items() if "columns" in of}
+    return from_values(Recipe, {"tables": tables}, where="proposed recipe")
+
+
 def _try_lines(lines: Sequence[ProposedLine], log: Path, reasons: Mapping[str, str]) -> list[ProposedLine]:
     """Return the lines as the first minute corrects and completes them; tables that contradict others become comments.
 
     So do those of ``reasons``, by name of the table; they are not tried.
     """
     reasons = {f"tables.{name}": why for name, why in reasons.items()}
-    tried = [line for line in lines if line.is_certain or line.key in ("stamp_zone", "stamp_format")]
-    tried = [line for line in tried if line.table not in reasons]
-    text = ProposedRecipe([], [replace(line, is_certain=True) for line in tried], "").toml()
-    tables = {name: of for name, of in tomllib.loads(text).get("tables", {}).items() if "columns" in of}
-    recipe = from_values(Recipe, {"tables": tables}, where="proposed recipe")
+    recipe = _make_recipe([line for line in lines if line.table not in reasons])
     findings: Sequence[Finding] = ()
     try:
-        findings = _fuse_first_minute(log, recipe) if tables else ()
+        findings = _fuse_first_minute(log, recipe) if recipe.tables else ()
     except LogError as error:
         found = ((re.search(r"recipe (tables\.\w+)", problem), problem) for problem in error.problems)
         reasons |= {named[1]: problem.partition(": ")[2] for named, problem in found if named}
@@ -541,9 +585,13 @@ def _fuse_first_minute(log: Path, recipe: Recipe) -> tuple[Finding, ...]:
     """Return the findings of the first minute of a log."""
     from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only where there is work
 
-    with open_single_log(log, tables=recipe.tables) as opened:
-        streams = read_run(opened, find_read_config(recipe, opened.topics), robot=None, known=load_profiles(recipe))
+    streams = _read_streams(log, recipe)
     end_ns = min(pc.min(table["stamp_ns"]).as_py() for table in streams.tables.values()) + _TRIAL_NS
     cut = {role: table.filter(pc.less(table["stamp_ns"], end_ns)) for role, table in streams.tables.items()}
     streams = replace(streams, tables={role: table for role, table in cut.items() if table.num_rows})
     return fuse_run(streams, recipe.fuse, run_id="trial").info.report.findings
+
+
+def _read_streams(log: Path, recipe: Recipe) -> Streams:
+    with open_single_log(log, tables=recipe.tables) as opened:
+        return read_run(opened, find_read_config(recipe, opened.topics), robot=None, known=load_profiles(recipe))

@@ -203,7 +203,7 @@ def _compute_chord_speed(table: pa.Table, t_s: Floats) -> tuple[Floats, Floats]:
         xy_m = enu_from_geodetic(lon, lat, alt, datum_deg_m=first)[:, :2]
     known = np.isfinite(xy_m).all(axis=1)
     xy_m, t_s = xy_m[known], t_s[known]
-    rows = np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1], 1.0))) if len(t_s) else np.arange(0)
+    rows = np.flatnonzero(np.diff(np.floor(t_s - t_s[:1]), prepend=-1.0))
     apart_s = np.diff(t_s[rows])
     near = (apart_s > 0.5) & (apart_s < 2.0)
     chord_m = np.hypot(*np.diff(xy_m[rows], axis=0).T)

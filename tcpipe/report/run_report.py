@@ -374,22 +374,23 @@ def _describe_noise(
 
 def _make_clock_sections(facts: StageFacts) -> list[Section]:
     """Return the time offset of each sensor, if any could be compared."""
-    clock_offsets = facts.clock_offsets
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
-    offsets = clock_offsets.offsets if clock_offsets else {}
-    if not offsets and not steps:
-        return []
     rows = [
-        (_name(role), f"{round(1e3 * offset.offset_s) + 0:+d} ms", f"{2e3 * offset.std_s:.0f} ms")
-        for role, offset in sorted(offsets.items())
+        (
+            _name(role),
+            _name(clocks.reference),
+            f"{round(1e3 * offset.offset_s) + 0:+d} ms",
+            f"{2e3 * offset.std_s:.0f} ms",
+        )
+        for clocks in facts.clock_offsets
+        for role, offset in sorted(clocks.offsets.items())
     ]
-    text = ""
-    if clock_offsets and rows:
-        reference = _name(clock_offsets.reference)
-        text = f"Time offsets relative to {reference}, from the motion that both sensors measure."
+    if not rows and not steps:
+        return []
+    text = "Time offsets from the motion that both sensors measure, by section." if rows else ""
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
-    header = ("sensor", "late by", "± (2σ)")
+    header = ("sensor", "relative to", "late by", "± (2σ)")
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
 
 

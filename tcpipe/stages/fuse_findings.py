@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.sanity import compute_command_ratio
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Positions
 from tcpipe.fusion.process import SCALE_STD
 from tcpipe.geometry.rotation import (
     matrix_from_quat,
@@ -21,13 +21,7 @@ from tcpipe.geometry.rotation import (
     rotation_vector_from_quat,
 )
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import (
-    FusionInputs,
-    exclude_role,
-    find_longest_epoch,
-    read_command,
-    state_extrinsics,
-)
+from tcpipe.stages.fuse_inputs import Section, exclude_role, state_extrinsics
 from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import (
     AuditFacts,
@@ -46,7 +40,7 @@ _CERTAIN_YAW_SOURCES = ("course over ground", "pose")
 
 
 def make_fuse_facts(
-    inputs: FusionInputs, sections: Sequence[StretchFacts], *, rows: int, skipped_s: float
+    inputs: Sequence[Section], sections: Sequence[StretchFacts], *, rows: int, skipped_s: float
 ) -> FuseFacts:
     """Return the facts of the run: counts by role over all sections, what was set aside, and each section."""
     roles = sorted({role for section in sections for role in section.measurements})
@@ -62,19 +56,35 @@ def make_fuse_facts(
         measurements={role: sum(section.measurements.get(role, 0) for section in sections) for role in roles},
         rejected={role: sum(section.rejected.get(role, 0) for section in sections) for role in roles},
         nis_mean=nis,
-        set_aside=inputs.counts,
+        set_aside=add_counts(inputs),
         skipped_s=skipped_s,
         stretches=tuple(sections),
     )
 
 
-def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:
+def add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
+    """Return by role the counts of messages that are not used as they are."""
+    total: dict[str, dict[str, int]] = {}
+    for role, each in (item for section in inputs for item in section.prepared.items()):
+        counts = {
+            "invalid": each.invalid_ns.size,
+            "repeated": each.repeated,
+            "variances_replaced": each.variances_replaced,
+        }
+        total[role] = {name: count + total.get(role, {}).get(name, 0) for name, count in counts.items()}
+    return total
+
+
+def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:
     """Return what was observed while fusing."""
     gnss, first_ns = Subject("role", GNSS), min((section.start_ns for section in facts.stretches), default=0)
-    findings = [finding for finding in inputs.findings if finding.subject.name not in inputs.excluded]
-    if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was found when it was read
+    unused = set.intersection(*(set(section.excluded) for section in inputs))
+    every = (finding for section in inputs for finding in section.findings)
+    findings = [*dict.fromkeys(finding for finding in every if finding.subject.name not in unused)]
+    is_local = all(section.datum_deg_m is None for section in inputs)
+    if is_local and GNSS in facts.set_aside:  # a log without any fix was found when it was read
         findings.append(make_finding("local-frame", gnss))
-    elif inputs.datum_deg_m is not None:
+    elif not is_local:
         findings += [
             _find_initial_yaw(section, first_ns, gnss)
             for section in facts.stretches
@@ -88,8 +98,8 @@ def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) 
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
         findings += [
             make_finding(code, Subject("role", role), row_count=count[key])
-            for role, count in inputs.counts.items()
-            if count[key] and role not in inputs.excluded
+            for role, count in facts.set_aside.items()
+            if count[key] and role not in unused
         ]
     if facts.skipped_s:
         findings.append(make_finding("sections-skipped", run, skipped_s=facts.skipped_s))
@@ -202,12 +212,14 @@ def _find_span_s(each: StretchFacts | GateReset | ChangeFacts | Disagreement, fi
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
-def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
+def make_audit_findings(fused: Fused, inputs: Sequence[Section], streams: Streams) -> StageReport[AuditFacts]:
     """Return every disagreement, wheels that are faster than any command, and the findings of both."""
     found = fused.disagreements
     first_ns = min((section.start_ns for section in fused.facts), default=0)
     findings = [_find_disagreement(found, first_ns)] if found else []
-    faster = _compute_command_ratio(inputs, streams)
+    # The scale of the wheels is a constant of the robot: any section may show that it is wrong.
+    ratios = (compute_command_ratio(section.measurements, section.command) for section in inputs)
+    faster = max((ratio for ratio in ratios if ratio is not None), default=None)
     if faster is not None:
         scale = round((streams.report.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
         remedies = suggest("state_scale", {"read.odometry_scale": {WHEELS: scale}})
@@ -215,17 +227,6 @@ def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) ->
         wheels = Subject("role", WHEELS)
         findings.append(make_finding("faster-than-commanded", wheels, remedies=remedies, speed_ratio=faster))
     return StageReport(tuple(findings), AuditFacts(tuple(found), () if faster is None else (WHEELS,)))
-
-
-def _compute_command_ratio(inputs: FusionInputs, streams: Streams) -> float | None:
-    """Return the ratio of the wheels' speed to the command where it is too high and no sensor makes the scale observable."""
-    if not inputs.measurements:
-        return None
-    epoch = find_longest_epoch(inputs)
-    m, command = inputs.measurements[epoch], read_command(streams, epoch)
-    if m.wheels is None or m.gnss is not None or m.visual is not None or command is None:
-        return None
-    return compute_command_ratio(m.wheels, command)
 
 
 def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
@@ -249,14 +250,15 @@ _LEAST_TURN_RAD = 0.05
 _LEAST_SCALE = 0.1
 
 
-def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
-    """Yield where the run shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
+def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
+    """Yield where the longest track section shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
     longest = facts.longest
     parameters = longest.parameters
+    scales = {role: scale for section in inputs for role, scale in section.scales.items()}
     arm, tilt = parameters.get("antenna"), parameters.get("mounting of the IMU")
     if arm is not None and GNSS in streams.sensors:
         sensor, turned = streams.sensors[GNSS], parameters.get("mounting of the pose")
-        turn = _find_rotation(turned, inputs.measurements.get(longest.clock_epoch), sensor)
+        turn = _find_rotation(turned, _find_fixes(inputs, longest), sensor)
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
             yield _find_arm(arm, sensor, turn)
         off = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
@@ -269,9 +271,9 @@ def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Str
         yield _find_tilt(tilt, streams.sensors[IMU])
     for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
         found = parameters.get(name)
-        if role in inputs.scales or (found is not None and _is_contradicted(found, _LEAST_SCALE)):
+        if role in scales or (found is not None and _is_contradicted(found, _LEAST_SCALE)):
             value, std = (0.0, SCALE_STD[role]) if found is None else (found.value[0], found.std[0])
-            scale = inputs.scales.get(role, 1.0) * (1.0 + value)
+            scale = scales.get(role, 1.0) * (1.0 + value)
             stated = (streams.report.facts.odometry_scale or {}).get(role, 1.0)
             remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
             yield make_finding("odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=std)
@@ -289,11 +291,17 @@ def _is_contradicted(found: ParameterFacts, least: float) -> bool:
     return any(abs(v) > max(_SURELY * s, least) for v, s in zip(found.value, found.std, strict=True))
 
 
-def _find_rotation(turned: ParameterFacts | None, m: Measurements | None, sensor: Sensor) -> NDArray[np.float64]:
+def _find_fixes(inputs: Sequence[Section], part: StretchFacts) -> Positions | None:
+    """Return the fixes of the section that contains a track section."""
+    fixes = (section.measurements.gnss for section in inputs if section.clock_epoch == part.clock_epoch)
+    return next((each for each in fixes if each is not None and each.stamp_ns[-1] >= part.start_ns), None)
+
+
+def _find_rotation(turned: ParameterFacts | None, fixes: Positions | None, sensor: Sensor) -> NDArray[np.float64]:
     """Return how the sensor of positions is turned on the robot, shape (3, 3): that of a pose as its run shows it."""
-    if turned is None or m is None or m.gnss is None:
+    if turned is None or fixes is None:
         return matrix_from_quat(sensor.quat_xyzw)
-    return matrix_from_quat(multiply(quat_from_rotation_vector(turned.value), m.gnss.mounting_xyzw))
+    return matrix_from_quat(multiply(quat_from_rotation_vector(turned.value), fixes.mounting_xyzw))
 
 
 def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: NDArray[np.float64]) -> Finding:

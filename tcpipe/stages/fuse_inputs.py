@@ -1,12 +1,11 @@
-"""Measurements by clock epoch, without sensors that contradict physics or the other sensors; findings name the remedy.
-
-A pose that another program estimated is fused as fixes with an attitude; findings and facts call it by its role.
-"""
+"""Sections of a run: measurements by clock epoch, without sensors that contradict physics or the other sensors."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from itertools import pairwise
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -16,8 +15,10 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.attitude import align_mounting
+from tcpipe.fusion.checks.lags import compute_driven_m, find_span_ns
 from tcpipe.fusion.checks.sanity import (
-    CommandedSpeed,
+    CONSTANT_FAULTS,
+    Command,
     SensorExclusion,
     check_ground_velocity,
     check_sensors,
@@ -42,110 +43,144 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.arrays import select_rows
 from tcpipe.tables.columns import read_float_columns, to_floats, to_integers
+from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 
-@dataclass(slots=True)
-class FusionInputs:
-    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps and counts; findings."""
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One clock epoch of a run, or a part of it without a pause of `_PAUSE_NS`, and everything that is decided about its sensors.
 
-    datum_deg_m: tuple[float, float, float] | None
-    measurements: dict[int, Measurements] = field(default_factory=dict)
-    invalid_ns: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
-    counts: dict[str, dict[str, int]] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
+    Units, mounting and scale are constants of the robot: a section also has those that sections with a longer drive show. Clocks, frozen
+    sensors and everything else are decided in each section alone.
+
+    Attributes
+    ----------
+    command : last command of its clock epoch; None without commands.
+    datum_deg_m : longitude, latitude, height of the local frame's origin; None without fixes.
+    prepared : by role, messages that are not used as they are.
+    excluded : by role, why a sensor is not fused.
+    scales : by odometry, the scale that was taken out.
+    clocks : time offsets of the sensors; ``measurements`` contain them until `tcpipe.stages.fuse.correct_clocks`.
+    cuts : by first stamp [ns] after the clock of all sensors was set forward, the finding.
+    is_base_free : whether no other section shows where base_link is.
+    """
+
+    clock_epoch: int
+    measurements: Measurements = field(default_factory=Measurements)
+    command: Command | None = None
+    datum_deg_m: tuple[float, float, float] | None = None
+    prepared: Mapping[str, Prepared] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
     excluded: Mapping[str, Finding] = field(default_factory=dict)
-    """By role, why a sensor is not fused."""
     scales: Mapping[str, float] = field(default_factory=dict)
-    """By odometry, the scale that was taken out: far from 1."""
-    cuts_ns: tuple[int, ...] = ()
-    """First stamps after the clock of all sensors was set forward."""
+    clocks: ClockFacts = field(default_factory=lambda: ClockFacts(0, "", (), {}))
+    cuts: Mapping[int, Finding] = field(default_factory=dict)
+    is_base_free: bool = False
 
-    def note(self, role: str, prepared: Prepared) -> None:
-        """Remember what was set aside."""
-        self.invalid_ns.setdefault(role, []).append(prepared.invalid_ns)
-        count = self.counts.setdefault(role, {"invalid": 0, "repeated": 0, "variances_replaced": 0})
-        count["invalid"] += prepared.invalid_ns.size
-        count["repeated"] += prepared.repeated
-        count["variances_replaced"] += prepared.variances_replaced
-        self.findings += [finding for finding in prepared.findings if finding not in self.findings]
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp of a measurement [ns]."""
+        return find_span_ns(self.measurements) or (0, 0)
+
+    @property
+    def offsets(self) -> dict[str, ClockOffset]:
+        """By role, the time offsets that are corrected."""
+        sensors = self.measurements.sensors()
+        return {role: offset for role, offset in self.clocks.offsets.items() if offset.noted and role in sensors}
+
+    @property
+    def driven_m(self) -> float:
+        """Distance that the first sensor of motion measures [m]: how much the section shows of its sensors."""
+        return float(np.diff(compute_driven_m(self.measurements, np.array(self.span_ns)))[0])
 
 
-def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
-    """Turn the motion streams into measurements, one set a clock epoch."""
-    tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
+def rank_sections(sections: Sequence[Section]) -> list[int]:
+    """Return the indices of sections from the longest drive to the shortest."""
+    return sorted(range(len(sections)), key=lambda place: -sections[place].driven_m)
+
+
+_PAUSE_NS = 3_600_000_000_000
+"""Pause of all sensors after which a section ends [ns]: a log may begin in 1970, and grids over an hour are small."""
+
+
+def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
+    """Return the measurements of each clock epoch, in order of epoch and time, without those that have no usable value."""
+    roles = (GNSS, IMU, WHEELS, VISUAL) if config.estimator == "ukf" else (GNSS, DOPPLER, IMU, WHEELS, VISUAL)
+    tables = {role: streams.tables[role] for role in roles if role in streams.tables}
     tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
     if GNSS in tables:
         datum = preparation.find_datum(*(to_floats(tables[GNSS], name) for name in ("lon_deg", "lat_deg", "alt_m")))
-    inputs = FusionInputs(datum)
+    sections = []
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["clock_epoch"]).to_pylist()}):
         parts = {role: select_rows(table, "clock_epoch", epoch) for role, table in tables.items()}
-        found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
-        gnss, odometry = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL)
-        if gnss is not None:
-            gnss = align_mounting(gnss, odometry, is_stated=streams.sensors[GNSS].placed_by != "assumed")
-            count = gnss.stamp_ns.size
-            gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
-            inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
-            inputs.findings += [_find_frozen(each, streams) for each in repeats]
-        if gnss is not None and odometry is not None:
-            gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
-            inputs.findings += _find_jitter(jitter_s)
-        inputs.measurements[epoch] = Measurements(
-            gnss=gnss,
-            doppler=found.get(DOPPLER),
-            imu=found.get(IMU),
-            wheels=found.get(WHEELS),
-            visual=found.get(VISUAL),
-            nonholonomic_std_mps=config.nonholonomic_std_mps,
-        )
-    return inputs
+        command = read_command(streams, epoch)
+        for part in _split_at_pauses(parts):
+            section = _prepare_section(part, streams, config, datum)
+            sections.append(replace(section, clock_epoch=epoch, command=command))
+    return sections
 
 
-def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
-    first_ns = _find_first_ns(streams)
-    span_s = (repeats.start_ns - first_ns) / 1e9, (repeats.end_ns - first_ns) / 1e9
-    subject, names = Subject("role", GNSS), {"quantity": "position"}
-    return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
+def _split_at_pauses(parts: Mapping[str, pa.Table]) -> Iterator[dict[str, pa.Table]]:
+    stamps = {role: to_integers(part, "stamp_ns") for role, part in parts.items()}
+    every = np.unique(np.concatenate([*stamps.values()]))
+    first = np.concatenate((every[:1], every[1:][np.diff(every) > _PAUSE_NS], every[-1:] + 1))
+    for start, end in pairwise(first.tolist()):
+        bounds = {role: np.searchsorted(stamp, (start, end)).tolist() for role, stamp in stamps.items()}
+        yield {role: parts[role].slice(first, last - first) for role, (first, last) in bounds.items() if last > first}
 
 
-def _find_jitter(jitter_s: NDArray[np.float64]) -> Iterator[Finding]:
-    jumpy = jitter_s > 0
-    if jumpy.any():
-        share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
-        yield make_finding("stamp-jitter", Subject("role", GNSS), jitter_fraction=share, jitter_s=median_s)
-
-
-def _find_first_ns(streams: Streams) -> int:
-    """Return the first stamp of any sensor [ns]."""
-    return min(
-        int(to_integers(table.slice(0, 1), "stamp_ns")[0]) for table in streams.tables.values() if table.num_rows
+def _prepare_section(
+    tables: Mapping[str, pa.Table], streams: Streams, config: FuseConfig, datum: tuple[float, float, float] | None
+) -> Section:
+    every = {role: _prepare(role, part, streams.sensors[role], config, datum) for role, part in tables.items()}
+    prepared: dict[str, Prepared] = {role: each for role, (_, each) in every.items()}
+    found = {role: sensor for role, (sensor, _) in every.items() if sensor is not None and sensor.stamp_ns.size}
+    findings = [finding for each in prepared.values() for finding in each.findings]
+    gnss, odometry, fixes = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL), Subject("role", GNSS)
+    if gnss is not None:
+        gnss = align_mounting(gnss, odometry, is_stated=streams.sensors[GNSS].placed_by != "assumed")
+        repeated = prepared[GNSS].repeated + gnss.stamp_ns.size
+        gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
+        prepared[GNSS] = replace(prepared[GNSS], repeated=repeated - gnss.stamp_ns.size)
+        for each in repeats:
+            span_s, frozen = find_span_s(each.start_ns, each.end_ns, streams), {"quantity": "position"}
+            findings.append(make_finding("frozen", fixes, span_s=span_s, names=frozen, message_count=each.messages))
+    if gnss is not None and odometry is not None:
+        gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
+        if (jumpy := jitter_s > 0).any():
+            share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
+            findings.append(make_finding("stamp-jitter", fixes, jitter_fraction=share, jitter_s=median_s))
+    return Section(
+        0,
+        Measurements(nonholonomic_std_mps=config.nonholonomic_std_mps).replace_sensors(found | {GNSS: gnss}),
+        datum_deg_m=datum,
+        prepared=prepared,
+        findings=tuple(dict.fromkeys(findings)),
     )
 
 
-def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
-    """Return when a sensor's first and last messages are [s]."""
-    table = streams.tables.get(name_pose(role, streams))
-    if table is None:
-        return None
-    stamp_ns = to_integers(table, "stamp_ns")
-    return (int(stamp_ns[0]) - _find_first_ns(streams)) / 1e9, (int(stamp_ns[-1]) - _find_first_ns(streams)) / 1e9
+def find_span_s(start_ns: int, end_ns: int, streams: Streams) -> tuple[float, float]:
+    """Return two stamps [ns] as times since the first stamp of any sensor [s]."""
+    stamps = [to_integers(table.slice(0, 1), "stamp_ns") for table in streams.tables.values()]
+    first_ns = min((int(each[0]) for each in stamps if each.size), default=start_ns)
+    return (start_ns - first_ns) / 1e9, (end_ns - first_ns) / 1e9
 
 
-def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:
+def _prepare(
+    role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, datum_deg_m: tuple[float, float, float] | None
+) -> tuple[Any, Prepared]:
     stamp_ns, columns = to_integers(table, "stamp_ns"), read_float_columns(table)
     place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
-    made: Any
     if role == GNSS:
-        if inputs.datum_deg_m is None:
-            inputs.note(role, Prepared(stamp_ns))
-            return None
-        made, prepared = preparation.prepare_positions(
+        if datum_deg_m is None:
+            return None, Prepared(stamp_ns)
+        return preparation.prepare_positions(
             stamp_ns,
             columns,
-            datum_deg_m=inputs.datum_deg_m,
+            datum_deg_m=datum_deg_m,
             lever_arm_m=sensor.xyz_m,
             lever_arm_std_m=UNSTATED_ARM_STD_M
             if sensor.placed_by == "assumed"
@@ -154,87 +189,122 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
             floor_std_m=config.gnss_std_floor_m,
             mounting_xyzw=sensor.quat_xyzw,
         )
-    elif role == DOPPLER:
-        made, prepared = preparation.prepare_ground_velocities(
-            stamp_ns, columns, default_std_mps=config.gnss_velocity_std_mps
-        )
-    elif role == IMU:
-        made, prepared = preparation.prepare_imu(
+    if role == DOPPLER:
+        return preparation.prepare_ground_velocities(stamp_ns, columns, default_std_mps=config.gnss_velocity_std_mps)
+    if role == IMU:
+        return preparation.prepare_imu(
             stamp_ns,
             columns,
             **place,
             gyro_std_radps=config.gyro_noise_radps,
             accelerometer_std_mps2=config.accelerometer_noise_mps2,
         )
-    else:
-        std = config.wheel_std_mps if role == WHEELS else config.visual_std_mps
-        made, prepared = preparation.prepare_body_velocities(
-            stamp_ns, columns, **place, default_std_mps=std, only_forward=role == WHEELS
-        )
-    inputs.note(role, prepared)
-    return made if made.stamp_ns.size else None
+    std = config.wheel_std_mps if role == WHEELS else config.visual_std_mps
+    return preparation.prepare_body_velocities(
+        stamp_ns, columns, **place, default_std_mps=std, only_forward=role == WHEELS
+    )
 
 
 _STATED = ("recipe", "tf_static", "same frame")
 
 
-def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> FusionInputs:
-    """Return the inputs without the sensors that cannot be right, judged over the longest clock epoch."""
-    if not inputs.measurements:
-        return inputs
-    epoch = find_longest_epoch(inputs)
+def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> list[Section]:
+    """Return the sections without the sensors that cannot be right.
+
+    Sections are judged from the longest drive to the shortest. Each one decides about its own sensors, after it has taken over the
+    constants of the robot that those before it have shown: a few metres show neither the sign of a yaw rate nor a scale.
+    """
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
-    exclusions, scales = check_sensors(
-        inputs.measurements[epoch],
-        command=read_command(streams, epoch),
-        stated=stated,
-        felt=_compute_median_specific_force(streams),
-    )
-    if scales:
-        measured = {number: rescale_odometries(m, scales) for number, m in inputs.measurements.items()}
-        inputs = replace(inputs, measurements=measured, scales=scales)
-    inputs = exclude_sensors(inputs, exclusions.values(), streams)
-    doubt = check_ground_velocity(inputs.measurements[epoch])
-    return inputs if doubt is None else exclude_sensors(inputs, [doubt], streams)
+    felt = _compute_median_specific_force(streams)
+    judged = list(sections)
+    constants: dict[str, SensorExclusion] = {}
+    scales: dict[str, float] = {}
+    for place in rank_sections(sections):
+        section = sections[place]
+        roles = section.measurements.sensors()
+        known = {role: scale for role, scale in scales.items() if role in roles}
+        section = replace(section, measurements=rescale_odometries(section.measurements, known))
+        section = exclude_sensors(section, [each for role, each in constants.items() if role in roles], streams)
+        found, own = check_sensors(section.measurements, command=section.command, stated=stated, felt=felt)
+        section = replace(section, measurements=rescale_odometries(section.measurements, own))
+        section = exclude_sensors(section, found.values(), streams)
+        doubt = check_ground_velocity(section.measurements)
+        found |= {} if doubt is None else {doubt.role: doubt}
+        section = exclude_sensors(section, [] if doubt is None else [doubt], streams)
+        known |= {role: known.get(role, 1.0) * scale for role, scale in own.items()}
+        judged[place] = replace(section, scales=known)
+        constants = {role: each for role, each in found.items() if each.code in CONSTANT_FAULTS} | constants
+        scales = known | scales
+    if not any(section.measurements.gnss for section in judged):
+        judged = [replace(section, datum_deg_m=None) for section in judged]
+    return _define_base_by_antenna(judged, streams)
 
 
-def exclude_sensors(inputs: FusionInputs, exclusions: Iterable[SensorExclusion], streams: Streams) -> FusionInputs:
-    """Return the inputs without some sensors."""
-    excluded = {**inputs.excluded, **{each.role: _find_exclusion(each, streams) for each in exclusions}}
+def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], streams: Streams) -> Section:
+    """Return a section without some sensors."""
+    excluded = {**section.excluded, **{each.role: _find_exclusion(each, section, streams) for each in exclusions}}
     # The receiver's velocity is of the antenna of the fixes.
     gone = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
-    kept = {number: measurements.replace_sensors(gone) for number, measurements in inputs.measurements.items()}
-    datum = None if GNSS in excluded else inputs.datum_deg_m
-    return _define_base_by_antenna(replace(inputs, datum_deg_m=datum, measurements=kept, excluded=excluded), streams)
+    section = replace(
+        section,
+        datum_deg_m=None if GNSS in excluded else section.datum_deg_m,
+        measurements=section.measurements.replace_sensors(gone),
+        excluded=excluded,
+    )
+    return _define_base_by_antenna([section], streams)[0] if section.is_base_free else section
 
 
-def _define_base_by_antenna(inputs: FusionInputs, streams: Streams) -> FusionInputs:
-    """Return the inputs with an antenna that nothing places exactly at base_link, if no other sensor of motion is fused."""
-    fixes = {number: m.gnss for number, m in inputs.measurements.items() if m.gnss and m.is_antenna_alone}
-    others = any(m.sensors() for number, m in inputs.measurements.items() if number not in fixes)
-    if others or not fixes or streams.sensors[GNSS].placed_by != "assumed":
-        return inputs
-    measurements = dict(inputs.measurements)
-    for number, gnss in fixes.items():
-        measurements[number] = replace(measurements[number], gnss=replace(gnss, lever_arm_std_m=NO_LEVER_ARM))
-    findings = dict.fromkeys((*inputs.findings, make_finding("track-of-antenna", Subject("role", GNSS))))
-    return replace(inputs, measurements=measurements, findings=[*findings])
+def _define_base_by_antenna(sections: Sequence[Section], streams: Streams) -> list[Section]:
+    """Return the sections with an antenna that nothing places exactly at base_link, if no other sensor of motion is fused in any."""
+    alone = [section.measurements.is_antenna_alone or not section.measurements.sensors() for section in sections]
+    based = []
+    for place, section in enumerate(sections):
+        gnss, findings = section.measurements.gnss, section.findings
+        if all(alone) and gnss is not None and streams.sensors[GNSS].placed_by == "assumed":
+            gnss = replace(gnss, lever_arm_std_m=NO_LEVER_ARM)
+            findings = tuple(dict.fromkeys((*findings, make_finding("track-of-antenna", Subject("role", GNSS)))))
+        measurements = section.measurements.replace_sensors({GNSS: gnss})
+        is_base_free = all(alone[:place] + alone[place + 1 :])
+        based.append(replace(section, measurements=measurements, findings=findings, is_base_free=is_base_free))
+    return based
 
 
-def find_longest_epoch(inputs: FusionInputs) -> int:
-    """Return the clock epoch with most measurements."""
-    counts = {
-        epoch: sum(sensor.stamp_ns.size for sensor in m.sensors().values()) for epoch, m in inputs.measurements.items()
-    }
-    return max(counts, key=lambda epoch: counts[epoch])
+def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
+    """Return the findings of all excluded sensors; the same of several sections as one, over the time of all."""
+    return merge_findings(finding for place in rank_sections(sections) for finding in sections[place].excluded.values())
 
 
-def read_command(streams: Streams, epoch: int) -> CommandedSpeed | None:
-    """Return the commanded speed of a clock epoch; None without."""
+_SAME_OFFSET_S = 0.1
+"""Time offsets of two sections that differ by less [s] are one: twice the offset that is noted."""
+
+
+def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the findings of several sections, those of one code and subject as one that has the first one's numbers.
+
+    Time offsets that differ stay apart, and have no remedy: the recipe states one.
+    """
+    merged: list[Finding] = []
+    for finding in findings:
+        for place, first in enumerate(merged):
+            off_s = finding.numbers.get("offset_s", 0.0) - first.numbers.get("offset_s", 0.0)
+            if (first.code, first.subject) == (finding.code, finding.subject) and abs(off_s) < _SAME_OFFSET_S:
+                spans = [each.span_s for each in (first, finding) if each.span_s is not None]
+                span_s = (min(start for start, _ in spans), max(end for _, end in spans)) if spans else None
+                merged[place] = replace(first, span_s=span_s)
+                break
+        else:
+            merged.append(finding)
+    offsets = Counter(finding.subject for finding in merged if "offset_s" in finding.numbers)
+    return [replace(each, remedies=()) if offsets[each.subject] > 1 else each for each in merged]
+
+
+def read_command(streams: Streams, epoch: int) -> Command | None:
+    """Return the commands of a clock epoch; None without."""
     if "command" not in streams.tables:
         return None
     table = select_rows(streams.tables["command"], "clock_epoch", epoch)
-    return CommandedSpeed(to_integers(table, "stamp_ns"), to_floats(table, "forward_velocity_mps"))
+    values = (to_floats(table, name) for name in ("forward_velocity_mps", "yaw_rate_radps"))
+    return Command(to_integers(table, "stamp_ns"), *values)
 
 
 def _compute_median_specific_force(streams: Streams) -> float:
@@ -245,7 +315,7 @@ def _compute_median_specific_force(streams: Streams) -> float:
     return float(np.median(np.linalg.norm(force, axis=1)))
 
 
-def _find_exclusion(exclusion: SensorExclusion, streams: Streams) -> Finding:
+def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Streams) -> Finding:
     """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
     sensor, name = streams.sensors[exclusion.role], exclusion.role
     if exclusion.units is not None:
@@ -257,10 +327,11 @@ def _find_exclusion(exclusion: SensorExclusion, streams: Streams) -> Finding:
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = exclusion.numbers
+    stamp_ns = section.measurements.sensors()[name].stamp_ns
     return make_finding(
         exclusion.code,
         Subject("role", name),
-        span_s=_find_used_s(exclusion.role, streams),
+        span_s=find_span_s(int(stamp_ns[0]), int(stamp_ns[-1]), streams),
         action="excluded",
         severity="note" if exclusion.role == DOPPLER else None,
         names={"topic": sensor.topic, "placed_by": sensor.placed_by, **exclusion.names},
@@ -283,40 +354,47 @@ def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64
 
 
 _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
-"""Where a frame that is nowhere on the earth is taken to lie while its positions are fused: east, north and up stay what they are."""
+"""Longitude, latitude [deg] and height [m] at which a frame without a place on the earth is fused; east, north and up stay the same."""
 
 
-def prepare_pose(streams: Streams) -> tuple[Streams, bool]:
-    """Return the streams with the pose as fixes of a GNSS could be, and whether it lies in a frame that is nowhere on the earth."""
-    pose = streams.tables.get(POSE)
-    if pose is None:
+def find_fixes_role(streams: Streams) -> str:
+    """Return the role of the positions of a run: that of a pose of another program, or of GNSS."""
+    return POSE if POSE in streams.tables else GNSS
+
+
+def use_pose_as_fixes(streams: Streams) -> tuple[Streams, bool]:
+    """Return the streams with a pose as fixes with an attitude, and whether its frame has no place on the earth.
+
+    Inside of fusion its role is that of fixes; `rename_role` names it in everything that leaves the stage.
+    """
+    if POSE not in streams.tables:
         return streams, False
-    local = bool(np.isnan(to_floats(pose, "lon_deg")).any())
-    if local:
+    pose, facts = streams.tables[POSE], streams.report.facts
+    is_local = bool(np.isnan(to_floats(pose, "lon_deg")).any())
+    if is_local:
         place = np.column_stack([to_floats(pose, f"{axis}_m") for axis in "xyz"])
         names = ("lon_deg", "lat_deg", "alt_m")
         geodetic = dict(zip(names, geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M), strict=True))
         pose = STREAMS[POSE].table(**{name: pose[name] for name in pose.column_names} | geodetic)
+    offsets_s = {GNSS if role == POSE else role: offset_s for role, offset_s in facts.time_offset_s.items()}
+    report = replace(streams.report, facts=replace(facts, time_offset_s=offsets_s))
     sensors = {**streams.sensors, GNSS: streams.sensors[POSE]}
-    return replace(streams, tables={**streams.tables, POSE: pose}, sensors=sensors), local
+    return replace(streams, tables={**streams.tables, POSE: pose}, sensors=sensors, report=report), is_local
 
 
 _Named = TypeVar("_Named")
 
 
-def name_pose(value: _Named, streams: Streams) -> _Named:
-    """Return a role, findings or facts in which the role of a pose stands for that of the fixes as which it is fused."""
-    if POSE not in streams.tables:
-        return value
+def rename_role(value: _Named, old: str, new: str) -> _Named:
+    """Return findings or facts in which one role stands for another."""
     named = cast("object", value)
     if isinstance(value, str):
-        named = POSE if value == GNSS else value
+        named = new if value == old else value
     elif isinstance(value, Mapping):
-        named = {name_pose(key, streams): name_pose(item, streams) for key, item in value.items()}
+        named = {rename_role(key, old, new): rename_role(item, old, new) for key, item in value.items()}
     elif isinstance(value, tuple | list):
-        named = type(value)(name_pose(item, streams) for item in value)
+        named = type(value)(rename_role(item, old, new) for item in value)
     elif is_dataclass(value) and not isinstance(value, type):
-        named = replace(
-            value, **{entry.name: name_pose(getattr(value, entry.name), streams) for entry in fields(value)}
-        )
+        items = {entry.name: getattr(value, entry.name) for entry in fields(value)}
+        named = replace(value, **rename_role(items, old, new))
     return cast("_Named", named)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import audit_trajectory
+from tcpipe.fusion.checks.sanity import Command
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import (
@@ -28,17 +29,15 @@ from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, multiply, rpy_from_matrix
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_inputs import Section
 from tcpipe.stages.message_arrays import make_rails
-from tcpipe.tables.arrays import select_rows
-from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import Disagreement, StretchFacts
 from tcpipe.tables.levels import REJECTIONS, Streams
 
 
 @dataclass(slots=True)
 class Fused:
-    """Trajectory, facts, columns and audit of every section; time without a track [s]; whether nothing shows the direction of one."""
+    """Trajectory, facts, columns and audit of every track section; time without a track [s]; whether the direction of one is assumed."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -49,32 +48,38 @@ class Fused:
     skipped_s: float = 0.0
     is_forward_assumed: bool = False
 
+    def append(self, other: Fused) -> None:
+        """Append the track of a later section."""
+        for name in (entry.name for entry in fields(self)):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
-def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
-    """Fuse each section separately, in order of epoch and stamp."""
+
+def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: Trajectory | None = None) -> Fused:
+    """Fuse each part of a section between pauses; a local frame goes on from the end of ``last``, the track before it."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
-    for section in cut_sections(inputs.measurements, inputs.cuts_ns):
-        output_ns = make_track_stamps(section, period_ns=period_ns, max_gap_ns=max_gap_ns)
-        if output_ns.size == 0 or (inputs.datum_deg_m is not None and section.measurements.gnss is None):
-            fused.skipped_s += (section.end_ns - section.start_ns) * 1e-9
+    for part in cut_sections({section.clock_epoch: section.measurements}, tuple(section.cuts)):
+        m, output_ns = part.measurements, make_track_stamps(part, period_ns=period_ns, max_gap_ns=max_gap_ns)
+        if output_ns.size == 0 or (section.datum_deg_m is not None and m.gnss is None):
+            fused.skipped_s += (part.end_ns - part.start_ns) * 1e-9
             continue
-        # 1. Where it starts; a local frame goes on from where the last section ended.
-        initial = _make_initial_state(section, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
+        # 1. Its initial state.
+        initial = _make_initial_state(part, last if section.datum_deg_m is None else None)
         # 2. Filter and smoother.
-        trajectory = _estimate(section, initial, output_ns, config)
-        if section.measurements.gnss is not None and section.measurements.is_antenna_alone:
-            commanded_mps = make_command_columns(streams, section.clock_epoch, output_ns)["commanded_velocity_mps"]
-            trajectory = assume_forward(trajectory, section.measurements.gnss.lever_arm_m, commanded_mps)
+        trajectory = _estimate(part, initial, output_ns, config)
+        if m.gnss is not None and m.is_antenna_alone:
+            commanded_mps = make_command_columns(section.command, output_ns)["commanded_velocity_mps"]
+            trajectory = assume_forward(trajectory, m.gnss.lever_arm_m, commanded_mps)
             fused.is_forward_assumed |= not np.isfinite(commanded_mps).any()
-        # 3. What came out is held against what went in.
-        trajectory, audit = audit_trajectory(trajectory, trajectory.corrected or section.measurements)
+        # 3. The audit compares the track with its sensors.
+        trajectory, audit = audit_trajectory(trajectory, trajectory.corrected or m)
         fused.disagreements += (replace(each, clock_epoch=section.clock_epoch) for each in audit.disagreements)
         fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
-        fused.facts.append(make_section_facts(section, initial, trajectory))
-        # 4. What else is known at the track's stamps.
-        fused.columns.append(_make_columns(section, trajectory, inputs, streams, config))
+        fused.facts.append(make_section_facts(part, initial, trajectory))
+        # 4. Other quantities at the track's stamps.
+        fused.columns.append(_make_columns(part, trajectory, section, streams, config))
+        last = trajectory
     return fused
 
 
@@ -131,15 +136,15 @@ def assume_forward(
 
 
 def _make_columns(
-    section: TrackSection, trajectory: Trajectory, inputs: FusionInputs, streams: Streams, config: FuseConfig
+    part: TrackSection, trajectory: Trajectory, section: Section, streams: Streams, config: FuseConfig
 ) -> dict[str, NDArray[Any]]:
     stamp_ns, gap_ns, power_gap_ns = trajectory.stamp_ns, int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
     return {
         "stamp_ns": stamp_ns,
         "clock_epoch": np.full(stamp_ns.size, section.clock_epoch, np.int16),
-        **make_pose_columns(trajectory, inputs.datum_deg_m),
-        "wheel_velocity_mps": make_wheel_column(section.measurements.wheels, stamp_ns, max_gap_ns=gap_ns),
-        **make_command_columns(streams, section.clock_epoch, stamp_ns),
+        **make_pose_columns(trajectory, section.datum_deg_m),
+        "wheel_velocity_mps": make_wheel_column(part.measurements.wheels, stamp_ns, max_gap_ns=gap_ns),
+        **make_command_columns(section.command, stamp_ns),
         **make_power_columns(streams, section.clock_epoch, stamp_ns, max_gap_ns=power_gap_ns),
     }
 
@@ -182,15 +187,14 @@ def make_wheel_column(
     return np.where(is_covered(wheels.stamp_ns, at_ns, at_ns, least_ns=max_gap_ns), between, np.nan)
 
 
-def make_command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:
+def make_command_columns(command: Command | None, at_ns: NDArray[np.int64]) -> Arrays:
     """Return the last command at each stamp; NaN before the first, while the topic is silent, and without commands."""
-    table = streams.tables.get("command")
-    names = {"commanded_velocity_mps": "forward_velocity_mps", "commanded_yaw_rate_radps": "yaw_rate_radps"}
-    if table is None:
-        return {name: np.full(at_ns.size, np.nan) for name in names}
-    table = select_rows(table, "clock_epoch", epoch)
-    stamp_ns = to_integers(table, "stamp_ns")
-    return {name: hold_last(stamp_ns, to_floats(table, source), at_ns) for name, source in names.items()}
+    none = np.empty(0)
+    command = command or Command(np.empty(0, np.int64), none, none)
+    return {
+        "commanded_velocity_mps": hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns),
+        "commanded_yaw_rate_radps": hold_last(command.stamp_ns, command.yaw_rate_radps, at_ns),
+    }
 
 
 def make_power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *, max_gap_ns: int) -> Arrays:
@@ -199,10 +203,10 @@ def make_power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *
     return dict(zip(("voltage_volt", "current_amp", "power_watt"), values, strict=True))
 
 
-def make_rejections_table(inputs: FusionInputs, found: list[Trajectory], fixes: str = GNSS) -> pa.Table:
-    """Return every refused measurement in order of time: by the gate, and those without a usable value; ``fixes`` is a role's name."""
+def make_rejections_table(sections: Sequence[Section], found: Sequence[Trajectory], fixes: str = GNSS) -> pa.Table:
+    """Return every rejected measurement in order of time: by the gate, or without a usable value; ``fixes`` is the role of fixes."""
     parts = [trajectory.rejections for trajectory in found]
-    invalid = [(role, np.concatenate(stamps)) for role, stamps in sorted(inputs.invalid_ns.items())]
+    invalid = [(role, each.invalid_ns) for section in sections for role, each in sorted(section.prepared.items())]
     size = sum(stamps.size for _, stamps in invalid)
     unknown = np.full(size, np.nan)
     columns = {

@@ -200,10 +200,11 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     contains the delay of power.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
-    clocks = info.report.facts.clock_offsets
-    off = clocks is not None and any(offset.noted and not offset.blamed for offset in clocks.offsets.values())
+    offsets = (offset for clocks in info.report.facts.clock_offsets for offset in clocks.offsets.values())
+    off, checks = any(offset.noted and not offset.blamed for offset in offsets), info.report.facts.sensor_checks
+    far = checks is not None and "clocks-differ" in checks.excluded.values()
     # A step of all clocks leaves them together.
-    return recorder or off or any(step.topics for step in streams.report.facts.clock_steps)
+    return recorder or off or far or any(step.topics for step in streams.report.facts.clock_steps)
 
 
 _POWER, _WHEELS = Subject("role", "power"), Subject("role", "wheel_odometry")

@@ -516,7 +516,8 @@ class StageFacts:
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
     audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
-    clock_offsets: ClockFacts | None = field(default=None, metadata=LEFT_OUT)
+    clock_offsets: tuple[ClockFacts, ...] = field(default=(), metadata=LEFT_OUT)
+    """Of each section."""
     mask: MaskFacts | None = field(default=None, metadata=LEFT_OUT)
     segment: SegmentFacts | None = field(default=None, metadata=LEFT_OUT)
     label: LabelFacts | None = field(default=None, metadata=LEFT_OUT)

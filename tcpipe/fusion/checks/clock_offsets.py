@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.checks.coarse_lag import NEAR_S, find_coarse_offsets
 from tcpipe.fusion.checks.lags import (
     FIXES_S,
     GRID_S,
@@ -55,6 +56,7 @@ _MAX_STD_S = 0.02
 _CLEARLY = 10.0
 _MIN_EXPLAINED = 0.25
 _LEAST_STD_S = 1e-3
+_COARSE_STD_S = 0.1
 _WINDOW_NS, _MARGIN_NS = 600_000_000_000, 5_000_000_000
 _FEWEST_WINDOWS = 3  # that show a drift
 _DRIFT = 1e-3  # of a clock, 1σ
@@ -92,6 +94,34 @@ def find_middle_ns(m: Measurements) -> tuple[int, float]:
     """Return the middle of a set's measurements [ns], and how long they last [s]; 0 without any."""
     first_ns, last_ns = find_span_ns(m) or (0, 0)
     return (first_ns + last_ns) // 2, (last_ns - first_ns) * 1e-9
+
+
+def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:
+    """Return the offsets of sensors from the largest group that shares a clock, beyond the fine search and within it.
+
+    Those beyond it are noted. Nothing is returned if there are none, unless ``always``; sensors whose offset is unknown are missing.
+    """
+    late_s = find_coarse_offsets(m)
+    coarse = {
+        role: ClockOffset(each, _COARSE_STD_S, noted=abs(each) > NEAR_S, blamed=False) for role, each in late_s.items()
+    }
+    if not always and not any(offset.noted for offset in coarse.values()):
+        return {}
+    found = find_clock_offsets(shift_sensors(m, coarse, 0))
+    fine = {found.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(found.offsets)
+    zero = next((fine[role] for role, each in late_s.items() if each == 0.0 and role in fine), None)
+    if zero is not None:
+        for role in coarse.keys() & fine.keys():
+            offset_s = late_s[role] + fine[role].offset_s - zero.offset_s
+            coarse[role] = replace(coarse[role], offset_s=offset_s, std_s=fine[role].std_s + zero.std_s)
+    return coarse
+
+
+def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns: int) -> Measurements:
+    """Return measurements whose stamps are without the offsets of their sensors, and the drifts about ``middle_ns``."""
+    off = {role: sensor for role, sensor in m.sensors().items() if role in offsets}
+    stamps = {role: shift_stamps(sensor.stamp_ns, offsets[role], middle_ns) for role, sensor in off.items()}
+    return m.replace_sensors({role: replace(sensor, stamp_ns=stamps[role]) for role, sensor in off.items()})
 
 
 def shift_stamps(stamp_ns: NDArray[np.int64], offset: ClockOffset, middle_ns: int) -> NDArray[np.int64]:

@@ -1,11 +1,9 @@
-"""How late one signal's stamps are against others', by least squares over the lag.
+"""The time offset of one signal against others, by least squares over the lag; and signals on the grid that both need.
 
-Both sides stand on one grid, smoothed alike, so that smoothing moves neither. For every lag the target is fitted by the regressors
-(linear, with a constant); the best lag is where that explains most of the target's variance, refined by a parabola. With one regressor
-this is the peak of the normalised cross-correlation. Its standard deviation is the larger of two. That of least squares: the noise that is
-left over the curvature of the peak, so that a flat peak tells little. And the delete-a-group jackknife's over contiguous groups of time
-(Miller 1974, Biometrika 61), which needs no model of the residuals. Where fewer than four groups hold anything, or another peak is
-nearly as high, nothing is said.
+At every lag the target is fitted by the regressors and a constant; the lag that explains most of the target's variance is the offset,
+refined by a parabola. With one regressor this is the peak of the normalised cross-correlation. Its standard deviation is the larger of two:
+that of least squares, and that of the delete-a-group jackknife over contiguous groups of time (Miller 1974, Biometrika 61), which needs no
+model of the residuals.
 """
 
 from __future__ import annotations
@@ -59,18 +57,6 @@ def make_grid_ns(first_ns: int, last_ns: int) -> NDArray[np.int64]:
     return np.arange(first_ns, last_ns + 1, GRID_NS, dtype=np.int64)
 
 
-def average_on_grid(
-    stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[np.int64], *, longest_gap_ns: int
-) -> Floats:
-    """Return the means of the piecewise-linear signal (N, k) over each grid cell, shape (M, k); NaN in gaps and outside."""
-    zero = int(at_ns[0])
-    edges_s: Floats = (np.arange(at_ns.size + 1, dtype=np.float64) - 0.5) * GRID_S
-    means = np.diff(integrate_signal(compute_seconds(stamp_ns, zero), values, edges_s), axis=0) / GRID_S
-    half = GRID_NS // 2
-    means[is_in_gap(stamp_ns, at_ns - half, at_ns + half, longest_ns=longest_gap_ns)] = np.nan
-    return means
-
-
 def compute_moving_mean(values: Floats, width_s: float) -> Floats:
     """Return the centred running mean over ``width_s`` of (M, k) values, NaN where the window holds one or leaves the grid."""
     half = round(width_s / GRID_S / 2)
@@ -98,7 +84,9 @@ def find_lag(target: Floats, regressors: Floats) -> Lag | None:
 
 def estimate_lag(windows: Sequence[Floats]) -> Lag | None:
     """Return the lag of several windows of time together; ``windows`` are of `compute_lag_products`, of the same signals."""
-    products = _merge_products(np.concatenate(windows, axis=1))
+    products = np.concatenate(windows, axis=1)
+    together = -(-products.shape[1] // (2 * _GROUPS))  # fewer, longer groups
+    products = np.add.reduceat(products, np.arange(0, products.shape[1], together), axis=1)
     products = products[:, (products[:, :, -2, -2] > 0).all(axis=0)]
     groups = products.shape[1]
     if groups < _FEWEST_EVENTS:
@@ -131,14 +119,6 @@ def _has_rival(explained: Floats, best: int, independent: float) -> bool:
     others = explained[peaks[np.abs(peaks - best) > 1]]
     worse = independent * np.log(np.maximum(1.0 - others, _TINY) / max(1.0 - explained[best], _TINY))
     return bool((worse < _CLEARLY).any())
-
-
-def _merge_products(products: Floats) -> Floats:
-    """Return the products of fewer, longer groups of time, at most twice `_GROUPS`."""
-    together = -(-products.shape[1] // (2 * _GROUPS))
-    first = np.arange(0, products.shape[1], together)
-    merged: Floats = np.add.reduceat(products, first, axis=1)
-    return merged
 
 
 def compute_lag_products(target: Floats, regressors: Floats) -> Floats | None:
@@ -198,10 +178,7 @@ def _find_peak(explained: Floats) -> float:
 
 Ints = NDArray[np.int64]
 
-_SECOND_NS = 1_000_000_000
-_LONGEST_NS = 1800 * _SECOND_NS
-_STEP_NS = 300 * _SECOND_NS
-_PLACES_NS = 10 * _SECOND_NS
+_LONGEST_NS, _STEP_NS, _PLACES_NS = 1800 * 10**9, 300 * 10**9, 10 * 10**9
 
 
 def iterate_windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
@@ -230,12 +207,12 @@ def find_liveliest_window_ns(m: Measurements) -> Ints | None:
         return None
     first_ns, last_ns = span
     begin = np.arange(first_ns, max(last_ns - _LONGEST_NS, first_ns) + 1, _STEP_NS, dtype=np.int64)
-    way_m = _compute_driven_m(m, np.concatenate((begin, begin + _LONGEST_NS)))
-    best = int(begin[np.argmax(way_m[begin.size :] - way_m[: begin.size])])
+    driven_m = np.diff(compute_driven_m(m, np.stack((begin, begin + _LONGEST_NS))), axis=0)
+    best = int(begin[np.argmax(driven_m)])
     return make_grid_ns(best, min(last_ns, best + _LONGEST_NS))
 
 
-def _compute_driven_m(m: Measurements, at_ns: Ints) -> NDArray[np.float64]:
+def compute_driven_m(m: Measurements, at_ns: Ints) -> Floats:
     """Return the distance driven before each time [m], by the first sensor that measures it."""
     source = m.first_odometry
     if source is not None:
@@ -246,9 +223,9 @@ def _compute_driven_m(m: Measurements, at_ns: Ints) -> NDArray[np.float64]:
         places = [np.interp(stamp_ns, m.gnss.stamp_ns, axis) for axis in m.gnss.position_enu_m[:, :2].T]
         steps_m = np.hypot(*np.diff(places, axis=1))
     else:
-        return np.zeros(at_ns.size)
-    way_m: NDArray[np.float64] = np.interp(at_ns, stamp_ns, np.concatenate(([0.0], np.cumsum(steps_m))))
-    return way_m
+        return np.zeros(at_ns.shape)
+    driven_m: Floats = np.interp(at_ns, stamp_ns, np.concatenate(([0.0], np.cumsum(steps_m))))
+    return driven_m
 
 
 FIXES_S = 0.5
@@ -261,8 +238,15 @@ _COURSE_MPS = 0.3
 
 
 def resample_signal(stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[np.int64]) -> Floats:
-    """Return a signal (N, k) on the grid, shape (M, k); NaN in gaps of half a second or three periods."""
-    return average_on_grid(stamp_ns, values, at_ns, longest_gap_ns=find_longest_step_ns(stamp_ns, _MAX_GAP_NS))
+    """Return the means of the piecewise-linear signal (N, k) over each grid cell, shape (M, k); NaN outside and in gaps.
+
+    A gap is longer than half a second and than three periods.
+    """
+    edges_s: Floats = (np.arange(at_ns.size + 1, dtype=np.float64) - 0.5) * GRID_S
+    means = np.diff(integrate_signal(compute_seconds(stamp_ns, int(at_ns[0])), values, edges_s), axis=0) / GRID_S
+    longest_ns, half = find_longest_step_ns(stamp_ns, _MAX_GAP_NS), GRID_NS // 2
+    means[is_in_gap(stamp_ns, at_ns - half, at_ns + half, longest_ns=longest_ns)] = np.nan
+    return means
 
 
 def resample_twist(source: BodyVelocities, at_ns: NDArray[np.int64]) -> Floats:
@@ -270,7 +254,10 @@ def resample_twist(source: BodyVelocities, at_ns: NDArray[np.int64]) -> Floats:
     forward, yaw_rate = source.velocity_mps[:, 0], source.yaw_rate_radps
     if not np.isfinite(yaw_rate).any():
         yaw_rate = np.zeros_like(forward)
-    known = np.isfinite(forward + yaw_rate) & ~_find_strays(forward) & ~_find_strays(yaw_rate)
+    known = np.isfinite(forward + yaw_rate)
+    for values in (forward, yaw_rate):
+        off = np.abs(values - compute_median_of_five(values))
+        known &= ~(off > _STRAY * max(float(np.nanpercentile(off, 90)), 1e-9))
     if known.sum() < 2:
         return np.full((at_ns.size, 2), np.nan)
     return resample_signal(source.stamp_ns[known], np.column_stack((forward, yaw_rate))[known], at_ns)
@@ -281,7 +268,7 @@ def resample_fixes(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.comp
     place = gnss.position_enu_m[:, :2]
     wild = np.zeros(place.shape[0], np.bool_)
     for axis in place.T:
-        off = _compute_neighbour_distance(axis)
+        off = np.abs(axis - compute_median_of_five(axis))
         wild |= off > _STRAY_M + _STRAY * float(np.median(off))
     if (~wild).sum() < 2:
         return np.full(at_ns.size, np.nan + 0j)
@@ -312,15 +299,3 @@ def compute_course_rate(velocity_mps: NDArray[np.complex128]) -> Floats:
     turned = np.angle(velocity_mps[2 * half :] * np.conj(velocity_mps[: -2 * half]))
     rate[half:-half] = np.where(quick[2 * half :] & quick[: -2 * half], turned / (2 * half * GRID_S), np.nan)
     return rate
-
-
-def _find_strays(values: Floats) -> NDArray[np.bool_]:
-    """Return which samples lie far off the median of their neighbours."""
-    off = _compute_neighbour_distance(values)
-    stray: NDArray[np.bool_] = off > _STRAY * max(float(np.nanpercentile(off, 90)), 1e-9)
-    return stray
-
-
-def _compute_neighbour_distance(values: Floats) -> Floats:
-    """Return each sample's distance from the median of the five around it; 0 for fewer than five samples."""
-    return np.abs(values - compute_median_of_five(values))

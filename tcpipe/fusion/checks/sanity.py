@@ -42,9 +42,9 @@ from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
     IMU,
+    PAUSE_NS,
     VISUAL,
     WHEELS,
-    BodyVelocities,
     InertialMeasurements,
     Measurements,
     Positions,
@@ -83,20 +83,26 @@ class SensorExclusion:
     is_suspect_excludable: bool = False
 
 
+CONSTANT_FAULTS = frozenset({
+    "drives-backwards", "imu-rotated", "imu-sign", "imu-units", "path-mirrored", "unit-suspected", "velocity-frame", "yaw-rate-sign",
+})  # fmt: skip
+"""Codes of exclusions for units and mounting, which no restart of a clock changes."""
+
 Exclusions = dict[str, SensorExclusion]
 """By role, in order."""
 
 
 @dataclass(frozen=True, slots=True)
-class CommandedSpeed:
-    """Commanded forward velocity: stamps [ns] and values [m/s], in order."""
+class Command:
+    """Commands of a clock epoch: stamps [ns], forward velocity [m/s] and yaw rate [rad/s], in order, shape (N,) each."""
 
     stamp_ns: NDArray[np.int64]
     forward_velocity_mps: Floats
+    yaw_rate_radps: Floats
 
 
 def check_sensors(
-    m: Measurements, *, command: CommandedSpeed | None, stated: Mapping[str, bool], felt: float
+    m: Measurements, *, command: Command | None, stated: Mapping[str, bool], felt: float
 ) -> tuple[Exclusions, dict[str, float]]:
     """Return which sensors of a clock epoch are not to be fused, and the scale of an odometry that is far from 1.
 
@@ -123,7 +129,9 @@ def check_sensors(
     looks: dict[str, float] = {}
     if m.imu is not None:
         drives = any(compare_paths(path, path, _SHORT_S, noise_m2) for path in paths.values())
-        found |= _find_frozen_imu(m.imu) if drives else {}
+        values = {"acceleration": m.imu.specific_force_mps2, "angular_velocity": m.imu.angular_velocity_radps}
+        if drives and (frozen := [quantity for quantity, each in values.items() if _is_constant(each)]):
+            found[IMU] = _make_frozen_exclusion(IMU, frozen[0], len(m.imu.stamp_ns))
         axes, looks = _check_imu(found, m.imu, m.gnss, twists, at_ns, felt=felt, is_stated=stated.get(IMU, False))
     # 2. Paths show what is frozen, in another unit, or of another drive; yaw rates are the gyroscope's where it confirms them.
     if m.imu is not None and IMU not in found:
@@ -280,7 +288,7 @@ def _check_distances(
                 continue
         for role, other, lead in _find_outvoted([names], votes.__getitem__):
             times = ratio if role == names[1] else 1 / ratio
-            _exclude(found, _make_distance_exclusion(role, other, times, is_tie=lead == 0))
+            found.setdefault(role, _make_distance_exclusion(role, other, times, is_tie=lead == 0))
     return scales
 
 
@@ -365,21 +373,11 @@ _SAME_WAY = 0.5
 
 
 def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
-    """Return the rate of an IMU whose samples are mostly too far apart to show the motion between them."""
+    """Return the median rate of an IMU whose samples are mostly too far apart to show the motion between them; pauses do not count."""
     step_s = np.diff(stamp_ns) * 1e-9
-    span_s = float(step_s.sum())
-    is_slow = span_s == 0.0 or float(step_s[step_s < _SLOWEST_S].sum()) < 0.5 * span_s
-    return step_s.size / max(span_s, 1.0) if is_slow else None
-
-
-def _find_frozen_imu(imu: InertialMeasurements) -> Exclusions:
-    for quantity, values in (
-        ("acceleration", imu.specific_force_mps2),
-        ("angular_velocity", imu.angular_velocity_radps),
-    ):
-        if _is_constant(values):
-            return {IMU: _make_frozen_exclusion(IMU, quantity, len(values))}
-    return {}
+    known_s = step_s[step_s <= PAUSE_NS * 1e-9]
+    is_slow = step_s.size > 0 and float(known_s[known_s < _SLOWEST_S].sum()) <= 0.5 * float(known_s.sum())
+    return 1.0 / float(np.median(step_s)) if is_slow else None
 
 
 def _check_imu(
@@ -426,7 +424,7 @@ def _check_imu(
     signs = {role: bool(axis.axis[2] > 0) for role, axis in axes.items() if abs(axis.axis[2]) > _SAME_WAY}
     _check_yaw_signs(found, signs, is_stated=is_stated)
     if looks and all(_ASIDE_RAD < abs(each) <= _BACKWARDS_RAD for each in looks.values()):
-        _exclude(found, _make_yaw_exclusion(looks, turned_by))
+        found.setdefault(IMU, _make_yaw_exclusion(looks, turned_by))
     return axes, {} if IMU in found else looks
 
 
@@ -455,10 +453,10 @@ def _check_yaw_signs(found: Exclusions, signs: Mapping[str, bool], *, is_stated:
     against = [role for role, sign in signs.items() if not sign and role != GNSS]
     for role, _, _ in _find_outvoted([(role, IMU) for role in against], count_votes):
         if role == IMU:
-            _exclude(found, SensorExclusion(IMU, "imu-sign", {"reference": ", ".join(against)}))
+            found.setdefault(IMU, SensorExclusion(IMU, "imu-sign", {"reference": ", ".join(against)}))
         else:
             names = {"reference": ", ".join((IMU, *(other for other, sign in signs.items() if sign)))}
-            _exclude(found, SensorExclusion(role, "yaw-rate-sign", names, turned_by=YAW))
+            found.setdefault(role, SensorExclusion(role, "yaw-rate-sign", names, turned_by=YAW))
 
 
 def _make_yaw_exclusion(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
@@ -501,10 +499,8 @@ def _check_directions(
     turned = set()
     for role, other, lead in _find_outvoted([pair for pair, is_same in same.items() if not is_same], count_votes):
         if role == IMU:
-            _exclude(
-                found,
-                _make_yaw_exclusion({each: yaw for each, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}, FORWARD),
-            )
+            backwards = {each: yaw for each, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}
+            found.setdefault(IMU, _make_yaw_exclusion(backwards, FORWARD))
         elif role != COMMAND and role not in turned:
             turned.add(role)
             names = {"reference": other} | ({"suspect": other} if other in forward and lead < 1.0 else {})
@@ -573,12 +569,13 @@ _DRIVES_MPS = 0.3  # motors round slower commands
 _FASTER = 1.03  # of a command: no controller overshoots more
 
 
-def compute_command_ratio(wheels: BodyVelocities, command: CommandedSpeed) -> float | None:
-    """Return the ratio of the wheels' speed to the commanded speed, where that is surely too fast; else None.
+def compute_command_ratio(m: Measurements, command: Command | None) -> float | None:
+    """Return the ratio of the wheels' speed to the command where it is surely too high, and no other sensor shows the scale; else None.
 
     Only times count in which a command has been constant for three seconds: a robot that brakes is faster than its command.
     """
-    if command.stamp_ns.size == 0:
+    wheels = m.wheels
+    if wheels is None or m.gnss is not None or m.visual is not None or command is None or command.stamp_ns.size == 0:
         return None
     commanded_mps = hold_last(command.stamp_ns, command.forward_velocity_mps, wheels.stamp_ns)
     # A difference to an unknown command is NaN, which is a change.
@@ -590,8 +587,3 @@ def compute_command_ratio(wheels: BodyVelocities, command: CommandedSpeed) -> fl
         return None
     ratio = wheels.velocity_mps[rows, 0] / commanded_mps[rows]
     return float(np.median(ratio)) if np.quantile(ratio, 0.25) > _FASTER else None
-
-
-def _exclude(found: Exclusions, exclusion: SensorExclusion) -> None:
-    """Exclude a sensor that is not excluded yet."""
-    found.setdefault(exclusion.role, exclusion)

@@ -122,7 +122,7 @@ def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(page):
         refused = facts.fuse.rejected[role]
         assert (f"<td>{refused} gate</td>" in row) == (refused > 0)
     clocks = html.split("<h3>Clocks</h3>")[1].split("</section>")[0]
-    assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts.clock_offsets.offsets)
+    assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts.clock_offsets[0].offsets)
     assert f"Noise floor of E {100 * facts.label.energy_budget.total:.1f} %" in html
     assert "Kept and excluded distances add up to the odometer" in html
 

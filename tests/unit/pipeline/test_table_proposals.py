@@ -307,3 +307,26 @@ def test_what_ingest_would_reject_is_a_comment(tmp_path):
     write(tmp_path / "power.csv", time=SECONDS + UTC_S, **{"voltage__[%]": 24.0 + SECONDS, "current": 2.0 + SECONDS})
     values, _, _ = proposed(tmp_path)
     open_single_log(tmp_path, tables=parse_recipe(values, where="as written").tables)
+
+
+@pytest.mark.parametrize("robot_s", [UTC_S, 100.0])
+def test_tables_on_another_clock_are_aligned_by_speed_and_turns(tmp_path, robot_s):
+    """The fixes have GPS time, 18 s ahead; the computer's other tables have UTC or count from its start."""
+    t = np.arange(0.0, 240.0, 0.1)
+    rng = np.random.default_rng(4)
+    hold = np.repeat(rng.uniform(0.0, 1.3, 60), 40), np.repeat(rng.normal(0.0, 0.3, 80), 30)
+    speed, turn = (np.convolve(each, np.ones(15) / 15, "same") for each in hold)
+    place = np.cumsum(speed * np.exp(1j * np.cumsum(turn) * 0.1)) * 0.1
+    fixes = {
+        "latitude": 47.0 + place.imag / 111_195.0,
+        "longitude": 15.0 + place.real / (111_195.0 * np.cos(np.radians(47.0))),
+    }
+    tables = {"gps": {"time": t + UTC_S + 18.0, **fixes, "altitude": 400.0 + 0 * t}}
+    tables["odom"] = {"time": t + robot_s, "linear_x": speed, "angular_z": turn}
+    tables["power"] = {"time": t + robot_s, "voltage": 24.0 + 0.01 * speed, "current": 1.0 + 4.0 * speed}
+    for name, columns in tables.items():
+        pl.DataFrame(columns).write_csv(tmp_path / f"{name}.csv")
+    values, _, _ = proposed(tmp_path)
+    offset_s = {name: of.get("offset_s", 0.0) for name, of in values["tables"].items()}
+    assert offset_s["wheel_odometry"] + robot_s - (offset_s["gnss"] + UTC_S + 18.0) == pytest.approx(0.0, abs=0.05)
+    assert offset_s["power"] == offset_s["wheel_odometry"]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from suggested_recipes import proposed
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.fuse import correct_clocks, find_clock_jumps
-from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
-from tcpipe.tables.findings import Subject
+from tcpipe.stages.fuse import correct_clocks, find_clock_jumps, find_clocks, find_offsets, fuse_run
+from tcpipe.stages.fuse_inputs import Section, prepare_sections
+from tcpipe.stages.label_motion import is_clock_doubtful
+from tcpipe.tables.findings import Subject, select_findings, sort_findings
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20}
 WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020}
@@ -35,8 +37,10 @@ def drive_log(tmp_path_factory):
 
 
 def doctor(log, config=None):
+    """Return clock facts and findings of a drive."""
     streams = streams_of(log, config)
-    return correct_clocks(streams, prepare_inputs(streams, FuseConfig()))[1]
+    (section,) = find_clocks(prepare_sections(streams, FuseConfig()))
+    return SimpleNamespace(facts=section.clocks, findings=tuple(find_offsets([section], streams)))
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -75,16 +79,31 @@ def test_the_remedy_corrects_it(drive_log):
 
 
 def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(drive_log):
-    streams = streams_of(drive_log(1, 42, "wheel_odometry"))
-    before = prepare_inputs(streams, FuseConfig())
-    after, _ = correct_clocks(streams, before)
-    moved_s = (after.measurements[0].wheels.stamp_ns - before.measurements[0].wheels.stamp_ns) * 1e-9
+    before = find_clocks(prepare_sections(streams_of(drive_log(1, 42, "wheel_odometry")), FuseConfig()))
+    after = correct_clocks(before)
+    measured = [section.measurements for (section,) in (before, after)]
+    moved_s = (measured[1].wheels.stamp_ns - measured[0].wheels.stamp_ns) * 1e-9
     assert moved_s == pytest.approx(-LATE_S["wheel_odometry"], abs=WITHIN_S["wheel_odometry"])
-    assert after.measurements[0].imu is before.measurements[0].imu
-    assert correct_clocks(streams, after)[1].findings == ()
-    as_it_is, report = correct_clocks(streams, before, {"wheel_odometry"})
-    assert as_it_is.measurements[0].wheels is before.measurements[0].wheels
-    assert report.findings == ()
+    assert measured[1].imu is measured[0].imu
+    assert not any(offset.noted for offset in find_clocks(after)[0].clocks.offsets.values())
+
+
+def test_a_sensor_on_another_clock_is_excluded_until_the_recipe_states_the_offset(drive_log):
+    """The remedy includes what the recipe adds already: here all of the offset."""
+    log = drive_log(1, 31)
+    good, off = streams_of(log), streams_of(log, ReadConfig(time_offset_s={"gnss": 18.0}))
+    before, after = (fuse_run(streams, FuseConfig(), run_id="run").info for streams in (good, off))
+    findings = after.report.findings
+    (finding,) = select_findings(findings, "clocks-differ")
+    assert (finding.subject.name, finding.severity, finding.action) == ("gnss", "error", "excluded")
+    assert finding.numbers["offset_s"] == pytest.approx(18.0, abs=0.03)
+    assert proposed(finding)["read"]["time_offset_s"] == {"gnss": pytest.approx(0.0, abs=0.03)}
+    assert sort_findings(findings)[0] is finding
+    more = {each.code for each in findings} - {each.code for each in before.report.findings}
+    assert more <= {"clocks-differ", "local-frame", "odometry-scale-unobservable"}
+    assert "gnss" not in after.report.facts.fuse.sensors
+    assert is_clock_doubtful(off, after)
+    assert not is_clock_doubtful(good, before)
 
 
 def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
@@ -106,14 +125,14 @@ def driving(gap_s, *, moves):
     place = np.column_stack((stamp_s if moves else true_s, np.zeros((200, 2))))
     stamp_ns, one = np.round(stamp_s * 1e9).astype(np.int64), np.ones((200, 3))
     wheels = BodyVelocities(stamp_ns, one, one, one[:, 0], one[:, 0])
-    return FusionInputs(None, {0: Measurements(gnss=Positions(stamp_ns, place, one), wheels=wheels)})
+    return Section(0, Measurements(gnss=Positions(stamp_ns, place, one), wheels=wheels))
 
 
 def test_a_gap_of_all_sensors_in_which_the_robot_did_not_drive_is_a_step_of_their_clock():
-    ((after_ns, finding),) = find_clock_jumps(driving(3.0, moves=False))
+    ((after_ns, finding),) = find_clock_jumps([driving(3.0, moves=False)])
     assert (after_ns, finding.code) == (13 * 10**9, "clock-step")
     assert (finding.numbers["at_s"], finding.numbers["step_s"]) == pytest.approx((13.0, 3.1))
-    assert not list(find_clock_jumps(driving(3.0, moves=True)))
-    assert not list(find_clock_jumps(driving(0.2, moves=False)))
-    alone = replace(driving(3.0, moves=False).measurements[0], gnss=None)
-    assert not list(find_clock_jumps(FusionInputs(None, {0: alone})))
+    assert not list(find_clock_jumps([driving(3.0, moves=True)]))
+    assert not list(find_clock_jumps([driving(0.2, moves=False)]))
+    alone = replace(driving(3.0, moves=False).measurements, gnss=None)
+    assert not list(find_clock_jumps([Section(0, alone)]))

@@ -14,9 +14,10 @@ from tcpipe.fusion.measurements import (
     Positions,
     TrackSection,
 )
+from tcpipe.fusion.preparation import Prepared
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts
-from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
+from tcpipe.stages.fuse_inputs import Section, prepare_sections, read_command
 from tcpipe.stages.fuse_sections import Fused, make_section_facts
 from tcpipe.tables.facts import ChangeFacts, Disagreement, GateReset, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
@@ -32,13 +33,12 @@ def stretch(*, sensors=ALL, heading_from="course over ground", **said):
 
 
 def warned(inputs, *stretches, skipped_s=0.0):
-    return find_fuse_findings(
-        inputs, make_fuse_facts(inputs, stretches, rows=7, skipped_s=skipped_s), run=Subject("run", "r")
-    )
+    facts = make_fuse_facts([inputs], stretches, rows=7, skipped_s=skipped_s)
+    return find_fuse_findings([inputs], facts, run=Subject("run", "r"))
 
 
-def counts(**said):
-    return {"invalid": 0, "repeated": 0, "variances_replaced": 0} | said
+def prepared(*, invalid=0, repeated=0, variances_replaced=0):
+    return Prepared(np.zeros(invalid, np.int64), repeated, variances_replaced)
 
 
 def test_changes_of_one_kind_that_overlap_are_one_finding():
@@ -46,7 +46,9 @@ def test_changes_of_one_kind_that_overlap_are_one_finding():
         return ChangeFacts(kind, "gnss", round(start_s * 1e9), round(end_s * 1e9), size)
 
     first = (change("wander", 5, 45, 0.3), change("antenna", 30, 60, 0.2), change("wander", 40, 80, 0.7))
-    findings = warned(FusionInputs(PLACE), stretch(changes=first), stretch(changes=(change("wander", 90, 95, 0.1),)))
+    findings = warned(
+        Section(0, datum_deg_m=PLACE), stretch(changes=first), stretch(changes=(change("wander", 90, 95, 0.1),))
+    )
     found = [(each.span_s, each.numbers["off_m"]) for each in findings if each.code == "sensor-changed"]
     assert found == [((5.0, 80.0), 0.7), ((30.0, 60.0), 0.2), ((90.0, 95.0), 0.1)]
 
@@ -54,13 +56,17 @@ def test_changes_of_one_kind_that_overlap_are_one_finding():
 def test_stretches_add_up_and_their_innovations_are_averaged_by_count():
     first = stretch(nis_mean={"gnss": 1.0, "imu": None}, measurements={"gnss": 30, "imu": 5}, rejected={"gnss": 3})
     second = stretch(nis_mean={"gnss": 2.0}, measurements={"gnss": 10}, rejected={"gnss": 4}, sensors=("gnss",))
-    inputs = FusionInputs(PLACE, counts={"gnss": counts(invalid=2)})
-    facts = make_fuse_facts(inputs, [first, second], rows=7, skipped_s=1.5)
+    inputs = Section(0, datum_deg_m=PLACE, prepared={"gnss": prepared(invalid=2)})
+    facts = make_fuse_facts([inputs], [first, second], rows=7, skipped_s=1.5)
     assert facts.measurements == {"gnss": 40, "imu": 5}
     assert facts.rejected == {"gnss": 7, "imu": 0}
     assert facts.nis_mean == {"gnss": pytest.approx(1.25)}
     assert facts.sensors == ALL
-    assert (facts.rows, facts.skipped_s, facts.set_aside) == (7, 1.5, inputs.counts)
+    assert (facts.rows, facts.skipped_s, facts.set_aside) == (
+        7,
+        1.5,
+        {"gnss": {"invalid": 2, "repeated": 0, "variances_replaced": 0}},
+    )
     assert facts.stretches == (first, second)
 
 
@@ -80,13 +86,13 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
 
 
 def test_nothing_is_said_where_nothing_is_odd():
-    inputs = FusionInputs(PLACE, counts={"gnss": counts(repeated=5)})
+    inputs = Section(0, datum_deg_m=PLACE, prepared={"gnss": prepared(repeated=5)})
     assert warned(inputs, stretch(measurements={"gnss": 10}, rejected={"gnss": 1})) == ()
 
 
 @pytest.mark.parametrize(("rejected", "said"), [(1, False), (2, True)])
 def test_rejections_are_a_finding_beyond_a_tenth(rejected, said):
-    found = warned(FusionInputs(PLACE), stretch(measurements={"gnss": 10}, rejected={"gnss": rejected}))
+    found = warned(Section(0, datum_deg_m=PLACE), stretch(measurements={"gnss": 10}, rejected={"gnss": rejected}))
     assert [(of.code, of.subject.name) for of in found] == [("measurements-rejected", "gnss")] * said
     for finding in found:
         assert finding.numbers == {"rejected_fraction": 0.2, "rejected_count": 2, "measurement_count": 10}
@@ -95,43 +101,50 @@ def test_rejections_are_a_finding_beyond_a_tenth(rejected, said):
 
 def test_the_only_sensor_of_motion_is_not_proposed_to_be_excluded():
     counts = {"measurements": {"wheel_odometry": 10}, "rejected": {"wheel_odometry": 2}}
-    (finding,) = warned(FusionInputs(None), stretch(sensors=("imu", "wheel_odometry"), **counts))
+    (finding,) = warned(Section(0), stretch(sensors=("imu", "wheel_odometry"), **counts))
     assert (finding.code, finding.remedies) == ("measurements-rejected", ())
 
 
 @pytest.mark.parametrize(("common", "said"), [(None, []), (0.02, []), (0.03, [0.03])])
 def test_a_scale_that_nothing_shows_is_a_finding_beyond_two_hundredths(common, said):
-    found = warned(FusionInputs(PLACE), stretch(common_scale_std=common), stretch(common_scale_std=0.01))
+    found = warned(Section(0, datum_deg_m=PLACE), stretch(common_scale_std=common), stretch(common_scale_std=0.01))
     assert [of.numbers["scale_std_fraction"] for of in found] == said
     assert all(of.names == {"reason": "coarse-gnss"} for of in found)
 
 
 def test_without_fixes_they_would_show_the_scale():
-    (finding,) = warned(FusionInputs(PLACE), stretch(common_scale_std=0.03, sensors=("imu", "wheel_odometry")))
+    (finding,) = warned(
+        Section(0, datum_deg_m=PLACE), stretch(common_scale_std=0.03, sensors=("imu", "wheel_odometry"))
+    )
     assert (finding.code, finding.subject.name) == ("odometry-scale-unobservable", "wheel_odometry")
     assert finding.names == {"reason": "no-gnss"}
 
 
 def test_a_track_without_a_place_is_a_finding():
-    assert warned(FusionInputs(None), stretch()) == ()  # a log without fixes was found when it was read
-    (finding,) = warned(FusionInputs(None, counts={"gnss": counts()}), stretch())
+    assert warned(Section(0), stretch()) == ()  # a log without fixes was found when it was read
+    (finding,) = warned(Section(0, prepared={"gnss": prepared()}), stretch())
     assert finding.code == "local-frame"
 
 
 def test_a_heading_that_the_course_does_not_show_is_a_finding_where_the_track_has_a_place():
     later = stretch(heading_from="the IMU", clock_epoch=1, start_ns=2_000_000_000, end_ns=9_000_000_000)
-    (finding,) = warned(FusionInputs(PLACE), stretch(), later)
+    (finding,) = warned(Section(0, datum_deg_m=PLACE), stretch(), later)
     assert (finding.code, finding.names) == ("initial-yaw-uncertain", {"source": "the IMU"})
     assert finding.span_s == (2.0, 9.0)
-    assert warned(FusionInputs(None), later) == ()
+    assert warned(Section(0), later) == ()
 
 
 def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was_refused():
     sleeps, blind = (make_finding("pose-increments", Subject("role", role)) for role in ("imu", "visual_odometry"))
-    inputs = FusionInputs(
-        PLACE,
-        counts={"gnss": counts(variances_replaced=4), "imu": counts(invalid=2), "visual_odometry": counts(invalid=9)},
-        findings=[sleeps, blind],
+    inputs = Section(
+        0,
+        datum_deg_m=PLACE,
+        prepared={
+            "gnss": prepared(variances_replaced=4),
+            "imu": prepared(invalid=2),
+            "visual_odometry": prepared(invalid=9),
+        },
+        findings=(sleeps, blind),
         excluded={"visual_odometry": make_finding("imu-no-acceleration", Subject("role", "visual_odometry"))},
     )
     assert warned(inputs, stretch(), skipped_s=0.55) == (
@@ -145,14 +158,14 @@ def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was
 def test_a_sensor_that_left_the_path_is_one_finding_with_its_worst():
     worst = GateReset("gnss", 30_000_000_000, 40_000_000_000, 2.5)
     first = stretch(gate_resets=(GateReset("gnss", 10, 20, 1.0), GateReset("wheel_odometry", 0, 2_000_000_000, 0.4)))
-    gnss, wheels = warned(FusionInputs(PLACE), first, stretch(gate_resets=(worst,)))
+    gnss, wheels = warned(Section(0, datum_deg_m=PLACE), first, stretch(gate_resets=(worst,)))
     assert (gnss.code, gnss.subject.name, gnss.span_s) == ("gnss-contradicts-odometry", "gnss", (30.0, 40.0))
     assert gnss.numbers == {"off_m": 2.5, "event_count": 2}
     assert gnss.names == {"suspect": "wheel_odometry"}
     assert (wheels.code, wheels.subject.name) == ("odometry-contradicts-others", "wheel_odometry")
     assert (wheels.numbers, wheels.span_s) == ({"off_mps": 0.4, "event_count": 1}, (0.0, 2.0))
     third = stretch(gate_resets=(worst,), sensors=(*ALL, "visual_odometry"))
-    assert warned(FusionInputs(PLACE), third)[0].names == {}
+    assert warned(Section(0, datum_deg_m=PLACE), third)[0].names == {}
 
 
 SECOND_NS = 1_000_000_000
@@ -162,7 +175,7 @@ def off(begin_s, end_s, size, *, sensor="gnss"):
     return Disagreement(begin_s * SECOND_NS, end_s * SECOND_NS, sensor, size, 0.02)
 
 
-NOBODY = FusionInputs(None), Streams({}, {}, "husky")
+NOBODY = [Section(0)], Streams({}, {}, "husky")
 
 
 def fused(*found):
@@ -194,7 +207,8 @@ def wheels_alone(speed_mps):
         stamp_ns=stamp_ns, log_time_ns=stamp_ns, clock_epoch=np.zeros(stamp_ns.size, np.int16),
         forward_velocity_mps=np.ones(stamp_ns.size), yaw_rate_radps=np.zeros(stamp_ns.size),
     )  # fmt: skip
-    return FusionInputs(None, {0: Measurements(wheels=wheels)}), Streams({"command": command}, {}, "husky")
+    streams = Streams({"command": command}, {}, "husky")
+    return [Section(0, Measurements(wheels=wheels), read_command(streams, 0))], streams
 
 
 def test_wheels_faster_than_any_command_bear_no_segment_where_nothing_else_tells_how_long_a_metre_is():
@@ -232,7 +246,8 @@ def streams():
 
 
 def test_what_no_receiver_claims_is_the_recipes(streams):
-    (found,) = prepare_inputs(streams, FuseConfig(gnss_velocity_std_mps=0.2)).measurements.values()
+    (section,) = prepare_sections(streams, FuseConfig(gnss_velocity_std_mps=0.2))
+    found = section.measurements
     assert set(found.sensors()) == {"gnss", "gnss_velocity"}
     assert found.doppler.velocity_enu_mps[0].tolist() == [0.76, 0.0, 0.0]
     assert found.doppler.variance_m2ps2[0] == pytest.approx([0.04, 0.04, 1e6])

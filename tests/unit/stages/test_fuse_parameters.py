@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from suggested_recipes import proposed
 
 from tcpipe.stages.fuse_findings import find_parameter_findings, make_fuse_facts
-from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_inputs import Section
 from tcpipe.tables.facts import ChangeFacts, ParameterFacts, StretchFacts
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -26,8 +26,8 @@ def make_findings(log, changes=(), **parameters):
     shown = {name.replace("_", " "): ParameterFacts(*of) for name, of in parameters.items()}
     long = StretchFacts({}, {}, {}, start_ns=0, end_ns=100, parameters=shown)
     sections = [StretchFacts({}, {}, {}, end_ns=9, changes=changes), long]
-    facts = make_fuse_facts(FusionInputs(None), sections, rows=0, skipped_s=0.0)
-    return tuple(find_parameter_findings(FusionInputs(None), facts, log))
+    facts = make_fuse_facts([Section(0)], sections, rows=0, skipped_s=0.0)
+    return tuple(find_parameter_findings([Section(0)], facts, log))
 
 
 def antenna(std_m):

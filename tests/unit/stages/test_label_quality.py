@@ -162,7 +162,7 @@ def streams(*, steps=(), **time_sources):
 
 def clocks(role, *, noted=False, blamed=False):
     offset = ClockOffset(0.1, 0.01, noted, blamed)
-    return info(clock_offsets=ClockFacts(0, "gnss", (), {role: offset}))
+    return info(clock_offsets=(ClockFacts(0, "gnss", (), {role: offset}),))
 
 
 def test_a_clock_is_doubtful_that_steps_or_is_the_recorders():

@@ -8,12 +8,12 @@ import pytest
 from tcpipe.fusion.checks.lags import (
     GRID_NS,
     GRID_S,
-    average_on_grid,
     compute_moving_mean,
     find_lag,
     find_liveliest_window_ns,
     iterate_windows_ns,
     make_grid_ns,
+    resample_signal,
 )
 from tcpipe.fusion.measurements import BodyVelocities, Measurements
 
@@ -67,7 +67,7 @@ def test_nothing_is_said_of_too_little():
 
 def test_cells_are_means_and_gaps_are_unknown():
     stamp = np.array([0, 1, 2, 3, 9, 10]) * S
-    cells = average_on_grid(stamp, (stamp * 1e-9)[:, None] * 2.0, AT[: 11 * 50], longest_gap_ns=2 * S)[:, 0]
+    cells = resample_signal(stamp, (stamp * 1e-9)[:, None] * 2.0, AT[: 11 * 50])[:, 0]
     known = np.isfinite(cells)
     inside = (AT[: 11 * 50] + GRID_NS // 2 <= 3 * S) | (AT[: 11 * 50] - GRID_NS // 2 >= 9 * S)
     np.testing.assert_array_equal(known[50:500], inside[50:500])

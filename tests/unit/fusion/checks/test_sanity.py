@@ -7,7 +7,7 @@ import pytest
 
 from tcpipe.fusion.checks.lags import GRID_NS, GRID_S
 from tcpipe.fusion.checks.sanity import (
-    CommandedSpeed,
+    Command,
     check_sensors,
     compute_agreement,
     compute_command_ratio,
@@ -50,6 +50,10 @@ def gyroscope(yaw_rate=TWIST[:, 1], forward=TWIST):
     return InertialMeasurements(AT_NS, rate, force, np.full((T.size, 4), np.nan), 0.01, 0.05)
 
 
+def order(stamp_ns, forward_mps):
+    return Command(stamp_ns, forward_mps, np.zeros(stamp_ns.size))
+
+
 def checked(gnss=None, *, wheels=None, visual=None, imu=None, command=None, stated=True):
     m = Measurements(
         gnss=gnss,
@@ -57,7 +61,7 @@ def checked(gnss=None, *, wheels=None, visual=None, imu=None, command=None, stat
         wheels=None if wheels is None else odometry(wheels),
         visual=None if visual is None else odometry(visual, axes=3),
     )
-    wanted = None if command is None else CommandedSpeed(AT_NS, command[:, 0])
+    wanted = None if command is None else order(AT_NS, command[:, 0])
     return check_sensors(m, command=wanted, stated={"imu": stated}, felt=np.nan if imu is None else 9.81)
 
 
@@ -203,18 +207,18 @@ def driven(over, *, commanded):
 def test_a_robot_that_is_faster_than_its_command_has_other_wheels(over, found):
     jitter = np.random.default_rng(1).normal(0, 0.01, COMMAND_NS.size)
     commanded = np.where(COMMAND_NS % (30 * 10**9) < 24 * 10**9, 1.0 + jitter, 0.0)
-    told = compute_command_ratio(driven(over, commanded=commanded), CommandedSpeed(COMMAND_NS, commanded))
+    told = compute_command_ratio(Measurements(wheels=driven(over, commanded=commanded)), order(COMMAND_NS, commanded))
     assert told == (None if found is None else pytest.approx(found, abs=0.02))
 
 
 def test_a_command_that_is_not_what_drives_tells_nothing():
     moving = driven(1.2, commanded=np.ones(COMMAND_NS.size))
-    assert compute_command_ratio(moving, CommandedSpeed(COMMAND_NS, np.zeros(COMMAND_NS.size))) is None
-    assert compute_command_ratio(moving, CommandedSpeed(COMMAND_NS[:0], np.zeros(0))) is None
+    assert compute_command_ratio(Measurements(wheels=moving), order(COMMAND_NS, np.zeros(COMMAND_NS.size))) is None
+    assert compute_command_ratio(Measurements(wheels=moving), order(COMMAND_NS[:0], np.zeros(0))) is None
 
 
 def test_speeds_while_the_commands_are_silent_prove_no_ratio():
     is_sent = COMMAND_NS % (20 * 10**9) < 6 * 10**9
     another_source = np.where(np.roll(is_sent, 20), 1.0, 1.3)  # it drives until two seconds after the commands return
-    command = CommandedSpeed(COMMAND_NS[is_sent], np.ones(is_sent.sum()))
-    assert compute_command_ratio(driven(1.0, commanded=another_source), command) is None
+    command = order(COMMAND_NS[is_sent], np.ones(is_sent.sum()))
+    assert compute_command_ratio(Measurements(wheels=driven(1.0, commanded=another_source)), command) is None
