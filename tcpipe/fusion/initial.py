@@ -158,7 +158,7 @@ def _integrate_since_start(stamp_s: Floats, values: Floats, at_s: Floats) -> Flo
 
 def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
     """Return the fixes of the first second, 3 to 10, and the median of their slopes, east + i north, and its standard deviation [m/s]."""
-    rows = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 10**9, "right"), 3, 10)))
+    rows = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
     at_s, place = compute_seconds(gnss.stamp_ns[rows], int(gnss.stamp_ns[0])), gnss.position_enu_m[rows, :2]
     if at_s.size < 2:
         return rows, 0j, _START_STD_MPS
@@ -311,8 +311,8 @@ def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:
     first = np.flatnonzero(still & ~np.concatenate(([False], joined)))
     last = np.flatnonzero(still & ~np.concatenate((joined, [False])))
     found = np.stack((stamp_ns[first], stamp_ns[last]), -1)
-    found = found[found[:, 1] - found[:, 0] >= _MIN_LENGTH_NS]
-    return np.asarray(found + [_MARGIN_NS, -_MARGIN_NS])
+    inner: Ints = found[found[:, 1] - found[:, 0] >= _MIN_LENGTH_NS] + np.array([_MARGIN_NS, -_MARGIN_NS])
+    return inner
 
 
 _GRID_S = 0.5  # grid of the course
