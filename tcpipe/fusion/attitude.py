@@ -31,7 +31,7 @@ _DEFAULT_STD_RAD = 0.01  # scan matching and visual SLAM state none, or any
 _FLOOR_STD_RAD = 0.003  # no localization is better
 _FLAT = 1e-6  # of the lowest row of the rotation matrices: a pose in the plane has yaw alone
 _FEWEST = 20  # attitudes, and chords
-_CHORD_NS, _CHORD_M, _STRAIGHT_RAD = 10**9, 0.3, 0.1  # duration and least length of a chord, largest turn along it
+_CHORD_NS, _CHORD_M, _STRAIGHT_RAD = 1_000_000_000, 0.3, 0.1  # duration, least length, largest turn of a chord
 _MISSTATED_RAD = 0.25  # slopes that the robot drives along look like half of that
 
 

@@ -325,10 +325,9 @@ def _compare(
             for b in range(a + 1):
                 missed[a, b] += (0.5 * (up[a] + down[a]) - y[a]) * (0.5 * (up[b] + down[b]) - y[b]) / 3.0
     if kind == FIX:  # the product of the errors of yaw and of the distance driven since the last fix is sideways
-        sideways = P[THETA + 2, THETA + 2] * P[RHO, RHO]
-        for a in range(size):
-            for b in range(a + 1):
-                missed[a, b] += sideways * x[3 * a + 1] * x[3 * b + 1]
+        for a in range(3):
+            for b in range(3):
+                missed[a, b] += P[THETA + 2, THETA + 2] * P[RHO, RHO] * x[3 * a + 1] * x[3 * b + 1]
     _solve_for_map(M, size, L, m, Hs)
     for a in range(size):
         for j in range(n):

@@ -158,7 +158,7 @@ def _integrate_since_start(stamp_s: Floats, values: Floats, at_s: Floats) -> Flo
 
 def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
     """Return the fixes of the first second, 3 to 10, and the median of their slopes, east + i north, and its standard deviation [m/s]."""
-    rows = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 10**9, "right"), 3, 10)))
+    rows = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
     at_s, place = compute_seconds(gnss.stamp_ns[rows], int(gnss.stamp_ns[0])), gnss.position_enu_m[rows, :2]
     if at_s.size < 2:
         return rows, 0j, _START_STD_MPS
@@ -168,20 +168,15 @@ def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
     return rows, complex(east, north), float(np.hypot(noise_mps, _START_STD_MPS))
 
 
-def _collect_yaw_rate(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
+def _collect_yaw_rate(m: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
     """Return stamps [s] and yaw rates [rad/s], (N, 1), by the gyroscope, and in its gaps by an odometry or the course over ground."""
-    sources, odometry, gnss, imu = (
-        turn_sources(measurements),
-        measurements.first_odometry,
-        measurements.gnss,
-        measurements.imu,
-    )
+    sources, imu = turn_sources(m), m.imu
     stamp_s, rate = np.empty(0), np.empty(0)
     if sources:
         known = np.isfinite(sources[-1].yaw_rate_radps)
         stamp_s, rate = compute_seconds(sources[-1].stamp_ns[known], start_ns), sources[-1].yaw_rate_radps[known]
-    elif odometry is not None and gnss is not None:
-        stamp_s, rate = compute_course_rate(gnss, odometry, start_ns)
+    elif m.first_odometry is not None and m.gnss is not None:
+        stamp_s, rate = compute_course_rate(m.gnss, m.first_odometry, start_ns)
     if imu is not None:
         stamp_ns = start_ns + np.rint(stamp_s * 1e9).astype(np.int64)
         missing = ~is_covered(imu.stamp_ns, stamp_ns, stamp_ns)
@@ -311,13 +306,13 @@ def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, spre
 
 
 def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:
-    """Find runs of True, not bridged over gaps of half a second, shortened at both ends, the short ones left out."""
+    """Return the runs of True, shape (K, 2), without those that are short; gaps of half a second end them, both ends are cut."""
     joined = still[1:] & still[:-1] & (np.diff(stamp_ns) < _WINDOW_NS)
     first = np.flatnonzero(still & ~np.concatenate(([False], joined)))
     last = np.flatnonzero(still & ~np.concatenate((joined, [False])))
     found = np.stack((stamp_ns[first], stamp_ns[last]), -1)
-    long = found[found[:, 1] - found[:, 0] >= _MIN_LENGTH_NS]
-    return np.stack((long[:, 0] + _MARGIN_NS, long[:, 1] - _MARGIN_NS), -1)
+    inner: Ints = found[found[:, 1] - found[:, 0] >= _MIN_LENGTH_NS] + np.array([_MARGIN_NS, -_MARGIN_NS])
+    return inner
 
 
 _GRID_S = 0.5  # grid of the course

@@ -59,7 +59,7 @@ _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _FROZEN_NS = 1_000_000_000  # fixes that repeat for less, or for two of their periods, are those of a slow receiver
 _DATUM_FIXES = 10  # the ENU origin is their median
-_NOISE_WINDOW_S = 2.0  # window of noise around each sample
+_NOISE_WINDOW_NS = 2_000_000_000  # window of noise around each sample
 _TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
 _DEGREE_M = 111_320.0  # one degree of latitude, or of longitude at the equator [m]
 _PIECE = 1 << 16
@@ -102,9 +102,8 @@ def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, 
 
 
 def _is_fix(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> Mask:
-    fix: Mask = np.isfinite(lon_deg) & np.isfinite(lat_deg) & np.isfinite(alt_m)
-    fix &= (np.abs(lat_deg) <= 90) & (np.abs(lon_deg) <= 360) & ~((lon_deg == 0) & (lat_deg == 0))
-    return fix
+    is_place: Mask = (np.abs(lat_deg) <= 90) & (np.abs(lon_deg) <= 360) & ((lon_deg != 0) | (lat_deg != 0))
+    return is_place & np.isfinite(alt_m)
 
 
 def prepare_positions(
@@ -123,7 +122,8 @@ def prepare_positions(
     Or a pose (columns of the role pose), whose sensor is turned by ``mounting_xyzw`` to base_link.
     """
     lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
-    usable, repeated = _select_usable_rows(stamp_ns, _is_fix(lon, lat, alt))
+    is_fix = _is_fix(lon, lat, alt)
+    usable, repeated = _select_usable_rows(stamp_ns, is_fix)
     variance = _stack_columns(columns, [f"{axis}_var_m2" for axis in ("east", "north", "up")])[usable]
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
@@ -131,7 +131,7 @@ def prepare_positions(
     degree_m = _DEGREE_M * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])
     variance[:, :2] += _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
-    prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
+    prepared = Prepared(stamp_ns[~is_fix], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
     made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
     if "quat_x" in columns:
@@ -145,14 +145,14 @@ def _compute_rounding_variances(values: Floats) -> Floats:
     """Return the variance of rounding along each axis of values (N, k), shape (k,): grid²/12 times how many rows in turn have one value.
 
     All axes have one grid: the smallest step between their values, of which every step is a multiple. Rows with one value have one error,
-    which does not average out.
+    which does not average out; it is below the grid.
     """
     steps = np.concatenate([np.diff(np.unique(axis.round(10))) for axis in values.T])  # binary numbers differ by less
     multiples = steps / steps.min() if steps.size >= _FEWEST else np.array([0.5])
     if (np.abs(multiples - np.rint(multiples)) > 0.01).any():
         return np.zeros(values.shape[1])
-    lengths = [np.diff(np.flatnonzero(np.diff(axis, prepend=np.nan, append=np.nan))) for axis in values.T]
-    return np.asarray(steps.min() ** 2 / 12.0 * np.array([np.median(np.repeat(each, each)) for each in lengths]))
+    rows = values.shape[0] / (1 + np.count_nonzero(np.diff(values, axis=0), axis=0))
+    return np.asarray(steps.min() ** 2 * np.minimum(rows / 12.0, 1.0))
 
 
 def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, tuple[Repeats, ...]]:
@@ -167,16 +167,15 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     if first.size < 2 or first.size == stamp_ns.size:
         return gnss, ()
     last = np.append(first[1:], stamp_ns.size) - 1
-    lasting = stamp_ns[last] - stamp_ns[first] >= max(_FROZEN_NS, 2 * compute_median_period_ns(stamp_ns[first]))
+    kept_ns = stamp_ns[last] - stamp_ns[first]
+    lasting = kept_ns >= max(_FROZEN_NS, 2 * compute_median_period_ns(stamp_ns[first]))
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
         return (gnss if kept.all() else select_rows(gnss, kept)), ()
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
-    frozen = np.flatnonzero(
-        lasting & (driven_m[last] - driven_m[first] > _MOVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
-    )
+    frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > _MOVES_MPS * kept_ns * 1e-9))
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
     return select_rows(gnss, changes), tuple(found)
 
@@ -201,8 +200,8 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     driven_m, moved_m, mean_speed = driven_m[moving], moved_m[moving], driven_m[moving] / interval_s[moving]
     # A median: neither slip nor an outlying fix is jitter.
     residual_s = (moved_m - np.median(_make_windows(moved_m / driven_m), axis=1) * driven_m) / mean_speed
-    claimed_s2 = (gnss.variance_m2[:-1, :2].mean(1) + gnss.variance_m2[1:, :2].mean(1))[moving] / 2 / mean_speed**2
-    claimed_s2 = _make_windows(claimed_s2).mean(1)
+    claimed_m2 = gnss.variance_m2[:, :2].mean(1)
+    claimed_s2 = _make_windows((claimed_m2[:-1] + claimed_m2[1:])[moving] / 2 / mean_speed**2).mean(1)
     # One outlying fix spoils two pairs: the fourth fifth bears one in ten, yet sees tails that the median does not.
     spread_s = np.quantile(_make_windows(np.abs(residual_s)), 0.8, axis=1) / 1.2816
     excess_s2 = spread_s**2 / 2 - claimed_s2
@@ -404,18 +403,12 @@ def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, l
 
 
 def _estimate_local_noise(stamp_ns: Ints, values: Floats) -> Floats:
-    """Estimate the white noise over two seconds around each sample, the largest of the axes, shape (N,)."""
-    if values.shape[0] < 3:
-        return np.zeros(values.shape[0])
-    half = max(1, round(_NOISE_WINDOW_S * 0.5e9 / compute_median_period_ns(stamp_ns)))
-    row = np.arange(values.shape[0]) - 1
-    last_row = values.shape[0] - 2
-    first, last = np.clip(row - half, 0, last_row), np.clip(row + half + 1, 0, last_row)
-    largest = np.zeros(values.shape[0])
-    for axis in values.T:
-        total = np.concatenate(([0.0], np.cumsum(np.diff(axis, n=2) ** 2 / 6)))
-        np.maximum(largest, total[last] - total[first], out=largest)
-    return np.asarray(np.sqrt(largest / np.maximum(last - first, 1)))
+    """Return the σ of the white noise over two seconds around each sample, the largest of the axes, shape (N,); 0 where few are near."""
+    largest = np.zeros(stamp_ns.size)
+    for axis in values.T if stamp_ns.size > 2 else ():
+        square = np.square(np.diff(axis, n=2))[:, None] / 6.0
+        np.fmax(largest, compute_window_means(stamp_ns[1:-1], square, stamp_ns, _NOISE_WINDOW_NS)[:, 0], out=largest)
+    return np.sqrt(largest)
 
 
 def _stack_columns(columns: Columns, names: list[str] | tuple[str, ...]) -> Floats:
@@ -451,13 +444,10 @@ _TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
 
 
 def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
-    """Whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
-    known = np.isfinite(velocity_mps).any(1)
-    if not known.any():
-        return False
+    """Return whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
     posed = pose_m[np.isfinite(pose_m).all(1)]
     moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > _MOVED_M
-    return bool(np.nansum(np.abs(velocity_mps[known])) > 0) or not moves
+    return bool(np.isfinite(velocity_mps).any() and (np.nan_to_num(velocity_mps).any() or not moves))
 
 
 def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tuple[Ints, Floats, Floats]:

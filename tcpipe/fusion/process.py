@@ -110,12 +110,13 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
     if gnss is None or gnss.stamp_ns.size < _FIXES:
         return None
     rows = max(1, round(_CHORD_S * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
-    east, north, up = (compute_median_of_five(axis) for axis in gnss.position_enu_m.T)
-    way_m = np.hypot(east[rows:] - east[:-rows], north[rows:] - north[:-rows])
+    place_m = np.stack([compute_median_of_five(axis) for axis in gnss.position_enu_m.T])
+    east, north, up = place_m[:, rows:] - place_m[:, :-rows]
+    way_m = np.hypot(east, north)
     climbs = way_m > _CHORD_M
     if climbs.sum() < _FIXES:
         return None
-    slope = ((up[rows:] - up[:-rows]) / np.maximum(way_m, _CHORD_M))[climbs].clip(-_STEEPEST, _STEEPEST)
+    slope = (up / np.maximum(way_m, _CHORD_M))[climbs].clip(-_STEEPEST, _STEEPEST)
     noise = float(2.0 * np.median(gnss.variance_m2[:, 2]) / np.median(way_m[climbs]) ** 2)
     excess = float(np.mean(slope**2)) - noise
     slopes_seen = max(1.0, float(np.sum(way_m[climbs])) / rows / _SLOPE_LASTS_M)

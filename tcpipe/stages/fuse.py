@@ -187,17 +187,13 @@ def fuse_recovering(
         return recovered[IMU]
     if len(recovered) == 1:
         return next(iter(recovered.values()))
-    motion = [role for role in roles if role not in {IMU, DOPPLER}]
-    code, subject, problem = "track-contradicts-sensors", run, "the track contradicts every sensor"
+    code, subject = "track-contradicts-sensors", run
+    motion = {*roles} - {IMU, DOPPLER}
     if len(motion) == 1:
-        code, subject, problem = (
-            "sensor-contradicts-itself",
-            Subject("role", motion[0]),
-            f"{motion[0]} contradicts itself",
-        )
+        code, subject = "sensor-contradicts-itself", Subject("role", motion.pop())
     span_s = find_span_s(*inputs.span_ns, streams)
     finding = make_finding(code, subject, span_s=span_s, astray_fraction=fused.astray / fused.windows)
-    raise FusionError(problem, findings=(finding, *inputs.excluded.values()))
+    raise FusionError("the track contradicts every sensor", findings=(finding, *inputs.excluded.values()))
 
 
 def _exclude_misleading(role: str, inputs: Section, streams: Streams) -> Section:
