@@ -33,7 +33,8 @@ from tcpipe.pipeline.named_runs import find_named_run, is_path
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.fuse_inputs import Section, find_fixes_role, prepare_sections, use_pose_as_fixes
+from tcpipe.stages.fuse_inputs import Section, prepare_sections
+from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.store import is_store
 from tcpipe.tables.arrays import number_column, select_rows

@@ -503,7 +503,7 @@ def _align_clocks(
     to five minutes around the one at which both tables begin together. A table without motion has the clock of a table with which it has
     time in common.
     """
-    from tcpipe.stages.fuse import find_late_sensors  # noqa: PLC0415  kernels load only where there is work
+    from tcpipe.stages.fuse_clocks import find_late_sensors  # noqa: PLC0415  kernels load only where there is work
 
     begin_s = {name: (reference.span_ns[0] - table.span_ns[0]) / 1e9 for name, table in apart.items()}
     together = [ProposedLine(f"tables.{name}", "offset_s", each) for name, each in begin_s.items()]

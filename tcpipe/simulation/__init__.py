@@ -5,8 +5,8 @@ wrong, `sensors` how strongly) and the rasters' grids; `simulate_readings` gives
 `truth.compute_true_cost` is the cost of the true metre that begins at any time.
 """
 
-from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.scenarios import Scenario, find_scenario, make_tiny
+from tcpipe.simulation.sensors import Faults
 from tcpipe.simulation.site_files import SimulatedSite, read_truth, simulate, simulate_readings
 from tcpipe.simulation.truth import TrueCost, Truth, compute_true_cost
 

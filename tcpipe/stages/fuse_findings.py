@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -329,3 +329,21 @@ def _find_tilt(tilt: ParameterFacts, sensor: Sensor) -> Finding:
         roll_rad=-tilt.value[0],
         pitch_rad=-tilt.value[1],
     )
+
+
+_Named = TypeVar("_Named")
+
+
+def rename_role(value: _Named, old: str, new: str) -> _Named:
+    """Return findings or facts in which one role stands for another."""
+    named = cast("object", value)
+    if isinstance(value, str):
+        named = new if value == old else value
+    elif isinstance(value, Mapping):
+        named = {rename_role(key, old, new): rename_role(item, old, new) for key, item in value.items()}
+    elif isinstance(value, tuple | list):
+        named = type(value)(rename_role(item, old, new) for item in value)
+    elif is_dataclass(value) and not isinstance(value, type):
+        items = {entry.name: getattr(value, entry.name) for entry in fields(value)}
+        named = replace(value, **rename_role(items, old, new))
+    return cast("_Named", named)

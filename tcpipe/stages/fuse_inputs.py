@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -37,7 +37,6 @@ from tcpipe.fusion.measurements import (
     Measurements,
 )
 from tcpipe.fusion.preparation import Prepared
-from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
@@ -45,7 +44,7 @@ from tcpipe.tables.arrays import select_rows
 from tcpipe.tables.columns import read_float_columns, to_floats, to_integers
 from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
-from tcpipe.tables.levels import STREAMS, Sensor, Streams
+from tcpipe.tables.levels import Sensor, Streams
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,50 +350,3 @@ def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64
     return suggest(
         "state_extrinsics", {"read.extrinsics": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}}
     )
-
-
-_ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
-"""Longitude, latitude [deg] and height [m] at which a frame without a place on the earth is fused; east, north and up stay the same."""
-
-
-def find_fixes_role(streams: Streams) -> str:
-    """Return the role of the positions of a run: that of a pose of another program, or of GNSS."""
-    return POSE if POSE in streams.tables else GNSS
-
-
-def use_pose_as_fixes(streams: Streams) -> tuple[Streams, bool]:
-    """Return the streams with a pose as fixes with an attitude, and whether its frame has no place on the earth.
-
-    Inside of fusion its role is that of fixes; `rename_role` names it in everything that leaves the stage.
-    """
-    if POSE not in streams.tables:
-        return streams, False
-    pose, facts = streams.tables[POSE], streams.report.facts
-    is_local = bool(np.isnan(to_floats(pose, "lon_deg")).any())
-    if is_local:
-        place = np.column_stack([to_floats(pose, f"{axis}_m") for axis in "xyz"])
-        names = ("lon_deg", "lat_deg", "alt_m")
-        geodetic = dict(zip(names, geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M), strict=True))
-        pose = STREAMS[POSE].table(**{name: pose[name] for name in pose.column_names} | geodetic)
-    offsets_s = {GNSS if role == POSE else role: offset_s for role, offset_s in facts.time_offset_s.items()}
-    report = replace(streams.report, facts=replace(facts, time_offset_s=offsets_s))
-    sensors = {**streams.sensors, GNSS: streams.sensors[POSE]}
-    return replace(streams, tables={**streams.tables, POSE: pose}, sensors=sensors, report=report), is_local
-
-
-_Named = TypeVar("_Named")
-
-
-def rename_role(value: _Named, old: str, new: str) -> _Named:
-    """Return findings or facts in which one role stands for another."""
-    named = cast("object", value)
-    if isinstance(value, str):
-        named = new if value == old else value
-    elif isinstance(value, Mapping):
-        named = {rename_role(key, old, new): rename_role(item, old, new) for key, item in value.items()}
-    elif isinstance(value, tuple | list):
-        named = type(value)(rename_role(item, old, new) for item in value)
-    elif is_dataclass(value) and not isinstance(value, type):
-        items = {entry.name: getattr(value, entry.name) for entry in fields(value)}
-        named = replace(value, **rename_role(items, old, new))
-    return cast("_Named", named)

@@ -1,8 +1,9 @@
-"""The log as stages see it (`LogReader`), and its tables as numpy arrays and power rails, for the domain packages."""
+"""The log as stages see it (`LogReader`); its tables as numpy arrays and power rails; a pose of another program as fixes."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -10,6 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from tcpipe.fusion.measurements import GNSS, POSE
+from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.logs.extrinsics import Transforms
 from tcpipe.logs.field_mapping import Array
 from tcpipe.logs.messages import LOG_TIME
@@ -17,7 +20,7 @@ from tcpipe.logs.topics import Topic
 from tcpipe.power.rails import Rail, make_rail, make_samples
 from tcpipe.tables.arrays import select_rows, to_numbers, to_texts
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.levels import Streams
+from tcpipe.tables.levels import STREAMS, Streams
 
 T = TypeVar("T", bound=np.generic)
 Arrays = dict[str, Array]
@@ -229,3 +232,32 @@ def make_rails(streams: Streams, epoch: int) -> list[Rail]:
         )
         rails.append(make_rail(name, *signals, averaged=streams.power_averaged))
     return rails
+
+
+_ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
+"""Longitude, latitude [deg] and height [m] at which a frame without a place on the earth is fused; east, north and up stay the same."""
+
+
+def find_fixes_role(streams: Streams) -> str:
+    """Return the role of the positions of a run: that of a pose of another program, or of GNSS."""
+    return POSE if POSE in streams.tables else GNSS
+
+
+def use_pose_as_fixes(streams: Streams) -> tuple[Streams, bool]:
+    """Return the streams with a pose as fixes with an attitude, and whether its frame has no place on the earth.
+
+    Inside of fusion its role is that of fixes; `rename_role` names it in everything that leaves the stage.
+    """
+    if POSE not in streams.tables:
+        return streams, False
+    pose, facts = streams.tables[POSE], streams.report.facts
+    is_local = bool(np.isnan(to_floats(pose, "lon_deg")).any())
+    if is_local:
+        place = np.column_stack([to_floats(pose, f"{axis}_m") for axis in "xyz"])
+        names = ("lon_deg", "lat_deg", "alt_m")
+        geodetic = dict(zip(names, geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M), strict=True))
+        pose = STREAMS[POSE].table(**{name: pose[name] for name in pose.column_names} | geodetic)
+    offsets_s = {GNSS if role == POSE else role: offset_s for role, offset_s in facts.time_offset_s.items()}
+    report = replace(streams.report, facts=replace(facts, time_offset_s=offsets_s))
+    sensors = {**streams.sensors, GNSS: streams.sensors[POSE]}
+    return replace(streams, tables={**streams.tables, POSE: pose}, sensors=sensors, report=report), is_local

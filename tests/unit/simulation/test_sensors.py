@@ -10,10 +10,20 @@ from simulated_streams import log_of, streams_of
 
 from tcpipe.fusion.preparation import find_datum
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.robot import GRAVITY_MPS2
 from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, make_small_world, make_tiny
-from tcpipe.simulation.sensors import CLOCK_STEP_NS, EXACT_GNSS, Doppler, Gnss, Noise, Power, Sensors, Visual, record
+from tcpipe.simulation.sensors import (
+    CLOCK_STEP_NS,
+    EXACT_GNSS,
+    Doppler,
+    Faults,
+    Gnss,
+    Noise,
+    Power,
+    Sensors,
+    Visual,
+    record,
+)
 from tcpipe.tables.columns import to_floats, to_integers
 
 SITE = make_small_world().site

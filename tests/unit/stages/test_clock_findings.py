@@ -12,7 +12,8 @@ from suggested_recipes import proposed
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.fuse import correct_clocks, find_clock_jumps, find_clocks, find_offsets, fuse_run
+from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.fuse_clocks import correct_clocks, find_clock_jumps, find_clocks, find_offsets
 from tcpipe.stages.fuse_inputs import Section, prepare_sections
 from tcpipe.stages.label_motion import is_clock_doubtful
 from tcpipe.tables.findings import Subject, select_findings, sort_findings

@@ -16,7 +16,8 @@ from unit.stages.test_fuse import filled, streams_of
 from tcpipe.fusion.checks.sanity import Command
 from tcpipe.fusion.measurements import Measurements, select_measurements
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.fuse import correct_clocks, find_clocks, find_offsets, fuse_run
+from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.fuse_clocks import correct_clocks, find_clocks, find_offsets
 from tcpipe.stages.fuse_findings import make_audit_findings
 from tcpipe.stages.fuse_inputs import Section, drop_implausible_sensors, find_exclusions
 from tcpipe.stages.fuse_sections import Fused

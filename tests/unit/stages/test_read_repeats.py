@@ -7,9 +7,8 @@ from made_tracks import power_streams, stamps, with_columns
 from tcpipe.power.noise import compute_median_period_s, estimate_energy_noise
 from tcpipe.power.rails import integrate_energy
 from tcpipe.simulation import find_scenario, simulate_readings
-from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.scenarios import make_small_world
-from tcpipe.simulation.sensors import Noise, Power, Sensors, record
+from tcpipe.simulation.sensors import Faults, Noise, Power, Sensors, record
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.read_power import find_repeats, remove_repeats
 from tcpipe.tables.levels import Streams

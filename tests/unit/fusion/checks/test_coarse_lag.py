@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.clock_offsets import find_other_clocks
-from tcpipe.fusion.checks.coarse_lag import find_coarse_offsets
+from tcpipe.fusion.checks.clock_offsets import find_coarse_offsets, find_other_clocks
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 
 STEP_S = 0.02

@@ -1,0 +1,183 @@
+"""Clocks of the sensors of each section: one that is far off the others' excludes its sensor, small offsets and drifts are taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tcpipe.fusion.checks.clock_offsets import (
+    NEAR_S,
+    find_clock_offsets,
+    find_middle_ns,
+    find_other_clocks,
+    shift_sensors,
+)
+from tcpipe.fusion.checks.sanity import SensorExclusion
+from tcpipe.fusion.measurements import DOPPLER, GNSS, Measurements
+from tcpipe.logs.clocks import LOG_CLOCK
+from tcpipe.recipe import FuseConfig
+from tcpipe.recipe.suggestions import suggest
+from tcpipe.stages.fuse_findings import rename_role
+from tcpipe.stages.fuse_inputs import (
+    Section,
+    exclude_sensors,
+    find_span_s,
+    merge_findings,
+    prepare_sections,
+    rank_sections,
+)
+from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
+from tcpipe.tables.facts import ClockFacts, ClockOffset
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
+from tcpipe.tables.levels import Streams
+
+
+def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[Section]:
+    """Return the sections without sensors whose clocks are more than a second off the others', there or where the drive is longer.
+
+    No label of the run is usable until the recipe states the offset, since it is unknown which of the clocks power has.
+    """
+    found, known = [*sections], dict[str, tuple[str, ClockOffset]]()
+    for place in rank_sections(sections):
+        section = sections[place]
+        offsets = find_other_clocks(section.measurements)
+        reference = next((role for role, offset in offsets.items() if not offset.noted), "")
+        known |= {role: (reference, offset) for role, offset in offsets.items() if offset.noted}
+        for role in [role for role in known if role in section.measurements.sensors()]:
+            against, offset = known[role]
+            numbers = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
+            exclusion = SensorExclusion(role, "clocks-differ", {"reference": against}, numbers)
+            section = exclude_sensors(section, [exclusion], streams)
+            remedies = _state_offset(role, offset, streams) + section.excluded[role].remedies
+            finding = replace(section.excluded[role], severity="error", remedies=remedies)
+            section = replace(section, excluded={**section.excluded, role: finding})
+        found[place] = section
+    return found
+
+
+def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
+    """Return how late sensors' stamps are against those of most sensors [s], by role; those whose offset is unknown are missing."""
+    sections = prepare_sections(use_pose_as_fixes(streams)[0], config)
+    if not sections:
+        return {}
+    offsets = find_other_clocks(sections[rank_sections(sections)[0]].measurements, always=True)
+    return rename_role({role: offset.offset_s for role, offset in offsets.items()}, GNSS, find_fixes_role(streams))
+
+
+_FINE_S = 0.004
+_JUMP_NS = 500_000_000
+_DRIVES_MPS = 0.3
+
+
+def find_clocks(sections: Sequence[Section]) -> list[Section]:
+    """Return the sections with the time offsets between their sensors.
+
+    A section decides about its own clocks. A sensor whose clock it cannot compare has the constant offset that a section with a longer
+    drive shows: latency is a constant of the driver. If the clock drifts there, its offset here is unknown, and is doubted.
+    """
+    found = [*sections]
+    shown: dict[str, tuple[ClockOffset, str, int]] = {}
+    for place in rank_sections(sections):
+        m = sections[place].measurements
+        clocks, middle_ns = find_clock_offsets(m, clock_epoch=sections[place].clock_epoch), find_middle_ns(m)[0]
+        own = {role: (offset, clocks.reference, middle_ns) for role, offset in clocks.offsets.items() if offset.noted}
+        for role in sorted(shown.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}):
+            offset, reference, at_ns = shown[role]
+            if offset.drift_ppm:
+                drift_s = offset.drift_ppm * 1e-6 * (middle_ns - at_ns) * 1e-9
+                offset = ClockOffset(0.0, float(np.hypot(offset.std_s, drift_s)), noted=True, blamed=False)
+            clocks = replace(clocks, reference=clocks.reference or reference, offsets={**clocks.offsets, role: offset})
+        shown = own | shown
+        found[place] = replace(sections[place], clocks=clocks)
+    return found
+
+
+def correct_clocks(sections: Sequence[Section]) -> list[Section]:
+    """Return the sections on one clock each: offset and drift of each clock, about the middle of its section, are taken out."""
+    corrected = []
+    for section in sections:
+        middle_ns = find_middle_ns(section.measurements)[0]
+        shifted = shift_sensors(section.measurements, section.offsets, middle_ns)
+        corrected.append(replace(section, measurements=shifted))
+    cuts = dict(find_clock_jumps(corrected))
+    return [replace(section, cuts=cuts) for section in corrected]
+
+
+def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]:
+    """Return the findings on clocks; those of several sections name the time of theirs."""
+    findings = []
+    for section in (sections[place] for place in rank_sections(sections)):
+        span_s = find_span_s(*section.span_ns, streams)
+        for role, offset in section.offsets.items():
+            finding = _find_offset(section.clocks, role, offset, streams, span_s[1] - span_s[0])
+            findings.append(replace(finding, span_s=span_s) if len(sections) > 1 else finding)
+    return merge_findings(findings)
+
+
+def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams, span_s: float) -> Finding:
+    """Return the finding on a clock: which is off where two others agree, else that two differ."""
+    compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
+    subject, names = Subject("role", role), {"reference": found.reference, "by": ", ".join(compared)}
+    offset_s, offset_2std_s, drift_s = offset.offset_s, 2 * offset.std_s, 1e-6 * offset.drift_ppm * span_s
+    if not offset.blamed:
+        return make_finding(
+            "clocks-differ", subject, names=names, offset_s=offset_s, offset_2std_s=offset_2std_s, drift_s=drift_s
+        )
+    if offset.drift_ppm:
+        by_log = streams.sensors[role].time_source == "log"
+        remedies = () if by_log else suggest("use_log_time", {"read.time_source": {role: "log"}})
+        return make_finding("clock-drift", subject, action="corrected", names=names, remedies=remedies, drift_s=drift_s)
+    return make_finding(
+        "time-offset",
+        subject,
+        severity="note" if role == DOPPLER else None,
+        action="corrected",
+        names=names,
+        remedies=_state_offset(role, offset, streams),
+        offset_s=offset_s,
+        offset_2std_s=offset_2std_s,
+    )
+
+
+def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Remedy, ...]:
+    """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
+    given_s = streams.report.facts.time_offset_s.get(role, 0.0)
+    correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
+    is_far = abs(offset.offset_s) > NEAR_S and role == GNSS and DOPPLER in streams.tables
+    roles = (role, DOPPLER) if is_far else (role,)
+    return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
+
+
+def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding]]:
+    """Yield the first stamps [ns] after the clock of all sensors was set forward, and the findings.
+
+    Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
+    """
+    epochs: dict[int, list[Measurements]] = {}
+    for section in sections:
+        epochs.setdefault(section.clock_epoch, []).append(section.measurements)
+    stamps = {
+        epoch: np.unique(np.concatenate([sensor.stamp_ns for m in of_epoch for sensor in m.sensors().values()]))
+        for epoch, of_epoch in epochs.items()
+        if any(m.sensors() for m in of_epoch)
+    }
+    for epoch, stamp_ns in stamps.items():
+        wheels = [m.first_odometry for m in epochs[epoch] if m.first_odometry is not None]
+        fixes = [m.gnss for m in epochs[epoch] if m.gnss is not None]
+        if not wheels or not fixes:
+            continue
+        wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (wheels, fixes))
+        speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in wheels])
+        place_m = np.concatenate([each.position_enu_m[:, :2] for each in fixes])
+        for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > _JUMP_NS]:
+            step_s = float(np.diff(ends_ns)[0]) * 1e-9
+            at_s = float(ends_ns[1] - min(each[0] for each in stamps.values())) * 1e-9
+            driven = np.interp(ends_ns, wheels_ns, speed_mps)
+            moved_m = [np.diff(np.interp(ends_ns, fixes_ns, axis)) for axis in place_m.T]
+            slowest_mps = float(np.abs(driven).min())
+            if slowest_mps > _DRIVES_MPS and np.linalg.norm(moved_m) < 0.5 * slowest_mps * step_s:
+                span_s, names = (at_s, at_s), {"topics": "all topics"}
+                finding = make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)
+                yield int(ends_ns[1]), finding
