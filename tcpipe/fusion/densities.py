@@ -99,8 +99,8 @@ class NoiseModel:
     odometries: Mapping[str, OdometryNoise]
     turns: Mapping[str, TurnNoise]
     shared_scale: GaussMarkov
-    offset: GaussMarkov = GaussMarkov(0.0, np.inf)
-    """Error of fixes beyond what the residuals show [m], east and north: slow, or constant between two steps."""
+    offset: GaussMarkov | None = None
+    """Error of fixes beyond what the residuals show [m], east and north: slow, or constant between two steps; None: none."""
     densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
     """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 

@@ -204,7 +204,8 @@ class Hypothesis:
         # Either side of a step may be right: both are off by half of it, 1σ, for as long as they last.
         steps_m = [0.5 * change.size for change in self.changes if change.kind == "step"]
         slow_m = [change.size for change in self.changes if change.kind == "slow"]
-        offset = GaussMarkov(max((*steps_m, *slow_m), default=0.0) ** 2, _SLOW_S if slow_m else np.inf)
+        sizes_m = (*steps_m, *slow_m)
+        offset = GaussMarkov(max(sizes_m) ** 2, _SLOW_S if slow_m else np.inf) if sizes_m else None
         return replace(noise, odometries={**noise.odometries, **varying}, offset=offset)
 
     @property

@@ -117,10 +117,11 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         std[state.ARM : state.ARM + 3][known] = m.gnss.lever_arm_std_m[known]
     if m.gnss is not None and m.has_attitude:
         std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad
+    offset = noise.offset or GaussMarkov(0.0, np.inf)
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
-        std[state.FIX_OFFSET : state.FIX_OFFSET + 3] = np.sqrt(noise.offset.variance) * FIX_AXES
-        time_s[state.FIX_OFFSET : state.FIX_OFFSET + 3] = noise.offset.time_s
+        std[state.FIX_OFFSET : state.FIX_OFFSET + 3] = np.sqrt(offset.variance) * FIX_AXES
+        time_s[state.FIX_OFFSET : state.FIX_OFFSET + 3] = offset.time_s
     return std, walk, time_s
 
 

@@ -30,12 +30,10 @@ from tcpipe.stages.fuse_inputs import (
     Section,
     drop_implausible_sensors,
     exclude_sensors,
-    find_exclusions,
     find_span_s,
-    merge_findings,
     prepare_sections,
 )
-from tcpipe.stages.fuse_sections import Fused, fuse_section, make_rejections_table
+from tcpipe.stages.fuse_sections import Fused, find_exclusions, fuse_section, make_rejections_table, merge_findings
 from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, select_findings

@@ -24,10 +24,10 @@ from tcpipe.stages.fuse_inputs import (
     Section,
     exclude_sensors,
     find_span_s,
-    merge_findings,
     prepare_sections,
     rank_sections,
 )
+from tcpipe.stages.fuse_sections import merge_findings
 from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding

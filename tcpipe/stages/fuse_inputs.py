@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -266,35 +265,6 @@ def _define_base_by_antenna(sections: Sequence[Section], streams: Streams) -> li
         is_base_free = all(alone[:place] + alone[place + 1 :])
         based.append(replace(section, measurements=measurements, findings=findings, is_base_free=is_base_free))
     return based
-
-
-def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
-    """Return the findings of all excluded sensors; the same of several sections as one, over the time of all."""
-    return merge_findings(finding for place in rank_sections(sections) for finding in sections[place].excluded.values())
-
-
-_SAME_OFFSET_S = 0.1
-"""Time offsets of two sections that differ by less [s] are one: twice the offset that is noted."""
-
-
-def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the findings of several sections, those of one code and subject as one that has the first one's numbers.
-
-    Time offsets that differ stay apart, and have no remedy: the recipe states one.
-    """
-    merged: list[Finding] = []
-    for finding in findings:
-        for place, first in enumerate(merged):
-            off_s = finding.numbers.get("offset_s", 0.0) - first.numbers.get("offset_s", 0.0)
-            if (first.code, first.subject) == (finding.code, finding.subject) and abs(off_s) < _SAME_OFFSET_S:
-                spans = [each.span_s for each in (first, finding) if each.span_s is not None]
-                span_s = (min(start for start, _ in spans), max(end for _, end in spans)) if spans else None
-                merged[place] = replace(first, span_s=span_s)
-                break
-        else:
-            merged.append(finding)
-    offsets = Counter(finding.subject for finding in merged if "offset_s" in finding.numbers)
-    return [replace(each, remedies=()) if offsets[each.subject] > 1 else each for each in merged]
 
 
 def read_command(streams: Streams, epoch: int) -> Command | None:

@@ -54,9 +54,13 @@ def test_without_an_imu_the_velocity_may_change_where_every_odometry_says_so():
     assert estimate_density(blind, at_ns + 300_000_000, held)[1] > 5 * steady
 
 
-def test_a_turn_rate_of_an_odometry_has_a_scale_to_be_found():
+def test_a_turn_rate_has_a_scale_to_be_found():
     with_imu, without = measured(), measured(imu=False)
-    assert turn_scale_std(with_imu) == 0.0
+    assert turn_scale_std(replace(with_imu, gnss=None)) == 0.0
+    rate = with_imu.imu.angular_velocity_radps
+    found = fuse(replace(with_imu, imu=replace(with_imu.imu, angular_velocity_radps=1.05 * rate)))
+    assert 1.0 / (1.0 - found.facts.parameters["turn scale"].value[0]) == pytest.approx(1.05, abs=0.005)
+    assert drive.errors(truth(), found)["yaw_deg"] < 0.5
     assert turn_scale_std(without) > 0.1
     found = fuse(without)
     (value,) = found.facts.parameters["turn scale"].value

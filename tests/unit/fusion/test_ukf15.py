@@ -121,7 +121,8 @@ def test_filterpy_and_the_compiled_kernel_agree(truth, absent):
     assert np.abs(apart[:, model.active] / std).max() < 0.6
     assert _rms(apart[:, model.active] / std).max() < 0.2
     np.testing.assert_array_equal(forward.tests.verdict, tests.verdict)
-    assert forward.tests.nis == pytest.approx(tests.nis, rel=0.2, abs=0.2, nan_ok=True)
+    # Beside them the kernel adds the product of two errors, of yaw and distance, to the variance of a fix.
+    assert forward.tests.nis == pytest.approx(tests.nis, rel=0.35, abs=0.2, nan_ok=True)
 
 
 def test_an_estimate_uses_the_past_only(truth):

@@ -19,8 +19,8 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_clocks import correct_clocks, find_clocks, find_offsets
 from tcpipe.stages.fuse_findings import make_audit_findings
-from tcpipe.stages.fuse_inputs import Section, drop_implausible_sensors, find_exclusions
-from tcpipe.stages.fuse_sections import Fused
+from tcpipe.stages.fuse_inputs import Section, drop_implausible_sensors
+from tcpipe.stages.fuse_sections import Fused, find_exclusions
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import COMMAND, Sensor, Streams
