@@ -285,8 +285,23 @@ def explain(
             break
     rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
     if best.changes:
+        best, tests = _drop_needless_changes(best, tests, run, gates)
         best = replace(best, changes=(*best.changes, *find_steps(tests, period_s)))
     return [best, *sorted(rivals, key=lambda each: -each.score)[:_MOST_RIVALS]] if best.changes or rivals else []
+
+
+def _drop_needless_changes(
+    best: Hypothesis, tests: Tests, run: Callable[[Hypothesis, int, int], Pass], gates: Floats
+) -> tuple[Hypothesis, Tests]:
+    """Return a hypothesis without the changes that later ones explain as well, and its tests."""
+    size = tests.verdict.shape[0]
+    for change in best.changes[:-1]:
+        fewer = replace(best, changes=tuple(each for each in best.changes if each is not change))
+        of_fewer = run(fewer, 0, size).tests
+        lost = compute_evidence(tests, gates, 0, size) - compute_evidence(of_fewer, gates, 0, size) - change.cost
+        if lost < _SURELY:
+            best, tests = replace(fewer, score=best.score - lost), of_fewer
+    return best, tests
 
 
 def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> bool:
