@@ -473,7 +473,7 @@ def _compare_with_truth(world: World, log: Log, track: Track, labelled: Labelled
     speed = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
     true_speed = np.hypot(*world.at(rows_s, world.velocity_mps)[:, :2].T)
     changes = sum(len(section.changes) for section in facts.fuse.stretches) + len(facts.sensor_checks.excluded)
-    changes += sum(offset.noted for offset in facts.clock_offsets.offsets.values()) if facts.clock_offsets else 0
+    changes += sum(offset.noted for clocks in facts.clock_offsets or () for offset in clocks.offsets.values())
     return Outcome(
         start_s.tolist(), {name: values.tolist() for name, values in error.items()},
         {name: to_floats(table, column).tolist() for name, (_, column, *_) in QUANTITIES.items()},

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import DETERMINED, PRIORS, NoiseModel
+from tcpipe.fusion.densities import DETERMINED, NoiseModel
 from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
 from tcpipe.fusion.initial import compute_course_rate
 from tcpipe.fusion.measurements import NO_LEVER_ARM, VISUAL, WHEELS, BodyVelocities, Measurements
@@ -43,7 +43,6 @@ from tcpipe.robust import estimate_robust_std
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_OTHER_KIND = 9.0  # ratio of stated variances [1]: float to fixed solutions 100 and more, by geometry less
 _LONGEST_NS = 50_000_000
 _STATIONARY_EVERY_S = 0.2
 _STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
@@ -131,15 +130,11 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
             axes = 1 if kind == state.WHEELS else 3
             put(kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role))
     fix_variance = np.zeros((size, 3))
-    fix_time_s = np.full(size, np.inf if noise.horizontal is None else noise.horizontal.correlated.time_s)
     if m.gnss is not None:
-        white, correlated, usual_m2 = _compute_shares(noise)
-        # Fixes that state much more than the usual ones are of another kind (float): the excess is an error that lasts.
-        usual_m2 = np.minimum(m.gnss.variance_m2, _OTHER_KIND * usual_m2)
-        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, usual_m2 * white)
+        white, correlated = _compute_shares(noise)
+        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * white)
         nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
-        fix_variance = (usual_m2 * correlated + m.gnss.variance_m2 - usual_m2)[nearest]
-        fix_time_s[(m.gnss.variance_m2 > usual_m2)[nearest, 0]] = PRIORS["fix, more"].time_s
+        fix_variance = m.gnss.variance_m2[nearest] * correlated
     attitude = np.zeros((size, 3))
     if m.gnss is not None and m.gnss.quat_xyzw is not None and m.gnss.rotation_variance_rad2 is not None:
         measured = np.where(np.isfinite(m.gnss.quat_xyzw).all(1), rows[state.FIX], -1)
@@ -172,7 +167,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         )
         if m.imu.accelerometer_usable:
             mode[by_gyro] = state.INERTIAL
-    kept, fix_noise = _make_fix_process(fix_variance, period_s / fix_time_s)
+    kept, fix_noise = _make_fix_process(noise, fix_variance, period_s)
     inputs = Inputs(
         period_s,
         mode,
@@ -193,18 +188,21 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
     return Ticks(stamp_ns, inputs, rows, fix_variance)
 
 
-def _compute_shares(noise: NoiseModel) -> tuple[Floats, Floats, Floats]:
-    """Return white and correlated share of the stated variance of fixes, and the usual one [m²], each east, north, up."""
+def _compute_shares(noise: NoiseModel) -> tuple[Floats, Floats]:
+    """Return white and correlated share of the claimed variance of fixes, each east, north, up."""
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
     shares = np.array([(fix.white_m2 / fix.claimed_m2, fix.correlated.variance / fix.claimed_m2) for fix in axes])
-    return shares[:, 0], shares[:, 1], np.array([fix.claimed_m2 for fix in axes])
+    return shares[:, 0], shares[:, 1]
 
 
-def _make_fix_process(variance_m2: Floats, decay: Floats) -> tuple[Floats, Floats]:
-    """Return the share of the fixes' correlated error that stays over each tick of ``decay`` correlation times, and the variance added."""
+def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -> tuple[Floats, Floats]:
+    """Return the share of the fixes' correlated error that stays over each tick, and the variance added to it."""
+    size = variance_m2.shape[0]
+    if noise.horizontal is None:
+        return np.ones(size), np.zeros((size, 3))
     before = np.concatenate((variance_m2[:1], variance_m2[:-1]))
     shrunk = np.sqrt(np.minimum(1.0, variance_m2[:, 0] / np.maximum(before[:, 0], 1e-12)))
-    kept = np.exp(-decay) * shrunk
+    kept = np.exp(-period_s / noise.horizontal.correlated.time_s) * shrunk
     return kept, np.maximum(variance_m2 - kept[:, None] ** 2 * before, 0.0)
 
 

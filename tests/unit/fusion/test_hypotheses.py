@@ -136,20 +136,6 @@ def test_no_side_of_a_step_of_fixes_is_believed(share):
     assert drms_m[t > 120.0].min() > 0.5 * 0.3
 
 
-def test_what_a_receiver_states_of_a_float_solution_is_a_floor():
-    m = drive.measure(truth(), 1, visual=False)
-    t = (m.gnss.stamp_ns - drive.ZERO_NS) * 1e-9
-    floats = (t > 60.0) & (t < 110.0)
-    variance = np.where(floats[:, None], np.square([0.3, 0.3, 0.5]), m.gnss.variance_m2)
-    wrong = 0.2 * floats * np.sin((t - 60.0) / 15.0)
-    position = m.gnss.position_enu_m + wrong[:, None] * [0.8, -0.6, 0.0]
-    found = fuse(replace(m, gnss=replace(m.gnss, position_enu_m=position, variance_m2=variance)))
-    t, _, off = find_errors(found)
-    inside = (t > 62.0) & (t < 108.0)
-    assert np.mean(off[inside] < 2.45) > 0.9
-    assert np.median(np.hypot(*found.position_std_m[inside, :2].T)) > 0.05
-
-
 def test_fixes_that_two_odometries_contradict_smoothly_are_an_excursion():
     def bump(t):
         return 0.4 * np.sin(np.pi * np.clip((t - 55.0) / 40.0, 0.0, 1.0)) ** 2
