@@ -20,13 +20,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from tcpipe.fusion.level_motion import KNOT_S
 from tcpipe.fusion.measurements import GNSS, IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, TURN, TURN_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
-from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std
+from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std, solve_non_negative
 from tcpipe.tables.facts import NoiseFacts
 
 Floats = NDArray[np.float64]
@@ -100,7 +99,7 @@ class NoiseModel:
     turns: Mapping[str, TurnNoise]
     shared_scale: GaussMarkov
     offset: GaussMarkov | None = None
-    """Error of fixes beyond what the residuals show [m], east and north: slow, or constant between two steps; None: none."""
+    """Error of fixes beyond what the residuals show [m], east and north: slow, or constant between two steps; None without."""
     densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
     """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 
@@ -287,7 +286,7 @@ class _Fit:
             logarithm = np.log(np.maximum(levels, _LEAST_LEVEL)) + np.minimum(1.0 / (_OVERLAP * counts), 0.5)
             target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
             # Solved in units of the prior, so that rounding does not decide.
-            fitted = nnls(matrix * std, target)[0] * std
+            fitted = solve_non_negative(matrix * std, target) * std
             self._variances = 0.5 * (self._variances + fitted)
             self._covariance = np.linalg.inv(np.einsum("mi,mj->ij", matrix, matrix))
 

@@ -32,7 +32,6 @@ from tcpipe.fusion.hypotheses import (
     POSSIBLE,
     ROLES,
     Change,
-    EventCandidate,
     Hypothesis,
     compute_evidence,
     compute_weights,
@@ -55,7 +54,7 @@ from tcpipe.fusion.measurements import (
     Trajectory,
     select_rows,
 )
-from tcpipe.fusion.pair_residuals import find_residuals
+from tcpipe.fusion.pair_residuals import Residuals, find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, make_model, make_priors, make_start, widen_start
 from tcpipe.fusion.process import (
     GROUND,
@@ -90,8 +89,8 @@ _JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose
 _UNCHANGED = Hypothesis((), 0.0)
 _ERRORS_M = (0.03, 0.06, 0.12, 0.24)
 """Sizes of a lasting error of fixes that are tried [m], 1σ: from RTK's usual error to a wrong ambiguity."""
-_SHOWS_ERROR, _SHOWS_LARGER = 100.0, 8.0
-"""Log likelihood by which such an error, and a larger one, must explain more: gains are -5 to 59 on clean runs, above 1,000 on stepped."""
+_LEAST_GAIN, _LEAST_FURTHER_GAIN = 100.0, 8.0
+"""Least gain in log likelihood [nat] by such an error, and by a larger one: gains are -5 to 59 on clean runs, above 1,000 on stepped."""
 
 
 def make_tests(size: int) -> Tests:
@@ -151,34 +150,24 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     ------
     FusionError : the estimate is not finite.
     """
-    residuals, standing = find_residuals(m), find_stationary_intervals(m)
-    m = inflate_unclaimed_fixes(m, residuals)
-    noise = fit_noise(m, residuals)
-    ticks = build_ticks(m, noise, standing, find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
-    std = make_priors(m, noise, ticks)[0]
-    section = _Section(m, noise, ticks, gate_probability)
-    model = section.make_model()
-    start = make_start(initial, std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
+    section = prepare_section(m, output_ns, gate_probability)
+    model, start, period_s = section.make_model(), section.make_start(initial), section.ticks.inputs.period_s
     first_minute = filter_section(
-        ticks, model, start.select(model.active), until=round(_LEVELLING_S / ticks.inputs.period_s)
+        section.ticks, model, start.select(model.active), until=round(_LEVELLING_S / period_s)
     )
     start.x[:9] = smooth_section(first_minute).states[0, :9]
-    made = filter_section(ticks, model, start.select(model.active))
-    hypotheses = []
-    if _is_judging_fixes(m):
-        hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise))
-        if m.gnss is not None and find_suspects(made.tests, ticks.inputs.period_s):
-            hypotheses = section.prefer_larger_errors(hypotheses, start)
+    made = filter_section(section.ticks, model, start.select(model.active))
+    hypotheses = section.explain(made, start) if _is_judging_fixes(section.measurements) else []
     if hypotheses:
         made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
     if len(hypotheses) > 1:
         rivals = [smooth_section(section.filter(start, each)) for each in hypotheses[1:]]
-        widen(smoothed, rivals, compute_weights(hypotheses), made.ticks.inputs.period_s)
+        widen(smoothed, rivals, compute_weights(hypotheses), period_s)
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
-    return make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
+    return make_trajectory(section, made, smoothed, output_ns, hypotheses[:1])
 
 
 def _is_judging_fixes(m: Measurements) -> bool:
@@ -189,14 +178,33 @@ def _is_judging_fixes(m: Measurements) -> bool:
     return carries and (m.gnss is None or float(np.median(m.gnss.variance_m2[:, 0])) < _JUDGED_M**2)
 
 
+def prepare_section(m: Measurements, output_ns: Ints, gate_probability: float) -> SectionModel:
+    """Return what an estimator needs of a section: its noise comes from the residuals of all pairs of sensors."""
+    residuals, standing = find_residuals(m), find_stationary_intervals(m)
+    m = inflate_unclaimed_fixes(m, residuals)
+    noise = fit_noise(m, residuals)
+    ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
+    return SectionModel(m, residuals, noise, ticks, make_priors(m, noise, ticks)[0], gate_probability)
+
+
 @dataclass(frozen=True, slots=True)
-class _Section:
-    """A section that is filtered under several hypotheses."""
+class SectionModel:
+    """A section as estimators take it, under one hypothesis or another.
+
+    ``residuals`` are of the pairs of sensors, ``std`` is the standard deviation of every error before the measurements, shape (45,).
+    """
 
     measurements: Measurements
+    residuals: Sequence[Residuals]
     noise: NoiseModel
     ticks: Ticks
+    std: Floats
     gate_probability: float
+
+    def make_start(self, initial: InitialState) -> Memory:
+        """Return the state of all errors at the first tick."""
+        gnss = self.measurements.gnss
+        return make_start(initial, self.std, (0.0, 0.0, 0.0) if gnss is None else gnss.lever_arm_m)
 
     def make_model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
         """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
@@ -221,51 +229,16 @@ class _Section:
         std = make_priors(self.measurements, hypothesis.alter_noise(self.noise), ticks)[0]
         return filter_section(ticks, changed, widen_start(start, std).select(changed.active))
 
-    def prefer_larger_errors(self, hypotheses: list[Hypothesis], start: Memory) -> list[Hypothesis]:
-        """Return the hypothesis that fixes err by more throughout, and in steps, where it is the most likely one, else those given.
+    def explain(self, made: Pass, start: Memory) -> list[Hypothesis]:
+        """Return the hypotheses that explain where sensors contradict each other, the best first.
 
-        Their noise may be larger, and a slow error may come on top. Spans of wrong or unused fixes would explain both by inventions: a set
-        of changes that holds one is not believed.
-        """
-        best, tests = self._judge(_UNCHANGED, start)
-        for kind in ("noise", "slow"):
-            kept, least = best.changes, best.score + _SHOWS_ERROR
-            for size_m in _ERRORS_M:
-                tried, of_tried = self._judge(Hypothesis((*kept, Change(kind, state.FIX, 0, size=size_m)), 0.0), start)
-                if tried.score <= least:
-                    break
-                best, tests, least = tried, of_tried, tried.score + _SHOWS_LARGER
-        if not best.changes:
-            return hypotheses
-        steps = find_steps(tests, self.ticks.inputs.period_s)
-        stepped = self._judge(Hypothesis((*best.changes, *steps), 0.0), start)[0]
-        best = max(best, stepped, key=lambda each: each.score)
-        for each in hypotheses[:1]:
-            score = self._judge(each, start)[0].score
-            is_invented = len(each.changes) > 1 and any(c.kind in {"offset", "useless"} for c in each.changes)
-            if score > best.score and not is_invented:
-                return hypotheses
-            if score > best.score + _SHOWS_ERROR:
-                count = sum(change.kind not in FIX_ERRORS for change in each.changes)
-                best = replace(best, rival_change_count=count)
-        return [best]
-
-    def _judge(self, hypothesis: Hypothesis, start: Memory) -> tuple[Hypothesis, Tests]:
-        """Return the hypothesis with its score by all measurements of the section, and their tests."""
-        made = self.filter(start, hypothesis, judges=True)
-        score = compute_evidence(made.tests, made.model.gates, 0, made.states.shape[0])
-        return replace(hypothesis, score=score - sum(change.cost for change in hypothesis.changes)), made.tests
-
-    def explain(self, made: Pass, start: Memory, excursions: Sequence[EventCandidate]) -> list[Hypothesis]:
-        """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not.
-
-        ``excursions`` are smooth errors of fixes, which the filter follows.
+        Where they do not, smooth errors of fixes, which the filter follows, are the only one, if there are any.
         """
         jump = find_turn_jump(self.measurements)
-        if jump is None and not find_suspects(made.tests, self.ticks.inputs.period_s):
-            return make_excursions(made, excursions)
-        model = self.make_model(judges=True)
-        plain = filter_section(self.ticks, model, start.select(model.active))
+        suspects = find_suspects(made.tests, self.ticks.inputs.period_s)
+        if jump is None and not suspects:
+            return make_excursions(made, find_fix_excursions(self.residuals, self.noise))
+        plain = self.filter(start, _UNCHANGED, judges=True)
 
         def run(changed: Hypothesis, first: int, last: int) -> Pass:
             block = first // _BLOCK
@@ -273,7 +246,52 @@ class _Section:
             ticks = changed.alter_ticks(self.ticks)
             return filter_section(ticks, self.make_model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
 
-        return explain(plain, run, frozenset(model.active.tolist()), jump)
+        found = explain(plain, run, frozenset(plain.model.active.tolist()), jump)
+        return (
+            self._prefer_larger_errors(found, plain, start)
+            if suspects and self.measurements.gnss is not None
+            else found
+        )
+
+    def _prefer_larger_errors(self, hypotheses: list[Hypothesis], plain: Pass, start: Memory) -> list[Hypothesis]:
+        """Return the hypothesis that fixes err by more throughout, and in steps, where it is the most likely one, else those given.
+
+        The noise of fixes may be larger, and a slow error may come on top. Spans of wrong or unused fixes would explain both: a set of
+        changes that contains such a span is rejected. ``plain`` is the pass without any change.
+        """
+        best, tests = _score(_UNCHANGED, plain), plain.tests
+        for kind in ("noise", "slow"):
+            changes, least = best.changes, best.score + _LEAST_GAIN
+            for size_m in _ERRORS_M:
+                tried, of_tried = self._judge((*changes, Change(kind, state.FIX, 0, size=size_m)), start)
+                if tried.score <= least:
+                    break
+                best, tests, least = tried, of_tried, tried.score + _LEAST_FURTHER_GAIN
+        if not best.changes:
+            return hypotheses
+        if steps := find_steps(tests, self.ticks.inputs.period_s):
+            stepped = self._judge((*best.changes, *steps), start)[0]
+            best = max(best, stepped, key=lambda each: each.score)
+        for changes in (each.changes for each in hypotheses[:1]):
+            score = self._judge(changes, start)[0].score
+            has_wrong_span = len(changes) > 1 and any(change.kind in {"offset", "useless"} for change in changes)
+            if score > best.score and not has_wrong_span:
+                return hypotheses
+            if score > best.score + _LEAST_GAIN:
+                best = replace(best, rival_change_count=sum(change.kind not in FIX_ERRORS for change in changes))
+        return [best]
+
+    def _judge(self, changes: Sequence[Change], start: Memory) -> tuple[Hypothesis, Tests]:
+        """Return the hypothesis of some changes with its score, and the tests of all measurements of the section."""
+        hypothesis = Hypothesis(tuple(changes), 0.0)
+        made = self.filter(start, hypothesis, judges=True)
+        return _score(hypothesis, made), made.tests
+
+
+def _score(hypothesis: Hypothesis, made: Pass) -> Hypothesis:
+    """Return a hypothesis with the log likelihood of all measurements of a pass under it, less the costs of its changes."""
+    score = compute_evidence(made.tests, made.model.gates, 0, made.states.shape[0])
+    return replace(hypothesis, score=score - sum(change.cost for change in hypothesis.changes))
 
 
 def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s: float) -> None:
@@ -300,23 +318,17 @@ def _compute_yaw(states: Floats) -> Floats:
     return np.arctan2(states[:, 3], states[:, 0])
 
 
-def find_start_ns(m: Measurements, output_ns: Ints) -> int:
+def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
     """Return the first stamp of a measurement of motion, or that of the first wanted state if it is earlier [ns]."""
     moving = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != IMU]
     return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
-def make_trajectory(  # noqa: PLR0917
-    m: Measurements,
-    noise: NoiseModel,
-    made: Pass,
-    smoothed: Smoothed,
-    std: Floats,
-    output_ns: Ints,
-    explained: Sequence[Hypothesis],
+def make_trajectory(
+    section: SectionModel, made: Pass, smoothed: Smoothed, output_ns: Ints, explained: Sequence[Hypothesis]
 ) -> Trajectory:
-    """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
-    ticks = made.ticks
+    """Return the trajectory at the wanted stamps [ns]; its standard deviations include errors that no state of the filter has."""
+    m, noise, std, ticks = section.measurements, section.noise, section.std, made.ticks
     at = np.searchsorted(ticks.stamp_ns, output_ns)
     x, variances = smoothed.states[at], smoothed.variances[at]
     rotation, velocity, rate = _make_motion(x, ticks, at)

@@ -104,7 +104,7 @@ class Change:
                 yield Event(self.last, place, count, std, is_new=place == state.FIX_OFFSET)
 
     def alter_ticks(self, ticks: Ticks, *, drifts: bool) -> Ticks:
-        """Return the ticks as they are under the change; around a step fixes also err as if they drifted (``drifts``)."""
+        """Return the ticks as they are under the change; if ``drifts``, fixes may also drift before and after a step."""
         inputs = ticks.inputs
         if self.kind in {"noise", "wander"} or (self.kind == "step" and drifts):
             kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
@@ -180,7 +180,7 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Changes, and their score against that of none, in nats; changes of a set that explains clearly more, and was not believed."""
+    """Set of changes with its score [nat], and the number of changes in a rejected set that explains clearly more."""
 
     changes: tuple[Change, ...]
     score: float
@@ -192,7 +192,7 @@ class Hypothesis:
         return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
 
     def alter_ticks(self, ticks: Ticks, *, drifts: bool = False) -> Ticks:
-        """Return the ticks as they are under all changes; an estimate ``drifts`` around steps, a comparison of hypotheses does not."""
+        """Return the ticks as they are under all changes; ``drifts`` is False while hypotheses are compared."""
         for change in self.changes:
             ticks = change.alter_ticks(ticks, drifts=drifts)
         return ticks
@@ -202,10 +202,11 @@ class Hypothesis:
         roles = [ROLES[change.role] for change in self.changes if change.kind == "varies"]
         varying = {role: replace(noise.odometries[role], scale=_VARYING) for role in roles}
         # Either side of a step may be right: both are off by half of it, 1σ, for as long as they last.
-        steps_m = [0.5 * change.size for change in self.changes if change.kind == "step"]
-        slow_m = [change.size for change in self.changes if change.kind == "slow"]
-        sizes_m = (*steps_m, *slow_m)
-        offset = GaussMarkov(max(sizes_m) ** 2, _SLOW_S if slow_m else np.inf) if sizes_m else None
+        step_m, slow_m = (
+            max((change.size for change in self.changes if change.kind == kind), default=0.0)
+            for kind in ("step", "slow")
+        )
+        offset = GaussMarkov(max(0.5 * step_m, slow_m) ** 2, _SLOW_S if slow_m else np.inf)
         return replace(noise, odometries={**noise.odometries, **varying}, offset=offset)
 
     @property
@@ -313,9 +314,11 @@ def _is_possible(change: Change, best: Hypothesis, active: Collection[int]) -> b
 
 def find_steps(tests: Tests, period_s: float) -> list[Change]:
     """Return a step of the fixes wherever they are rejected for long."""
-    suspects = [each for each in find_suspects(tests, period_s) if each.role == state.FIX]
-    sizes_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in suspects]
-    return [Change("step", state.FIX, each.first, size=size) for each, size in zip(suspects, sizes_m, strict=True)]
+    return [
+        Change("step", state.FIX, each.first, size=float(np.linalg.norm(_find_innovation_m(each, tests))))
+        for each in find_suspects(tests, period_s)
+        if each.role == state.FIX
+    ]
 
 
 def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> list[Hypothesis]:

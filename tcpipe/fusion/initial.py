@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import (
+    Plane,
     bridge_outliers,
     compute_interval_means,
     compute_median_of_five,
@@ -34,7 +35,6 @@ from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Plane = NDArray[np.complex128]
 
 _MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
 _MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°

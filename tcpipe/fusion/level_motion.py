@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import IMU, BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
+    Plane,
     compute_interval_means,
     compute_median_of_five,
     compute_median_period_ns,
@@ -28,7 +29,6 @@ from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotat
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Plane = NDArray[np.complex128]
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
 STEP_S = 0.05

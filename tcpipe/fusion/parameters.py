@@ -69,7 +69,7 @@ _MEAN_LASTS_S = 100.0  # the mean of a varying scale strays by as much as the sc
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What changes at a tick: errors from ``place`` on grow by ``std``, or are drawn anew from their prior (``is_new``)."""
+    """Change of ``count`` errors from ``place`` on at a tick: ``std`` is added to each, or, if ``is_new``, it has its prior again."""
 
     tick: int
     place: int
@@ -253,15 +253,15 @@ def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Me
     return Memory(x, P, np.zeros((state.KINDS, 2)))
 
 
-_START_FIXES = 3.0
-"""Standard deviations of a lasting error of fixes by which the start, which is made of the first fixes, may be off."""
+_START_STDS = 3.0
+"""Error of the start position, which comes from the first fixes, in standard deviations of a constant error of fixes."""
 
 
 def widen_start(start: Memory, std: Floats) -> Memory:
-    """Return a start of all errors whose fixes err by other standard deviations ``std``, shape (45,), than it was made with."""
+    """Return the start of all errors with the standard deviations ``std``, shape (45,), of the errors of fixes."""
     widened = start.copy()
     for place in range(state.FIX_ERROR, state.FIX_OFFSET + 3):
         widened.P[place, place] = std[place] ** 2
-    offset_m2 = (_START_FIXES * std[state.FIX_OFFSET]) ** 2
+    offset_m2 = (_START_STDS * std[state.FIX_OFFSET]) ** 2
     widened.P[range(state.RHO, state.RHO + 3), range(state.RHO, state.RHO + 3)] += offset_m2
     return widened

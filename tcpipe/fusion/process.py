@@ -25,6 +25,7 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
+    Plane,
     bridge_outliers,
     compute_median_of_five,
     compute_median_period_ns,
@@ -37,7 +38,6 @@ from tcpipe.robust import estimate_robust_std
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Plane = NDArray[np.complex128]
 
 SCALE_STD: Mapping[str, float] = {
     WHEELS: 0.12,  # a skid-steered robot on grass slips by so much
@@ -286,9 +286,8 @@ def _compute_accelerations(stamp_s: Floats, values: Plane, std: float, order: in
     Successive means are compared, of so few samples of a standard deviation ``std`` as show an acceleration of `_SHOWN_MPS2`.
     """
     wanted = _SHOWN_MPS2 * float(np.median(np.diff(stamp_s))) ** order / std
-    rows = int(
-        np.ceil((np.sqrt(4.0 * order - 2.0) / wanted) ** (1.0 / (order + 0.5)))
-    )  # 1 and 2 differences: √2 and √6 std
+    # First and second differences have √2 and √6 times the standard deviation of a sample.
+    rows = int(np.ceil((np.sqrt(4.0 * order - 2.0) / wanted) ** (1.0 / (order + 0.5))))
     rows = min(rows, stamp_s.size // (order + 2))
     at_s, values = (np.convolve(each, np.full(rows, 1.0 / rows), "valid") for each in (stamp_s, values))
     for _ in range(order):

@@ -17,24 +17,18 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import fit_noise, inflate_unclaimed_fixes
-from tcpipe.fusion.error_state import find_start_ns, make_tests, make_trajectory
+from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Memory, Model
-from tcpipe.fusion.initial import find_stationary_intervals
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
-from tcpipe.fusion.pair_residuals import find_residuals
-from tcpipe.fusion.parameters import make_model, make_priors, make_start
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
-from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
+from tcpipe.fusion.ticks import Pass, Ticks
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _MAX_ANGLE_STD_RAD = 1.0  # sigma points lie at √3 σ, and must not go round the circle
-_RESET_COUNT, _RESET_S = (
-    5,
-    5.0,
-)  # measurements of a kind that the gate has rejected in a row, and for how long, before it is reset
+_RESET_COUNT, _RESET_S = 5, 5.0
+"""Rejections in a row of one kind of measurement, and their least duration [s], after which the gate is reset."""
 _RESET_VELOCITY_STD_MPS = 0.3  # that of the start
 _MEASURED_ERRORS = {
     state.WHEELS: state.U,
@@ -57,18 +51,11 @@ def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_p
     output_ns : [ns], shape (N,), increasing multiples of the track's period.
     gate_probability : a measurement less likely than 1 minus this is rejected (χ² on its squared normalised innovation).
     """
-    residuals, stationary_ns = find_residuals(m), find_stationary_intervals(m)
-    m = inflate_unclaimed_fixes(m, residuals)
-    noise = fit_noise(m, residuals)
-    ticks = build_ticks(m, noise, stationary_ns, find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
-    std, walk, time_s = make_priors(m, noise, ticks)
-    model = make_model(
-        m, std, walk, (), period_s=ticks.inputs.period_s, gate_probability=gate_probability, time_s=time_s
-    )
+    section = prepare_section(m, output_ns, gate_probability)
+    model = section.make_model()
     initial = replace(initial, yaw_std_rad=min(initial.yaw_std_rad, _MAX_ANGLE_STD_RAD))
-    start = make_start(initial, std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m).select(model.active)
-    forward, estimate = filter_forward(ticks, model, start)
-    found = make_trajectory(m, noise, forward, estimate, std, output_ns, ())
+    forward, estimate = filter_forward(section.ticks, model, section.make_start(initial).select(model.active))
+    found = make_trajectory(section, forward, estimate, output_ns, ())
     # While a forward filter learns a parameter its estimate changes, and the parameter does not.
     parameters = {name: replace(learned, variation=()) for name, learned in found.facts.parameters.items()}
     return replace(found, facts=replace(found.facts, parameters=parameters))
@@ -132,9 +119,8 @@ class _Filter:
         kept, noise = model.kept.copy(), model.noise.copy()
         kept[self._is_fix_error] = inputs.fix_kept[k]
         noise[self._is_fix_error] += inputs.fix_noise[k, model.active[self._is_fix_error] - state.FIX_ERROR]
-        noise[state.THETA : state.THETA + 3] += inputs.noise[
-            k, :3
-        ]  # rotation, position and velocity are always active, and first
+        # Rotation, position and velocity are always active, and first.
+        noise[state.THETA : state.THETA + 3] += inputs.noise[k, :3]
         noise[state.U : state.U + 3] += inputs.noise[k, 3:]
         motion = inputs.mode[k], inputs.period_s, inputs.turned[k], inputs.gained[k]
         moving = np.flatnonzero(model.active < state.MOVING)
@@ -209,10 +195,8 @@ class _Filter:
     def _correct(self) -> None:
         """Move the error that filterpy has found into the estimate, and turn the axes of rotation and position errors with it."""
         ukf, turn = self._ukf, np.eye(self._model.active.size)
-        for first, share in (
-            (state.THETA, -0.5),
-            (state.RHO, -1.0),
-        ):  # right Jacobian of SO(3) to second order (Solà 2017, eq. 183)
+        # The right Jacobian of SO(3) to second order (Solà 2017, eq. 183).
+        for first, share in ((state.THETA, -0.5), (state.RHO, -1.0)):
             block = np.empty(9)
             state.make_rotation(*(share * ukf.x[:3]), block)
             turn[first : first + 3, first : first + 3] = block.reshape(3, 3)

@@ -337,7 +337,7 @@ def propose_tables(path: Path) -> ProposedRecipe:
 
 
 def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[str, Path]:
-    """Return the files of the largest run; keys are their names in the recipe, with a * where the names of runs differ.
+    """Return the files of the largest run by their names in the recipe, in which a * replaces the part that differs between runs.
 
     A part of a name tells runs apart if every table has several such files, with the same columns. Of one kind of table these are logs of
     all sensors; else the numbers may be those of motors.

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from tcpipe.power.rails import Rail, Samples, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
+from tcpipe.robust import solve_non_negative
 from tcpipe.tables.facts import Smoothing
 
 Floats = NDArray[np.float64]
@@ -210,10 +210,10 @@ def fit_signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bo
     error = _estimate_error_variance(signal, still, period_s, averaged=averaged)
     if error is None:
         columns = np.vstack((np.ones(len(spacing)), shown[2:]))  # faster processes look like independent errors
-        error, *size[2:] = nnls((columns * weight).T, seen * weight)[0].tolist()
+        error, *size[2:] = solve_non_negative((columns * weight).T, seen * weight).tolist()
     else:
         error = min(error, float(seen.min()))
-        size = nnls((shown * weight).T, (seen - error) * weight)[0]
+        size = solve_non_negative((shown * weight).T, (seen - error) * weight)
     slope_variance = float(size @ _SLOPES) / period_s**2
     return SignalModel(error, size @ _PROCESSES, period_s * _TAU, float(size @ shown[:, 0]), slope_variance)
 

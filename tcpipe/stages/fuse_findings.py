@@ -183,7 +183,7 @@ def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
 
 
 def _find_unlikely_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
-    """Yield each section whose sensors are explained by more changes than are likely."""
+    """Yield the finding of each section that needs more changes than are likely."""
     most = read_threshold("changes-unlikely", "max_change_count")
     for section in facts.stretches:
         count = section.count_changes()

@@ -60,7 +60,7 @@ class Section:
     prepared : by role, messages that are not used as they are.
     excluded : by role, why a sensor is not fused.
     scales : by odometry, the scale that was taken out.
-    clocks : time offsets of the sensors; ``measurements`` contain them until `tcpipe.stages.fuse.correct_clocks`.
+    clocks : time offsets of the sensors; ``measurements`` contain them until `tcpipe.stages.fuse_clocks.correct_clocks`.
     cuts : by first stamp [ns] after the clock of all sensors was set forward, the finding.
     is_base_free : whether no other section shows where base_link is.
     """
@@ -105,8 +105,7 @@ _PAUSE_NS = 3_600_000_000_000
 
 def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
     """Return the measurements of each clock epoch, in order of epoch and time, without those that have no usable value."""
-    roles = (GNSS, IMU, WHEELS, VISUAL) if config.estimator == "ukf" else (GNSS, DOPPLER, IMU, WHEELS, VISUAL)
-    tables = {role: streams.tables[role] for role in roles if role in streams.tables}
+    tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
     tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
     if GNSS in tables:

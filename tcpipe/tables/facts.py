@@ -101,7 +101,7 @@ class GateReset:
 
 
 FIX_ERRORS = frozenset({"noise", "slow", "wander", "step"})
-"""Kinds of changes by which fixes err for long, and nothing else changes."""
+"""Kinds of changes that only increase the errors of fixes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ class StretchFacts:
         )
 
     def count_changes(self) -> int:
-        """Return how many changes the sensors need; lasting errors of fixes are none, as they only make the position uncertain."""
+        """Return the number of changes that explain the sensors, without `FIX_ERRORS`, which only make the position uncertain."""
         return max(self.rival_change_count, sum(each.kind not in FIX_ERRORS for each in self.changes))
 
 
@@ -517,7 +517,7 @@ class StageFacts:
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
     audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
     clock_offsets: tuple[ClockFacts, ...] = field(default=(), metadata=LEFT_OUT)
-    """Of each section."""
+    """Time offsets between the sensors of each section, in order of clock epoch and time."""
     mask: MaskFacts | None = field(default=None, metadata=LEFT_OUT)
     segment: SegmentFacts | None = field(default=None, metadata=LEFT_OUT)
     label: LabelFacts | None = field(default=None, metadata=LEFT_OUT)

@@ -69,7 +69,11 @@ class Stacks(NamedTuple):
 
 
 class _Taps(NamedTuple):
-    """Of each patch pixel, (S·S,): the window's pixel left above, how far right and below of that it is [px], whether it is valid."""
+    """Position of each patch pixel in the window, (S·S,) each.
+
+    ``at`` is the window's pixel above and to the left, ``fx`` and ``fy`` are the distances from it to the right and down [px]; ``good``
+    marks valid patch pixels.
+    """
 
     at: NDArray[np.uint64]
     fx: NDArray[np.float32]

@@ -105,9 +105,10 @@ def find_middle_ns(m: Measurements) -> tuple[int, float]:
 
 
 def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:
-    """Return the offsets of sensors from the largest group that shares a clock, beyond the fine search and within it.
+    """Return by role the time offset of each sensor from the largest group of sensors that share a clock.
 
-    Those beyond it are noted. Nothing is returned if there are none, unless ``always``; sensors whose offset is unknown are missing.
+    Offsets that the fine search cannot find are noted. Returns {} if there are none, unless ``always``. Sensors whose offset is unknown
+    are missing.
     """
     late_s = find_coarse_offsets(m)
     coarse = {

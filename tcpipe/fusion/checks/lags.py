@@ -18,9 +18,8 @@ from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.fusion.signals import (
     compute_median_of_five,
     compute_seconds,
-    find_longest_step_ns,
     integrate_signal,
-    is_in_gap,
+    is_covered,
 )
 
 GRID_S = 0.02
@@ -244,8 +243,8 @@ def resample_signal(stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[
     """
     edges_s: Floats = (np.arange(at_ns.size + 1, dtype=np.float64) - 0.5) * GRID_S
     means = np.diff(integrate_signal(compute_seconds(stamp_ns, int(at_ns[0])), values, edges_s), axis=0) / GRID_S
-    longest_ns, half = find_longest_step_ns(stamp_ns, _MAX_GAP_NS), GRID_NS // 2
-    means[is_in_gap(stamp_ns, at_ns - half, at_ns + half, longest_ns=longest_ns)] = np.nan
+    half = GRID_NS // 2
+    means[~is_covered(stamp_ns, at_ns - half, at_ns + half, least_ns=_MAX_GAP_NS)] = np.nan
     return means
 
 

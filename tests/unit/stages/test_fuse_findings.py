@@ -245,8 +245,9 @@ def streams():
     return Streams(dict(zip(roles, (fixes, told), strict=True)), sensors, "husky")
 
 
-def test_what_no_receiver_claims_is_the_recipes(streams):
-    (section,) = prepare_sections(streams, FuseConfig(gnss_velocity_std_mps=0.2))
+@pytest.mark.parametrize("estimator", ["smoother", "ukf"])
+def test_what_no_receiver_claims_is_the_recipes(streams, estimator):
+    (section,) = prepare_sections(streams, FuseConfig(estimator, gnss_velocity_std_mps=0.2))
     found = section.measurements
     assert set(found.sensors()) == {"gnss", "gnss_velocity"}
     assert found.doppler.velocity_enu_mps[0].tolist() == [0.76, 0.0, 0.0]
