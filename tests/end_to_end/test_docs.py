@@ -14,8 +14,9 @@ PAGES = (*(f"tutorials/{page.name}" for page in sorted((DOCS / "tutorials").glob
 def _masked(text: str) -> list[str]:
     """Return lines with runs of digits, hashes and blanks as one sign each; lists in alphabetical order, not by size."""
     text = re.sub(r"(?<![\d.])\b[0-9a-f]{8}(?:[0-9a-f]{8})?\b", "#", text)
+    text = re.sub(r"[ ]+([\],])", r"\1", text)  # numpy pads its arrays to the widest number, which differs by processor
     text = re.sub(r"[-+]?\b\d[\d.,e+-]*", "#", text)
-    text = re.sub(r"[ ]*([\[\],])[ ]*", r"\1 ", text)  # numpy pads its arrays to the widest number
+    text = re.sub(r"[ ]*([\[\],])[ ]*", r"\1 ", text)
     return [re.sub(r"[\s─═-]+", " ", ", ".join(sorted(line.split(", ")))).strip() for line in text.splitlines()]
 
 
