@@ -23,7 +23,7 @@ from campaign_drives import HUSKY, WHOLE, MemoryLog, simulated
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.fusion.densities import FixNoise, GaussMarkov, NoiseModel, fit_noise
-from tcpipe.fusion.hypotheses import find_event_candidates
+from tcpipe.fusion.excursions import find_event_candidates
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.recipe import Recipe

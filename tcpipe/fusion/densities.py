@@ -98,8 +98,6 @@ class NoiseModel:
     odometries: Mapping[str, OdometryNoise]
     turns: Mapping[str, TurnNoise]
     shared_scale: GaussMarkov
-    offset: GaussMarkov | None = None
-    """Error of fixes beyond what the residuals show [m], east and north: slow, or constant between two steps; None without."""
     densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
     """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 

@@ -1,14 +1,12 @@
 """The default estimator: an error-state unscented filter on SE(3), and its smoother (`filter_kernel`: equations).
 
-Memory is bounded: the forward pass keeps a checkpoint for each block of ticks; on the way back each block is filtered once more, this
-time with everything kept, and smoothed. The second pass repeats the arithmetic of the first exactly, gates included.
+Where sensors contradict each other for long, changes are searched that explain it (`changes`), and the section is estimated again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,32 +14,20 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
-from tcpipe.fusion.densities import NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
-from tcpipe.fusion.filter_kernel import (
-    ACCEPTED,
-    NONE,
-    REJECTED,
-    RESET,
-    Memory,
-    Model,
-    Tests,
-    allocate_steps,
-    filter_ticks,
-)
-from tcpipe.fusion.hypotheses import (
+from tcpipe.fusion.changes import (
+    LARGER_ERRORS,
     POSSIBLE,
     ROLES,
     Change,
     Hypothesis,
     compute_evidence,
-    compute_weights,
-    explain,
-    find_fix_excursions,
-    find_steps,
-    find_suspects,
-    find_turn_jump,
-    make_excursions,
+    drop_outliers,
+    is_contradicted,
+    join_events,
 )
+from tcpipe.fusion.densities import PRIORS, NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
+from tcpipe.fusion.excursions import find_excursions
+from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, RESET, Memory, Model, Tests
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
@@ -55,7 +41,8 @@ from tcpipe.fusion.measurements import (
     select_rows,
 )
 from tcpipe.fusion.pair_residuals import Residuals, find_residuals
-from tcpipe.fusion.parameters import PARAMETERS, make_model, make_priors, make_start, widen_start
+from tcpipe.fusion.parameters import PARAMETERS, find_walk, make_model, make_priors, make_start, widen_start
+from tcpipe.fusion.passes import filter_section, smooth_section
 from tcpipe.fusion.process import (
     GROUND,
     SLOPE_RAD,
@@ -66,7 +53,7 @@ from tcpipe.fusion.process import (
     is_length_observable,
     is_turned_by_course,
 )
-from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed, make_adjoint, smooth_ticks
+from tcpipe.fusion.smoother_kernel import Smoothed
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.facts import FIX_ERRORS, ChangeFacts, GateReset, ParameterFacts, StretchFacts
@@ -86,54 +73,14 @@ _LEVELLING_S = 60.0
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50  # from so many on, their white noise is averaged out
 _JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose no better
-_UNCHANGED = Hypothesis((), 0.0)
-_ERRORS_M = (0.03, 0.06, 0.12, 0.24)
-"""Sizes of a lasting error of fixes that are tried [m], 1σ: from RTK's usual error to a wrong ambiguity."""
+_UNCHANGED = Hypothesis(())
+_FEW_CHANGES = 2
+"""Changes in a section that are likely [1]."""
+_MOST_EVENTS = 6
+_NEARLY_EXACT = 1e-4
+"""Standard deviation of errors that are known exactly, in their unit, where events are searched: sigma points need a width."""
 _LEAST_GAIN, _LEAST_FURTHER_GAIN = 100.0, 8.0
 """Least gain in log likelihood [nat] by such an error, and by a larger one: gains are -5 to 59 on clean runs, above 1,000 on stepped."""
-
-
-def make_tests(size: int) -> Tests:
-    """Return tests to be filled."""
-    shape = size, state.KINDS
-    return Tests(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.int8), np.full((size, 3), np.nan))
-
-
-def list_blocks(size: int) -> list[tuple[int, int]]:
-    """Return first and last tick, the latter excluded, of each block."""
-    return list(pairwise([*range(0, size, _BLOCK), size]))
-
-
-def filter_section(ticks: Ticks, model: Model, start: Memory, *, begin: int = 0, until: int | None = None) -> Pass:
-    """Return the forward pass from a start, over all ticks or those from ``begin``, where a block begins, to before ``until``."""
-    size = min(until or ticks.stamp_ns.size, ticks.stamp_ns.size)
-    made = Pass(ticks, model, [], make_tests(size), np.zeros((size, state.NX)), start.copy())
-    empty = allocate_steps(0, model.active.size)
-    for first, last in list_blocks(size):
-        if first < begin:
-            continue
-        made.checkpoints.append(made.last.copy())
-        filter_ticks(first, last, ticks.inputs, model, made.last, False, empty, made.tests, made.states)
-    return made
-
-
-def smooth_section(made: Pass) -> Smoothed:
-    """Return the smoothed estimate of a forward pass."""
-    size, n = made.states.shape[0], made.model.active.size
-    lags = np.array([round(lag_s / made.ticks.inputs.period_s) for lag_s in DISPLACEMENT_LAGS_S])
-    adjoint = make_adjoint(n, int(lags.max()))
-    out = Smoothed(
-        np.zeros_like(made.states),
-        np.zeros((size, 5)),
-        np.full((size, lags.size), np.nan),
-        np.zeros((-(-size // SELDOM), n)),
-    )
-    steps, again, filtered = allocate_steps(min(size, _BLOCK), n), make_tests(size), np.zeros_like(made.states)
-    for (first, last), memory in zip(reversed(list_blocks(size)), reversed(made.checkpoints), strict=True):
-        steps.used[:] = False
-        filter_ticks(first, last, made.ticks.inputs, made.model, memory.copy(), True, steps, again, filtered)
-        smooth_ticks(first, last, made.ticks.inputs, made.model, steps, filtered, lags, adjoint, out)
-    return out
 
 
 def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_probability: float = 0.999) -> Trajectory:  # fmt: skip
@@ -151,23 +98,20 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     FusionError : the estimate is not finite.
     """
     section = prepare_section(m, output_ns, gate_probability)
-    model, start, period_s = section.make_model(), section.make_start(initial), section.ticks.inputs.period_s
-    first_minute = filter_section(
-        section.ticks, model, start.select(model.active), until=round(_LEVELLING_S / period_s)
-    )
-    start.x[:9] = smooth_section(first_minute).states[0, :9]
-    made = filter_section(section.ticks, model, start.select(model.active))
-    hypotheses = section.explain(made, start) if _is_judging_fixes(section.measurements) else []
-    if hypotheses:
-        made = section.filter(start, hypotheses[0])
-    smoothed = smooth_section(made)
-    if len(hypotheses) > 1:
-        rivals = [smooth_section(section.filter(start, each)) for each in hypotheses[1:]]
-        widen(smoothed, rivals, compute_weights(hypotheses), period_s)
+    start, explanation = section.make_start(initial), _UNCHANGED
+    minute = round(_LEVELLING_S / section.ticks.inputs.period_s)
+    start.x[:9] = smooth_section(section.filter(start, until=minute))[0].states[0, :9]
+    made = section.filter(start)
+    smoothed, events = smooth_section(made)
+    if _is_judging_fixes(section.measurements):
+        explanation = section.explain(made, events, start)
+    if explanation.changes:
+        made = section.filter(start, explanation)
+        smoothed, _ = smooth_section(made)
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
-    return make_trajectory(section, made, smoothed, output_ns, hypotheses[:1])
+    return make_trajectory(section, made, smoothed, output_ns, explanation)
 
 
 def _is_judging_fixes(m: Measurements) -> bool:
@@ -206,116 +150,122 @@ class SectionModel:
         gnss = self.measurements.gnss
         return make_start(initial, self.std, (0.0, 0.0, 0.0) if gnss is None else gnss.lever_arm_m)
 
-    def make_model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
-        """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
-        std, walk, time_s = make_priors(self.measurements, changes.alter_noise(self.noise), self.ticks)
-        return make_model(
+    def filter(
+        self,
+        start: Memory,
+        hypothesis: Hypothesis = _UNCHANGED,
+        *,
+        judges: bool = False,
+        kept: Floats | None = None,
+        until: int | None = None,
+    ) -> Pass:
+        """Return the forward pass under a hypothesis from a start of all errors.
+
+        One that ``judges`` holds all errors that an event could change, and follows no fix that is rejected. With ``kept`` measurements,
+        (K, 9, 3), the pass uses those, without a gate.
+        """
+        ticks, model, begin = self.prepare(start, hypothesis, judges=judges)
+        if kept is not None:
+            ticks = replace(ticks, inputs=ticks.inputs._replace(value=kept))
+            model = model._replace(gates=np.full(state.KINDS, np.inf))
+            exact = [
+                place for place, error in enumerate(model.active) if error in POSSIBLE and not begin.P[place, place]
+            ]
+            begin.P[exact, exact] = _NEARLY_EXACT**2
+        return filter_section(ticks, model, begin, until=until)
+
+    def prepare(
+        self, start: Memory, hypothesis: Hypothesis = _UNCHANGED, *, judges: bool = False
+    ) -> tuple[Ticks, Model, Memory]:
+        """Return ticks, model and start of a pass under a hypothesis; see `filter`."""
+        ticks = hypothesis.alter_ticks(self.ticks, drifts=not judges)
+        std, walk, time_s = make_priors(self.measurements, self.noise, ticks)
+        hypothesis.alter_priors(std, walk, time_s)
+        if judges and self.measurements.imu is not None:  # a jump of the bias has made the walk that was fitted larger
+            walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = find_walk(PRIORS["imu bias"])
+        model = make_model(
             self.measurements,
             std,
             walk,
-            changes.events,
-            period_s=self.ticks.inputs.period_s,
+            hypothesis.events,
+            period_s=ticks.inputs.period_s,
             gate_probability=self.gate_probability,
             time_s=time_s,
             follows=not judges,
-            ignored=changes.ignored,
+            ignored=hypothesis.ignored,
             possible=POSSIBLE if judges else (),
         )
+        return ticks, model, widen_start(start, std).select(model.active)
 
-    def filter(self, start: Memory, hypothesis: Hypothesis, *, judges: bool = False) -> Pass:
-        """Return the forward pass under a hypothesis from a start of all errors."""
-        changed = self.make_model(hypothesis, judges=judges)
-        ticks = hypothesis.alter_ticks(self.ticks, drifts=not judges)
-        std = make_priors(self.measurements, hypothesis.alter_noise(self.noise), ticks)[0]
-        return filter_section(ticks, changed, widen_start(start, std).select(changed.active))
+    def explain(self, made: Pass, events: Sequence[Change], start: Memory) -> Hypothesis:
+        """Return the changes that explain most of where sensors contradict each other, none where they do not.
 
-    def explain(self, made: Pass, start: Memory) -> list[Hypothesis]:
-        """Return the hypotheses that explain where sensors contradict each other, the best first.
-
-        Where they do not, smooth errors of fixes, which the filter follows, are the only one, if there are any.
+        ``events`` explain much of the pass ``made``. Smooth errors of fixes, which the filter follows, need no contradiction.
         """
-        jump = find_turn_jump(self.measurements)
-        suspects = find_suspects(made.tests, self.ticks.inputs.period_s)
-        if jump is None and not suspects:
-            return make_excursions(made, find_fix_excursions(self.residuals, self.noise))
-        plain = self.filter(start, _UNCHANGED, judges=True)
+        period_s = self.ticks.inputs.period_s
+        excursions = find_excursions(self.residuals, self.noise, self.ticks)
+        if not events and not excursions and not is_contradicted(made.tests, period_s):
+            return _UNCHANGED
+        plain, tests = self._judge((), start)
+        best, tests_of_best = self._add_events(plain, tests, start)
+        if not best.changes and not is_contradicted(tests, period_s):
+            return Hypothesis(excursions)
+        if len(best.changes) <= _FEW_CHANGES and not is_contradicted(tests_of_best, period_s):
+            return best
+        # Errors may be larger than usual throughout: spans of wrong fixes would explain it, too.
+        larger, tests = self._find_larger_errors(plain, tests, start)
+        if not larger.changes:
+            return best
+        larger, _ = self._add_events(larger, tests, start)
+        has_wrong_span = len(best.changes) > 1 and any(change.kind in {"offset", "useless"} for change in best.changes)
+        if best.score > larger.score and not has_wrong_span:
+            return best
+        rivals = sum(change.kind not in FIX_ERRORS for change in best.changes)
+        return replace(larger, rival_change_count=rivals if best.score > larger.score + _LEAST_GAIN else 0)
 
-        def run(changed: Hypothesis, first: int, last: int) -> Pass:
-            block = first // _BLOCK
-            begin = plain.checkpoints[block]
-            ticks = changed.alter_ticks(self.ticks)
-            return filter_section(ticks, self.make_model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
-
-        found = explain(plain, run, frozenset(plain.model.active.tolist()), jump)
-        return (
-            self._prefer_larger_errors(found, plain, start)
-            if suspects and self.measurements.gnss is not None
-            else found
-        )
-
-    def _prefer_larger_errors(self, hypotheses: list[Hypothesis], plain: Pass, start: Memory) -> list[Hypothesis]:
-        """Return the hypothesis that fixes err by more throughout, and in steps, where it is the most likely one, else those given.
-
-        The noise of fixes may be larger, and a slow error may come on top. Spans of wrong or unused fixes would explain both: a set of
-        changes that contains such a span is rejected. ``plain`` is the pass without any change.
-        """
-        best, tests = _score(_UNCHANGED, plain), plain.tests
-        for kind in ("noise", "slow"):
-            changes, least = best.changes, best.score + _LEAST_GAIN
-            for size_m in _ERRORS_M:
-                tried, of_tried = self._judge((*changes, Change(kind, state.FIX, 0, size=size_m)), start)
-                if tried.score <= least:
+    def _find_larger_errors(self, plain: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
+        """Return the most likely errors that are larger than usual throughout, and the tests under them."""
+        best, sensors = (plain, tests), self.measurements.sensors()
+        kinds = {key: sizes for key, sizes in LARGER_ERRORS.items() if ROLES[key[1]] in sensors}
+        while kinds:
+            tried = {
+                key: self._judge((*best[0].changes, Change(*key, 0, size=sizes[0])), start)
+                for key, sizes in kinds.items()
+            }
+            top = max(tried, key=lambda key: tried[key][0].score)
+            if tried[top][0].score <= best[0].score + _LEAST_GAIN:
+                break
+            others, best = best[0].changes, tried[top]
+            for size in kinds.pop(top)[1:]:
+                larger = self._judge((*others, Change(*top, 0, size=size)), start)
+                if larger[0].score <= best[0].score + _LEAST_FURTHER_GAIN:
                     break
-                best, tests, least = tried, of_tried, tried.score + _LEAST_FURTHER_GAIN
-        if not best.changes:
-            return hypotheses
-        if steps := find_steps(tests, self.ticks.inputs.period_s):
-            stepped = self._judge((*best.changes, *steps), start)[0]
-            best = max(best, stepped, key=lambda each: each.score)
-        for changes in (each.changes for each in hypotheses[:1]):
-            score = self._judge(changes, start)[0].score
-            has_wrong_span = len(changes) > 1 and any(change.kind in {"offset", "useless"} for change in changes)
-            if score > best.score and not has_wrong_span:
-                return hypotheses
-            if score > best.score + _LEAST_GAIN:
-                best = replace(best, rival_change_count=sum(change.kind not in FIX_ERRORS for change in changes))
-        return [best]
+                best = larger
+        return best
+
+    def _add_events(self, given: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
+        """Return a hypothesis with the events that explain most beyond it, found one after the other; ``tests`` are of its pass."""
+        best, events, useless = (given, tests), list[Change](), tuple[Change, ...]()
+        for _ in range(_MOST_EVENTS):
+            kept, spans = drop_outliers(given.alter_ticks(self.ticks), best[1])
+            if not events and spans:
+                useless, best = spans, self._judge((*given.changes, *spans), start)
+            hypothesis = replace(given, changes=(*given.changes, *events))
+            likely = smooth_section(self.filter(start, hypothesis, judges=True, kept=kept), with_displacements=False)[1]
+            if not likely:
+                break
+            events.append(likely[0])
+            best = self._judge((*given.changes, *useless, *join_events(events)), start)
+        return best
 
     def _judge(self, changes: Sequence[Change], start: Memory) -> tuple[Hypothesis, Tests]:
-        """Return the hypothesis of some changes with its score, and the tests of all measurements of the section."""
-        hypothesis = Hypothesis(tuple(changes), 0.0)
-        made = self.filter(start, hypothesis, judges=True)
-        return _score(hypothesis, made), made.tests
+        """Return the hypothesis of some changes, and the tests of its pass.
 
-
-def _score(hypothesis: Hypothesis, made: Pass) -> Hypothesis:
-    """Return a hypothesis with the log likelihood of all measurements of a pass under it, less the costs of its changes."""
-    score = compute_evidence(made.tests, made.model.gates, 0, made.states.shape[0])
-    return replace(hypothesis, score=score - sum(change.cost for change in hypothesis.changes))
-
-
-def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s: float) -> None:
-    """Mix the variances of estimates under several hypotheses about the best one: Σ w (P + d d')."""
-    best.variances[:] *= weights[0]
-    best.links[:] *= weights[0]
-    lags = [round(lag_s / period_s) for lag_s in DISPLACEMENT_LAGS_S]
-    for other, weight in zip(rivals, weights[1:], strict=True):
-        apart = np.column_stack(
-            (
-                other.states[:, 9:12] - best.states[:, 9:12],
-                _compute_yaw(other.states) - _compute_yaw(best.states),
-                other.states[:, state.U + 6] - best.states[:, state.U + 6],
-            )
-        )
-        apart[:, 3] = (apart[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
-        best.variances[:] += weight * (other.variances + apart**2)
-        for column, lag in enumerate(lags):
-            length = [np.hypot(*(x[lag:, 9:11] - x[:-lag, 9:11]).T) for x in (other.states, best.states)]
-            best.links[:-lag, column] += weight * (other.links[:-lag, column] + (length[0] - length[1]) ** 2)
-
-
-def _compute_yaw(states: Floats) -> Floats:
-    return np.arctan2(states[:, 3], states[:, 0])
+        Its score is the log likelihood of all measurements, less the costs of the changes.
+        """
+        made = self.filter(start, Hypothesis(tuple(changes)), judges=True)
+        score = compute_evidence(made.tests, made.model.gates) - sum(change.cost for change in changes)
+        return Hypothesis(tuple(changes), score), made.tests
 
 
 def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
@@ -325,7 +275,7 @@ def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
 
 
 def make_trajectory(
-    section: SectionModel, made: Pass, smoothed: Smoothed, output_ns: Ints, explained: Sequence[Hypothesis]
+    section: SectionModel, made: Pass, smoothed: Smoothed, output_ns: Ints, explained: Hypothesis
 ) -> Trajectory:
     """Return the trajectory at the wanted stamps [ns]; its standard deviations include errors that no state of the filter has."""
     m, noise, std, ticks = section.measurements, section.noise, section.std, made.ticks
@@ -504,11 +454,9 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     return tuple(sorted(found, key=lambda each: each.start_ns))
 
 
-def _correct_measurements(
-    m: Measurements, made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]
-) -> Measurements:
+def _correct_measurements(m: Measurements, made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Measurements:
     """Return fixes and odometry without what the estimate found to be wrong with them, as the audit compares them with the track."""
-    changes = [c for each in explained for c in each.changes if c.kind in {"useless", "offset", "wander"}]
+    changes = [c for c in explained.changes if c.kind in {"useless", "offset", "wander"}]
     rows, found = made.ticks.rows, {}
     for kind, name in ((state.FIX, "gnss"), (state.WHEELS, "wheels"), (state.VISUAL, "visual")):
         source = getattr(m, name)
@@ -539,21 +487,21 @@ def _correct_measurements(
     return replace(m, **found)
 
 
-def _list_changes(made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
+def _list_changes(made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Iterator[ChangeFacts]:
     """Yield the changes that explain the run best."""
-    for change in (c for each in explained for c in each.changes):
+    for change in explained.changes:
         last = change.last or made.states.shape[0] - 1
-        size = 0.0 if change.kind == "gyroscope" else change.size
+        size = change.size
         if change.kind == "varies":
             mean, slip, _ = _OF_ODOMETRY[change.role]
             size = float((smoothed.states[:, mean + 6] + smoothed.states[:, slip + 6]).std())
-        role = IMU if change.kind == "gyroscope" else ROLES[change.role]
+        role = ROLES[change.role]
         start_ns, end_ns = made.ticks.stamp_ns[[change.first, last]].tolist()
         yield ChangeFacts(change.kind, role, start_ns, end_ns, size)
 
 
 def _make_facts(  # noqa: PLR0917
-    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Hypothesis
 ) -> StretchFacts:
     rows = _list_rows(m, made)
     tests = made.tests
@@ -570,7 +518,7 @@ def _make_facts(  # noqa: PLR0917
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,
-        rival_change_count=max((each.rival_change_count for each in explained), default=0),
+        rival_change_count=explained.rival_change_count,
         parameters=_describe_parameters(m, made, smoothed, std),
     )
 

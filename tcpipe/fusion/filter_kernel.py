@@ -96,8 +96,8 @@ class Model(NamedTuple):
         where no other sensor of motion is heard; (9, 3).
     mount : place of the IMU's mounting in ``active``; -1: known exactly.
     scales : by kind, the place in ``active`` of the sensor's own scale; -1: none.
-    events : at a tick, errors from a place in ``active`` on: (tick, place, count, whether the error is another one now); (e, 4).
-    sizes : variance added by each event, (e,).
+    events : changes of errors: (tick, place in ``active``, whether the error is another one now); (e, 3).
+    sizes, shifts : variance that each event adds, and by how much it changes the error, (e,).
     ignored : measurements that are predicted and not used: (kind, first tick, last tick, the latter excluded), (i, 3).
     """
 
@@ -112,6 +112,7 @@ class Model(NamedTuple):
     scales: Indices
     events: NDArray[np.int64]
     sizes: Vector
+    shifts: Vector
     ignored: NDArray[np.int64]
 
 
@@ -178,7 +179,7 @@ def allocate_steps(ticks: int, n: int) -> Steps:
 
 
 @compile_kernel
-def _factorize(P: Matrix, places: Indices, m: int, L: Matrix) -> None:
+def factorize(P: Matrix, places: Indices, m: int, L: Matrix) -> None:
     """Fill L with the lower Cholesky factor of P at m places; a pivot that rounding has spoiled is lifted."""
     for i in range(m):
         for j in range(i + 1):
@@ -219,7 +220,7 @@ def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix,
     row = MOTION_WITH_GYRO if mode >= GYRO_TURN else MOTION_WITHOUT_GYRO
     places, m, n = model.depends[row], model.counts[row], P.shape[0]
     move_state(x, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], centre, turn)
-    _factorize(P, places, m, L)
+    factorize(P, places, m, L)
     for a in range(m):
         for b in range(m):
             missed[a, b] = 0.0
@@ -277,10 +278,9 @@ def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vec
         is_fix_error = FIX_ERROR <= model.active[i] < FIX_ERROR + 3
         kept[i] = inputs.fix_kept[k] if is_fix_error else model.kept[i]
     for j in range(model.events.shape[0]):
-        tick, first, count, is_new = model.events[j]
-        if tick == k:
-            for i in range(first, first + count):
-                kept[i] = 0.0 if is_new else kept[i]
+        tick, place, is_new = model.events[j]
+        if tick == k and is_new:
+            kept[place] = 0.0
     for i in range(n):
         if kept[i] != 1.0:
             x[model.active[i] + 6] *= kept[i]
@@ -292,8 +292,9 @@ def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vec
             P[i, i] += inputs.fix_noise[k, model.active[i] - FIX_ERROR]
     for j in range(model.events.shape[0]):
         if model.events[j, 0] == k:
-            for i in range(model.events[j, 1], model.events[j, 1] + model.events[j, 2]):
-                P[i, i] += model.sizes[j]
+            place = model.events[j, 1]
+            P[place, place] += model.sizes[j]
+            x[model.active[place] + 6] += model.shifts[j]
 
 
 @compile_kernel
@@ -310,7 +311,7 @@ def _compare(
     predict_measurement(kind, x, rate, gyro, acceleration, tau, lever, centre)
     for a in range(size):
         y[a] = centre[a]
-    _factorize(P, places, m, L)
+    factorize(P, places, m, L)
     for a in range(3):
         for b in range(3):
             missed[a, b] = 0.0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import GaussMarkov, NoiseModel
+from tcpipe.fusion.densities import GaussMarkov, NoiseModel, Prior
 from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, Memory, Model
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import find_scale_stds, is_length_observable, turn_scale_std
@@ -69,12 +69,12 @@ _MEAN_LASTS_S = 100.0  # the mean of a varying scale strays by as much as the sc
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Change of ``count`` errors from ``place`` on at a tick: ``std`` is added to each, or, if ``is_new``, it has its prior again."""
+    """Change of the error at ``place`` at a tick by ``mean`` with a deviation ``std``, or, if ``is_new``, to another of the same prior."""
 
     tick: int
     place: int
-    count: int
     std: float = 0.0
+    mean: float = 0.0
     is_new: bool = False
 
 
@@ -100,7 +100,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
             rows = slice(parameter.place, parameter.place + parameter.count)
             std[rows], walk[rows] = parameter.std, parameter.walk
     if m.imu is not None:
-        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = _find_walk(noise.turns[IMU].bias)
+        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = find_walk(noise.turns[IMU].bias)
     scales = find_scale_stds(m, noise.horizontal)
     for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
@@ -117,15 +117,12 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         std[state.ARM : state.ARM + 3][known] = m.gnss.lever_arm_std_m[known]
     if m.gnss is not None and m.has_attitude:
         std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad
-    offset = noise.offset or GaussMarkov(0.0, np.inf)
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
-        std[state.FIX_OFFSET : state.FIX_OFFSET + 3] = np.sqrt(offset.variance) * FIX_AXES
-        time_s[state.FIX_OFFSET : state.FIX_OFFSET + 3] = offset.time_s
     return std, walk, time_s
 
 
-def _find_walk(process: GaussMarkov) -> float:
+def find_walk(process: GaussMarkov | Prior) -> float:
     """Return the deviation of a second's walk that strays as far as a Gauss-Markov process over a minute."""
     return float(np.sqrt(2.0 * process.variance * -np.expm1(-_MINUTE_S / process.time_s) / _MINUTE_S))
 
@@ -190,7 +187,7 @@ def make_model(
     ``ignored``: measurements (kind, first tick, last tick) that are not used; ``possible``: errors that other events could change.
     """
     kept = np.ones(state.N) if time_s is None else np.exp(-period_s / time_s)
-    involved = {e for event in events for e in range(event.place, event.place + event.count)} | set(possible)
+    involved = {event.place for event in events} | set(possible)
     active = np.array([e for e in range(state.N) if e < state.GYRO_BIAS or std[e] or walk[e] or e in involved])
     position = {int(e): i for i, e in enumerate(active)}
     depends = np.zeros((state.KINDS + 2, active.size), np.int64)
@@ -215,8 +212,9 @@ def make_model(
         patience=_find_patience(m, follows=follows),
         mount=position.get(state.MOUNT, -1),
         scales=scales,
-        events=np.array([(e.tick, position[e.place], e.count, e.is_new) for e in events], np.int64).reshape(-1, 4),
+        events=np.array([(e.tick, position[e.place], e.is_new) for e in events], np.int64).reshape(-1, 3),
         sizes=np.array([(std[e.place] if e.is_new else e.std) ** 2 for e in events], np.float64),
+        shifts=np.array([e.mean for e in events], np.float64),
         ignored=np.array(ignored, np.int64).reshape(-1, 3),
     )
 

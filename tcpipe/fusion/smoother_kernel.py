@@ -6,19 +6,52 @@ time over each update (gain K, innovation y of covariance S; G turns the axes of
     l ← G' l, Λ ← G' Λ G    l ← (I - K H)' l - H' S⁻¹ y,  Λ ← (I - K H)' Λ (I - K H) + H' S⁻¹ H    l ← F' l, Λ ← F' Λ F
     x_s = x - P l    P_s = P - P Λ P    cov(d_j, d_k) = P_j (product of all transitions from j to k)' (I - Λ_k P_k),  j < k
 
-Reference: G. J. Bierman, "Fixed interval smoothing with discrete measurements", International Journal of Control 18 (1), 1973.
+On its way back the adjoint shows how much an event at a tick would explain. Restricted to the errors that the event changes, with
+S = diag(σ) of the change::
+
+    B = I + S Λ S    z = chol(B)⁻¹ S l    log evidence = |z|² / 2 - log |B| / 2    change = -S B⁻¹ S l
+
+References: G. J. Bierman, "Fixed interval smoothing with discrete measurements", International Journal of Control 18 (1), 1973; P. de Jong,
+J. Penzer, "Diagnosing shocks in time series", Journal of the American Statistical Association 93 (442), 1998.
 """
 
 from __future__ import annotations
 
-from math import sqrt
+from math import log, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tcpipe.compiled import compile_kernel
-from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, Indices, Inputs, Model, Steps, turn_rows
+from tcpipe.fusion.filter_kernel import (
+    MOTION_WITH_GYRO,
+    MOTION_WITHOUT_GYRO,
+    Indices,
+    Inputs,
+    Model,
+    Steps,
+    factorize,
+    turn_rows,
+)
 from tcpipe.fusion.state import GYRO_TURN, KINDS, RHO, SIZES, Matrix, N, U, Vector, displace_state
+
+
+class Candidates(NamedTuple):
+    """Events whose evidence is wanted.
+
+    Attributes
+    ----------
+    places, stds, sizes : by event, places in `Model.active` of the errors that it changes, standard deviations of the change, (C, 9),
+        and how many errors those are, (C,).
+    earliest : first tick of an event.
+    best : by event, the largest log evidence of all ticks, its tick, the change, and its standard deviation, (C, 20); to be filled.
+    """
+
+    places: Indices
+    stds: Matrix
+    sizes: Indices
+    earliest: int
+    best: Matrix
 
 
 class Smoothed(NamedTuple):
@@ -40,6 +73,8 @@ class Smoothed(NamedTuple):
 
 
 NEAR, NEAR_EVERY, FAR_EVERY, SELDOM = 80, 4, 40, 100
+LARGEST_EVENT = 9
+"""Errors that an event changes, at most."""
 _SHORT_M = 0.01
 
 
@@ -63,9 +98,9 @@ class Adjoint(NamedTuple):
 
 
 def make_adjoint(size: int, longest: int) -> Adjoint:
-    """Return the adjoint at the last tick, of ``size`` errors, for lags up to ``longest`` ticks."""
-    near = NEAR // NEAR_EVERY + 1
-    ahead = near + longest // FAR_EVERY + 1
+    """Return the adjoint at the last tick, of ``size`` errors, for lags up to ``longest`` ticks; 0: no displacements are wanted."""
+    near = NEAR // NEAR_EVERY + 1 if longest else 0
+    ahead = near + longest // FAR_EVERY + 1 if longest else 0
     rows = np.zeros((1 + 2 * ahead, size))
     return Adjoint(np.zeros((size, size)), rows, np.full(ahead, -1, np.int64), np.zeros((ahead, 5)), near)
 
@@ -241,7 +276,7 @@ def _smooth_tick(
                     s += share[axis + other] * v
             s /= east * east + north * north + 2.0 * short
             out.links[k, column] = max(s, 0.0)
-    if k % NEAR_EVERY == 0:
+    if ticks.size and k % NEAR_EVERY == 0:
         q = (k // NEAR_EVERY) % near
         if k % FAR_EVERY == 0:
             q = near + (k // FAR_EVERY) % (ticks.size - near)
@@ -266,6 +301,40 @@ def _smooth_tick(
 
 
 @compile_kernel
+def _score_events(k: int, adjoint: Adjoint, candidates: Candidates, B: Matrix, L: Matrix) -> None:
+    """Keep what events at tick k explain, where that is more than at later ticks."""
+    places, stds, sizes, _, best = candidates
+    for c in range(sizes.size):
+        m = sizes[c]
+        for a in range(m):
+            for b in range(a + 1):
+                B[a, b] = stds[c, a] * adjoint.information[places[c, a], places[c, b]] * stds[c, b]
+            B[a, a] += 1.0
+        factorize(B, np.arange(m), m, L)
+        evidence = 0.0
+        for a in range(m):
+            s = stds[c, a] * adjoint.rows[0, places[c, a]]
+            for b in range(a):
+                s -= L[a, b] * B[b, m]
+            B[a, m] = s / L[a, a]
+            evidence += 0.5 * B[a, m] ** 2 - log(L[a, a])
+        if evidence > best[c, 0]:
+            best[c, 0], best[c, 1] = evidence, k
+            for a in range(m):  # rows of chol(B)⁻¹, and with them the diagonal of S B⁻¹ S
+                best[c, 2 + a] = best[c, 2 + LARGEST_EVENT + a] = 0.0
+                for b in range(a + 1):
+                    s = 1.0 if a == b else 0.0
+                    for j in range(b, a):
+                        s -= L[a, j] * B[j, b]
+                    B[a, b] = s / L[a, a]
+            for a in range(m):
+                for b in range(a, m):
+                    best[c, 2 + a] -= stds[c, a] * B[b, a] * B[b, m]
+                    best[c, 2 + LARGEST_EVENT + a] += (stds[c, a] * B[b, a]) ** 2
+                best[c, 2 + LARGEST_EVENT + a] = sqrt(best[c, 2 + LARGEST_EVENT + a])
+
+
+@compile_kernel
 def smooth_ticks(
     first: int,
     last: int,
@@ -275,6 +344,7 @@ def smooth_ticks(
     states: Matrix,
     lags: Indices,
     adjoint: Adjoint,
+    candidates: Candidates,
     out: Smoothed,
 ) -> None:
     """Smooth ticks ``last - 1`` down to ``first``.
@@ -284,11 +354,13 @@ def smooth_ticks(
     steps, states : of these ticks, as `filter_ticks` filled them.
     lags : ticks over which displacements are wanted.
     adjoint : of tick ``last`` before its motion; becomes that of ``first`` before its motion.
+    candidates : events to be scored at these ticks.
     out : filled for these ticks.
     """
     n = adjoint.information.shape[0]
     A, B = np.zeros((n, n)), np.zeros((3, 2 * n + 3))
     room = (np.zeros(N), np.zeros(9), np.zeros((12, 12)), np.zeros(n))
+    C, L = np.zeros((LARGEST_EVENT, LARGEST_EVENT + 1)), np.zeros((LARGEST_EVENT, LARGEST_EVENT))
     for k in range(last - 1, first - 1, -1):
         row = k - first
         _smooth_tick(k, steps.P[row], states[k], model, adjoint, lags, out, A, room)
@@ -298,6 +370,8 @@ def smooth_ticks(
                     steps.K[row, kind], steps.H[row, kind], SIZES[kind], steps.pull[row, kind],
                     steps.inverse[row, kind], steps.turn[row, kind], adjoint, B,
                 )  # fmt: skip
+        if k >= candidates.earliest:
+            _score_events(k, adjoint, candidates, C, L)
         if k > 0:
             motion = MOTION_WITH_GYRO if inputs.mode[k] >= GYRO_TURN else MOTION_WITHOUT_GYRO
             places, m = model.depends[motion], model.counts[motion]

@@ -17,9 +17,11 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
+from tcpipe.fusion.changes import Hypothesis
+from tcpipe.fusion.error_state import make_trajectory, prepare_section
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Memory, Model
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
+from tcpipe.fusion.passes import make_tests
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
 from tcpipe.fusion.ticks import Pass, Ticks
 
@@ -52,10 +54,9 @@ def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_p
     gate_probability : a measurement less likely than 1 minus this is rejected (χ² on its squared normalised innovation).
     """
     section = prepare_section(m, output_ns, gate_probability)
-    model = section.make_model()
     initial = replace(initial, yaw_std_rad=min(initial.yaw_std_rad, _MAX_ANGLE_STD_RAD))
-    forward, estimate = filter_forward(section.ticks, model, section.make_start(initial).select(model.active))
-    found = make_trajectory(section, forward, estimate, output_ns, ())
+    forward, estimate = filter_forward(*section.prepare(section.make_start(initial)))
+    found = make_trajectory(section, forward, estimate, output_ns, Hypothesis(()))
     # While a forward filter learns a parameter its estimate changes, and the parameter does not.
     parameters = {name: replace(learned, variation=()) for name, learned in found.facts.parameters.items()}
     return replace(found, facts=replace(found.facts, parameters=parameters))

@@ -8,7 +8,7 @@ import pytest
 from unit.fusion import drive
 
 from tcpipe.fusion.densities import GaussMarkov, fit_noise, make_prior_model
-from tcpipe.fusion.hypotheses import find_event_candidates
+from tcpipe.fusion.excursions import find_event_candidates
 from tcpipe.fusion.measurements import (
     GNSS,
     BodyVelocities,

@@ -7,12 +7,22 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from unit.fusion import se3_reference as reference
 
-from tcpipe.fusion import error_state, smoother_kernel, state
-from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
+from tcpipe.fusion import passes, smoother_kernel, state
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
-from tcpipe.fusion.smoother_kernel import FAR_EVERY, NEAR_EVERY, Adjoint, step_before_motion, step_before_update
+from tcpipe.fusion.passes import filter_section, make_tests, smooth_section
+from tcpipe.fusion.smoother_kernel import (
+    FAR_EVERY,
+    NEAR_EVERY,
+    Adjoint,
+    Candidates,
+    Smoothed,
+    make_adjoint,
+    smooth_ticks,
+    step_before_motion,
+    step_before_update,
+)
 from tcpipe.fusion.ticks import Ticks
 
 T = 0.05
@@ -264,12 +274,12 @@ class Problem:
         stamp_ns = np.arange(self.inputs.mode.size, dtype=np.int64) * 50_000_000
         ticks = Ticks(stamp_ns, self.inputs, {}, np.ones((stamp_ns.size, 3)))
         memory = Memory(self.x.copy(), self.P.copy(), np.zeros((state.KINDS, 2)))
-        return smooth_section(filter_section(ticks, self.model, memory))
+        return smooth_section(filter_section(ticks, self.model, memory))[0]
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkeypatch, mode):
-    monkeypatch.setattr(error_state, "_BLOCK", 17)
+    monkeypatch.setattr(passes, "_BLOCK", 17)
     monkeypatch.setattr(smoother_kernel, "NEAR", 20)
     problem = Problem(11, mode)
     found = problem.smooth()
@@ -337,10 +347,37 @@ def test_what_no_measurement_shows_keeps_its_prior_and_what_is_exact_stays(seed,
     hidden = sorted(set(range(n)) - shown)
     stamp_ns = np.arange(30, dtype=np.int64) * 50_000_000
     ticks = Ticks(stamp_ns, inputs, {}, np.ones((30, 3)))
-    smoothed = smooth_section(filter_section(ticks, model, Memory(x, np.diag(std**2), np.zeros((state.KINDS, 2)))))
+    smoothed, _ = smooth_section(filter_section(ticks, model, Memory(x, np.diag(std**2), np.zeros((state.KINDS, 2)))))
     assert np.array_equal(smoothed.spreads[0, hidden], np.sqrt(std[hidden] ** 2))
     places = model.active[hidden] + 6
     assert np.array_equal(smoothed.states[:, places], np.tile(x[places], (30, 1)))
+
+
+@pytest.mark.parametrize("place", [state.WHEEL_SCALE, state.GYRO_BIAS, state.ARM])
+def test_evidence_of_an_event_is_what_it_gains_in_log_likelihood(place):
+    problem = Problem(11, state.INERTIAL)
+    size, std = problem.inputs.mode.size, 0.05
+    entry = list(problem.model.active).index(place)
+
+    def filter_with(model):
+        steps, tests = allocate_steps(size, model.active.size), make_tests(size)
+        memory, states = (
+            Memory(problem.x.copy(), problem.P.copy(), np.zeros((state.KINDS, 2))),
+            np.zeros((size, state.NX)),
+        )
+        filter_ticks(0, size, problem.inputs, model, memory, True, steps, tests, states)
+        return steps, states, -0.5 * np.nansum(tests.nis + tests.log_det)
+
+    steps, states, likelihood = filter_with(problem.model)
+    row, best = (np.full((1, 9), value) for value in (entry, std)), np.full((1, 20), -np.inf)
+    candidates = Candidates(*row, np.ones(1, np.int64), 1, best)
+    empty = Smoothed(*(np.zeros((size, width)) for width in (state.NX, 5, 1, problem.model.active.size)))
+    adjoint = make_adjoint(problem.model.active.size, 0)
+    smooth_ticks(0, size, problem.inputs, problem.model, steps, states, np.array([10]), adjoint, candidates, empty)
+    evidence, tick = best[0, :2]
+    event = np.array([[int(tick), entry, 0]])
+    changed = filter_with(problem.model._replace(events=event, sizes=np.array([std**2]), shifts=np.zeros(1)))[2]
+    assert evidence == pytest.approx(changed - likelihood, rel=0.05, abs=0.02)
 
 
 def filter_stationary(kind, displace, noise):
@@ -392,9 +429,9 @@ def test_an_event_makes_an_error_uncertain_or_another_one():
     std = np.zeros(state.N)
     std[[state.WHEEL_SCALE, state.VISUAL_SCALE]] = 0.1
     events = (
-        Event(5, state.WHEEL_SCALE, 1, 0.3),
-        Event(7, state.VISUAL_SCALE, 1, is_new=True),
-        Event(6, state.ARM, 3, 0.4),
+        Event(5, state.WHEEL_SCALE, 0.3, 0.2),
+        Event(7, state.VISUAL_SCALE, is_new=True),
+        *(Event(6, state.ARM + axis, 0.4) for axis in range(3)),
     )
     model = make_model(Measurements(), std, np.zeros(state.N), events, period_s=T, gate_probability=0.999)
     x, n = make_state(rng), model.active.size
@@ -409,7 +446,7 @@ def test_an_event_makes_an_error_uncertain_or_another_one():
     assert spread[5:7, place[state.ARM]] == pytest.approx([0.0, 0.4])
     assert states[6, state.VISUAL_SCALE + 6] == x[state.VISUAL_SCALE + 6]
     assert states[7, state.VISUAL_SCALE + 6] == 0.0
-    assert states[9, state.WHEEL_SCALE + 6] == x[state.WHEEL_SCALE + 6]
+    assert states[9, state.WHEEL_SCALE + 6] == x[state.WHEEL_SCALE + 6] + 0.2
 
 
 def test_rounding_of_the_smoothers_information_does_not_grow():

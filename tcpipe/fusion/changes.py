@@ -1,0 +1,303 @@
+"""Changes that explain why sensors contradict each other: fixes step, an antenna moves, a clock steps, a scale or bias changes.
+
+A change makes one block of the state uncertain at a tick, and again where it ends. `error_state.score_events` tells when, by the log
+evidence of such an impulse at every tick. A step of fixes makes them uncertain on both sides, since nothing shows which side is right.
+Errors of fixes may also be larger than they claim throughout; sets of changes are compared by the
+likelihood of all measurements, with what lies beyond the gate counted as the gate, less a cost by kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter, uniform_filter1d
+
+from tcpipe.fusion import state
+from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
+from tcpipe.fusion.parameters import FIX_AXES, Event
+from tcpipe.fusion.ticks import Ticks
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+ROLES = {
+    state.WHEELS: WHEELS,
+    state.VISUAL: VISUAL,
+    state.STATIONARY_RATE: IMU,
+    state.DOPPLER: DOPPLER,
+    state.FIX: GNSS,
+    state.ATTITUDE: GNSS,
+}
+"""Sensors by the kind of their measurements."""
+POSSIBLE = (
+    *range(state.ARM, state.FIX_OFFSET + 3),
+    state.WHEEL_SCALE,
+    state.VISUAL_SCALE,
+    state.WHEEL_LAG,
+    state.VISUAL_LAG,
+)
+"""Errors that changes change, beside those that always vary."""
+
+
+@dataclass(frozen=True, slots=True)
+class EventKind:
+    """Errors that an event changes, each with the standard deviation of the change, in its unit.
+
+    ``cost``: log of how unlikely it is beforehand [nat]. ``least``: norm of the change of its first three errors; what is smaller is noise.
+    """
+
+    block: tuple[tuple[int, float], ...]
+    cost: float
+    least: float
+
+
+def _make_kind(place: int, count: int, std: float, cost: float, least: float) -> EventKind:
+    return EventKind(tuple((place + i, std) for i in range(count)), cost, least)
+
+
+EVENTS = {
+    ("offset", state.FIX): _make_kind(state.FIX_OFFSET, 3, 1.0, 12.0, 0.05),
+    ("antenna", state.FIX): _make_kind(state.ARM, 3, 0.3, 40.0, 0.05),
+    ("clock", state.FIX): _make_kind(state.FIX_LAG, 1, 0.3, 14.0, 0.05),
+    ("clock", state.WHEELS): _make_kind(state.WHEEL_LAG, 1, 0.3, 14.0, 0.05),
+    ("clock", state.VISUAL): _make_kind(state.VISUAL_LAG, 1, 0.3, 14.0, 0.05),
+    ("gyroscope", state.STATIONARY_RATE): _make_kind(state.GYRO_BIAS, 3, 0.03, 16.0, 0.003),
+    ("scale", state.WHEELS): _make_kind(state.WHEEL_SCALE, 1, 0.3, 10.0, 0.15),
+    ("scale", state.VISUAL): _make_kind(state.VISUAL_SCALE, 1, 0.3, 10.0, 0.15),
+    ("frame", state.ATTITUDE): _make_kind(state.POSE_FRAME, 3, 0.3, 14.0, 0.05),
+    ("pose", state.FIX): EventKind(
+        tuple(
+            (place + i, std) for place, std in ((state.RHO, 2.0), (state.THETA, 0.1), (state.U, 0.5)) for i in range(3)
+        ),
+        20.0,
+        1.0,
+    ),
+}
+"""Events by their name and the sensor that they are of."""
+LARGER_ERRORS = {
+    ("noise", state.FIX): (0.03, 0.06, 0.12, 0.24),  # m, from RTK's usual error to a wrong ambiguity
+    ("slow", state.FIX): (0.03, 0.06, 0.12, 0.24),
+    ("varies", state.WHEELS): (0.05, 0.1, 0.2),  # of the scale, with slope, ground or load
+    ("varies", state.VISUAL): (0.05, 0.1, 0.2),
+    ("accelerometer", state.STATIONARY_RATE): (
+        0.1,
+        0.3,
+        1.0,
+    ),  # m/s²: a bias that follows speed, vibration or temperature
+}
+"""Errors that may be larger than usual throughout a section, by their name and sensor, and the sizes that are tried [their unit], 1σ."""
+_VARIES_S = 5.0
+"""Correlation time of a scale or a bias that varies [s]."""
+_STEP_COST = 12.0
+_WIDER = 3.0
+"""Standard deviations of an estimated change that the filter takes for one: it is estimated once more from the same measurements."""
+_AROUND_STEP_S = 40.0
+"""How long before and after a step fixes may drift by as much [s]: corrections age, and ambiguities are resolved slowly."""
+_NOISE_S = 1.5
+"""Correlation time of a larger noise of fixes [s]: reflected signals change as the antenna moves by a metre."""
+_SLOW_S = 60.0
+"""Correlation time of a slow error of fixes [s]: the paths of reflected signals change with the satellites."""
+_REJECTED_S = {state.FIX: 1.0, state.WHEELS: 4.0, state.VISUAL: 4.0, state.ATTITUDE: 4.0}
+"""How long a sensor that is not wrong may be rejected without a break [s]: wheels slip for seconds."""
+_FEWEST_REJECTIONS = 5
+_NEAR_ROWS, _WILD = 7, 8.0
+"""Measurements whose median one of them is compared with, and how many times as far off as usual an outlier is [1]."""
+_MOST_ACCELERATION_MPS2 = 3.0
+"""Of a ground robot [m/s²]."""
+_SPAN_ROWS, _WILD_SHARE = 31, 0.2
+"""Measurements in a row, of which so many are outliers where the sensor is useless [1]."""
+_SAME_EVENT_TICKS = 20
+"""Ticks between events of one block that are one."""
+_LARGEST_REST = 0.4
+"""Of two opposite events, share of the first that the second may leave if it ends the first [1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One change: its kind, the sensor it is of, and its first and last tick (None: to the end of the section).
+
+    ``size``: how large it is, in the unit of what changes. ``impulse``: by how much the errors of its block change, and its deviation.
+    """
+
+    kind: str
+    role: int
+    first: int
+    last: int | None = None
+    size: float = 0.0
+    impulse: tuple[float, ...] = ()
+    impulse_std: tuple[float, ...] = ()
+
+    @property
+    def cost(self) -> float:
+        """Log of how unlikely it is beforehand."""
+        if (self.kind, self.role) in EVENTS:
+            return EVENTS[self.kind, self.role].cost + (0.0 if self.last is None else 2.0)
+        return _STEP_COST if self.kind == "step" else 0.0
+
+    def list_events(self) -> Iterator[Event]:
+        """Yield what it changes in the state."""
+        if self.kind == "step":  # drawn from the prior that `Hypothesis.alter_priors` gives
+            yield from (Event(self.first, state.FIX_OFFSET + axis, is_new=True) for axis in range(3))
+        elif (self.kind, self.role) in EVENTS:
+            block = EVENTS[self.kind, self.role].block
+            for (place, prior_std), found, found_std in zip(block, self.impulse, self.impulse_std, strict=True):
+                is_pose = place < state.GYRO_BIAS  # its errors are along axes that the change turns: they have no mean
+                std, mean = (prior_std, 0.0) if is_pose else (min(prior_std, _WIDER * found_std), found)
+                yield Event(self.first, place, std, mean)
+                if self.last is not None:
+                    yield (
+                        Event(self.last, place, is_new=True)
+                        if self.kind == "offset"
+                        else Event(self.last, place, std, -mean)
+                    )
+
+    def alter_ticks(self, ticks: Ticks, *, drifts: bool) -> Ticks:
+        """Return the ticks as they are under the change; if ``drifts``, fixes may also drift before and after a step."""
+        if self.kind not in {"noise", "wander"} and not (self.kind == "step" and drifts):
+            return ticks
+        inputs = ticks.inputs
+        kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
+        first, last = self.first, kept.size if self.last is None else self.last
+        if self.kind == "noise":
+            kept[:] = np.exp(-inputs.period_s / _NOISE_S)
+        elif self.kind == "step":
+            around = round(_AROUND_STEP_S / inputs.period_s)
+            first, last = max(first - around, 0), min(first + around, kept.size)
+        variance[first:last] = np.maximum(variance[first:last], np.square(self.size * FIX_AXES))
+        if last < kept.size:
+            kept[last] *= np.sqrt(variance[last, 0] / variance[last - 1, 0])
+        earlier = np.concatenate((variance[:1], variance[:-1]))
+        noise[first:] = np.maximum(variance - kept[:, None] ** 2 * earlier, 0.0)[first:]
+        return replace(ticks, inputs=inputs._replace(fix_kept=kept, fix_noise=noise), fix_variance_m2=variance)
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """Set of changes with its score [nat], and the number of changes in a rejected set that explains clearly more."""
+
+    changes: tuple[Change, ...]
+    score: float = 0.0
+    rival_change_count: int = 0
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """What all changes change in the state, in order of time."""
+        return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
+
+    def alter_ticks(self, ticks: Ticks, *, drifts: bool = False) -> Ticks:
+        """Return the ticks as they are under all changes; ``drifts`` is False while hypotheses are compared."""
+        for change in self.changes:
+            ticks = change.alter_ticks(ticks, drifts=drifts)
+        return ticks
+
+    @property
+    def ignored(self) -> tuple[tuple[int, int, int], ...]:
+        """Measurements that are not used: (kind, first tick, last tick)."""
+        return tuple(
+            (c.role, c.first, 1 << 60 if c.last is None else c.last) for c in self.changes if c.kind == "useless"
+        )
+
+    def alter_priors(self, std: Floats, walk: Floats, time_s: Floats) -> None:
+        """Alter standard deviation, walk and correlation time of every error, shapes (45,), to those under all changes."""
+        offset = slice(state.FIX_OFFSET, state.FIX_OFFSET + 3)
+        for change in self.changes:
+            if (
+                change.kind == "step"
+            ):  # either side may be right: both are off by half of it, 1σ, for as long as they last
+                std[offset] = np.maximum(std[offset], 0.5 * change.size * FIX_AXES)
+            elif change.kind == "slow":
+                std[offset] = np.maximum(std[offset], change.size * FIX_AXES)
+                time_s[offset] = _SLOW_S
+            elif change.kind == "varies":
+                slip = state.WHEEL_SLIP if change.role == state.WHEELS else state.VISUAL_SLIP
+                std[slip], time_s[slip] = change.size, _VARIES_S
+            elif change.kind == "accelerometer":
+                bias = slice(state.ACCELEROMETER_BIAS, state.ACCELEROMETER_BIAS + 3)
+                std[bias], walk[bias], time_s[bias] = change.size, 0.0, _VARIES_S
+
+
+def is_contradicted(tests: Tests, period_s: float) -> bool:
+    """Return whether a sensor is rejected without a break for longer than one that is not wrong."""
+    for kind in _REJECTED_S:
+        rows = np.flatnonzero(tests.verdict[:, kind] != NONE)
+        if _find_long_runs(rows, tests.verdict[rows, kind] != ACCEPTED, period_s, kind):
+            return True
+    return False
+
+
+def drop_outliers(ticks: Ticks, tests: Tests) -> tuple[NDArray[np.float64], tuple[Change, ...]]:
+    """Return the measurements of ticks without those far off their neighbours, and the spans in which most of a sensor's are.
+
+    Also what the gate rejects is dropped, but for runs of rejections, which a change may explain.
+    """
+    value, spans = ticks.inputs.value.copy(), list[Change]()
+    for kind in (state.WHEELS, state.VISUAL, state.FIX):
+        rows = np.flatnonzero(np.isfinite(value[:, kind, 0]))
+        if rows.size < _SPAN_ROWS:
+            continue
+        axes, period_s = slice(state.SIZES[kind]), ticks.inputs.period_s
+        least = np.sqrt(ticks.inputs.variance[rows, kind, axes])
+        series = tests.fix_innovation[rows] if kind == state.FIX else value[rows, kind, axes]
+        wild = _is_outlying(series, least)
+        time_s = _NEAR_ROWS // 3 * period_s * np.median(np.diff(rows))  # from the middle of a window to its median
+        moved = 0.5 * _MOST_ACCELERATION_MPS2 * time_s * (time_s if kind == state.FIX else 1.0)
+        scattered = _is_outlying(value[rows, kind, axes], least + moved / _WILD)
+        useless = uniform_filter1d(scattered.astype(np.float64), _SPAN_ROWS, mode="constant") > _WILD_SHARE
+        rejected = tests.verdict[rows, kind] != ACCEPTED
+        for first, last in _find_long_runs(rows, rejected, period_s, kind):
+            rejected[first:last] = False
+        value[rows[wild | rejected], kind] = np.nan
+        for first, last in _find_long_runs(rows, useless, period_s, kind):
+            value[rows[first:last], kind] = np.nan
+            spans.append(Change("useless", kind, int(rows[first]), int(rows[last]) if last < rows.size else None))
+    return value, tuple(spans)
+
+
+def _is_outlying(series: Floats, least: Floats) -> NDArray[np.bool_]:
+    """Return which rows of a series (N, k) are far off their neighbours, at ``least`` by many times as much as that, (N, k)."""
+    off = np.abs(series - median_filter(series, size=(_NEAR_ROWS, 1), mode="nearest"))
+    return np.asarray((off > _WILD * np.maximum(np.median(off, axis=0), least)).any(axis=1))
+
+
+def _find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last row, the latter excluded, of each run of true rows."""
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: int) -> list[tuple[int, int]]:
+    """Return those runs of measurements at some ticks that last longer than a sensor that is not wrong may be rejected."""
+    runs = [run for run in _find_runs(mask) if run[1] - run[0] >= _FEWEST_REJECTIONS]
+    return [(first, last) for first, last in runs if (rows[last - 1] - rows[first] + 1) * period_s >= _REJECTED_S[kind]]
+
+
+def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
+    """Return changes by events that were found one after the other: one that undoes another ends it, an offset that stays is a step."""
+    single: list[Change] = []
+    for event in sorted(events, key=lambda each: (each.kind, each.role, each.first)):
+        before = single[-1] if single and (single[-1].kind, single[-1].role) == (event.kind, event.role) else None
+        if before is not None and event.first - before.first < _SAME_EVENT_TICKS:
+            single[-1] = replace(before, impulse=tuple(np.add(before.impulse, event.impulse).tolist()))
+        else:
+            single.append(event)
+    joined: list[Change] = []
+    for event in single:
+        before = joined[-1] if joined and (joined[-1].kind, joined[-1].role) == (event.kind, event.role) else None
+        if before is not None and before.last is None:
+            rest = np.linalg.norm(np.add(before.impulse, event.impulse))
+            if rest < _LARGEST_REST * np.linalg.norm(before.impulse):
+                joined[-1] = replace(before, last=event.first)
+                continue
+        joined.append(event)
+    joined.sort(key=lambda each: each.first)
+    return tuple(replace(each, kind="step") if (each.kind, each.last) == ("offset", None) else each for each in joined)
+
+
+def compute_evidence(tests: Tests, gates: Floats) -> float:
+    """Return the log likelihood of all measurements; one beyond the gate counts as the gate."""
+    kinds = [state.WHEELS, state.VISUAL, state.DOPPLER, state.FIX, state.ATTITUDE]
+    return float(-0.5 * np.nansum(np.minimum(tests.nis[:, kinds], gates[kinds]) + tests.log_det[:, kinds]))
