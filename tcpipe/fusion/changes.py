@@ -83,11 +83,7 @@ LARGER_ERRORS = {
     ("slow", state.FIX): (0.03, 0.06, 0.12, 0.24),
     ("varies", state.WHEELS): (0.05, 0.1, 0.2),  # of the scale, with slope, ground or load
     ("varies", state.VISUAL): (0.05, 0.1, 0.2),
-    ("accelerometer", state.STATIONARY_RATE): (
-        0.1,
-        0.3,
-        1.0,
-    ),  # m/s²: a bias that follows speed, vibration or temperature
+    ("accelerometer", state.STATIONARY_RATE): (0.1, 0.3, 1.0),  # m/s²: its bias follows speed or temperature
 }
 """Errors that may be larger than usual throughout a section, by their name and sensor, and the sizes that are tried [their unit], 1σ."""
 _VARIES_S = 5.0

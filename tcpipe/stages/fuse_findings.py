@@ -176,10 +176,8 @@ def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
             merged.append(change)
     for change in sorted(merged, key=lambda each: each.start_ns):
         subject = Subject("role", change.role)
-        names = {"change": CHANGES[change.kind]}
-        yield make_finding(
-            "sensor-changed", subject, span_s=_find_span_s(change, first_ns), names=names, off_m=change.size
-        )
+        names, span_s = {"change": CHANGES[change.kind].format(change.size)}, _find_span_s(change, first_ns)
+        yield make_finding("sensor-changed", subject, span_s=span_s, names=names)
 
 
 def _find_unlikely_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
@@ -192,20 +190,21 @@ def _find_unlikely_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Ite
 
 
 CHANGES = {
-    "offset": "positions are off by a constant",
-    "wander": "positions err far more than usual",
-    "step": "positions step, and nothing shows which side is right",
-    "noise": "positions err by more than they claim",
-    "slow": "positions err slowly, by more than they claim",
-    "antenna": "it was moved on the robot",
-    "clock": "its clock stepped",
-    "gyroscope": "the bias of its gyroscope jumped",
-    "scale": "its scale changed",
-    "frame": "the frame of its attitude turned",
-    "pose": "a clock stepped, or the robot was moved without being measured",
+    "offset": "positions are off by {:.2f} m",
+    "wander": "positions err smoothly, by up to {:.2f} m",
+    "step": "positions step by {:.2f} m, and nothing shows which side is right",
+    "noise": "positions err by {:.2f} m (1σ), more than they claim",
+    "slow": "positions err slowly by {:.2f} m (1σ), more than they claim",
+    "antenna": "it was moved by {:.2f} m on the robot",
+    "clock": "its clock stepped by {:.2f} s",
+    "gyroscope": "the bias of its gyroscope jumped by {:.3f} rad/s",
+    "accelerometer": "the bias of its accelerometer varies by {:.1f} m/s² (1σ)",
+    "scale": "its scale changed by {:.0%}",
+    "frame": "the frame of its attitude turned by {:.2f} rad",
+    "pose": "its clock stepped, or the robot was moved by {:.1f} m without being measured",
     "useless": "it measured nothing usable",
 }
-"""Changes in words."""
+"""Changes in words, with their size."""
 
 
 def _find_span_s(each: StretchFacts | GateReset | ChangeFacts | Disagreement, first_ns: int) -> tuple[float, float]:

@@ -108,7 +108,7 @@ FIX_ERRORS = frozenset({"noise", "slow", "wander", "step"})
 class ChangeFacts:
     """A change that explains a contradiction: its kind (``varies`` or one of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
 
-    ``size``: median innovation of fixes there [m]; σ of a scale that varies [1]; 0 of other changes.
+    ``size`` is how large it is, in the unit of what changes; 0 where that is unknown.
     """
 
     kind: str

@@ -49,8 +49,13 @@ def test_changes_of_one_kind_that_overlap_are_one_finding():
     findings = warned(
         Section(0, datum_deg_m=PLACE), stretch(changes=first), stretch(changes=(change("wander", 90, 95, 0.1),))
     )
-    found = [(each.span_s, each.numbers["off_m"]) for each in findings if each.code == "sensor-changed"]
-    assert found == [((5.0, 80.0), 0.7), ((30.0, 60.0), 0.2), ((90.0, 95.0), 0.1)]
+    found = [(each.span_s, each.names["change"]) for each in findings if each.code == "sensor-changed"]
+    smooth = "positions err smoothly, by up to {} m"
+    assert found == [
+        ((5.0, 80.0), smooth.format("0.70")),
+        ((30.0, 60.0), "it was moved by 0.20 m on the robot"),
+        ((90.0, 95.0), smooth.format("0.10")),
+    ]
 
 
 def test_stretches_add_up_and_their_innovations_are_averaged_by_count():
