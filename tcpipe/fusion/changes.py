@@ -100,6 +100,8 @@ _SLOW_S = 60.0
 _REJECTED_S = {state.FIX: 1.0, state.WHEELS: 4.0, state.VISUAL: 4.0, state.ATTITUDE: 4.0}
 """How long a sensor that is not wrong may be rejected without a break [s]: wheels slip for seconds."""
 _FEWEST_REJECTIONS = 5
+_MOST_REJECTED = 0.1
+"""Share of a sensor's measurements that may be rejected [1]: wheels slip."""
 _NEAR_ROWS, _WILD = 7, 8.0
 """Measurements whose median one of them is compared with, and how many times as far off as usual an outlier is [1]."""
 _MOST_ACCELERATION_MPS2 = 3.0
@@ -217,10 +219,11 @@ class Hypothesis:
 
 
 def is_contradicted(tests: Tests, period_s: float) -> bool:
-    """Return whether a sensor is rejected without a break for longer than one that is not wrong."""
+    """Return whether a sensor is rejected more often, or longer without a break, than one that is not wrong."""
     for kind in _REJECTED_S:
         rows = np.flatnonzero(tests.verdict[:, kind] != NONE)
-        if _find_long_runs(rows, tests.verdict[rows, kind] != ACCEPTED, period_s, kind):
+        rejected = tests.verdict[rows, kind] != ACCEPTED
+        if rejected.sum() > _MOST_REJECTED * rows.size or _find_long_runs(rows, rejected, period_s, kind):
             return True
     return False
 
