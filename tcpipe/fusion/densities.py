@@ -1,16 +1,6 @@
 """Noise of each sensor, estimated from the run itself by pairwise residuals at several time differences (structure functions).
 
-`fit_noise` returns a `NoiseModel`. A filter takes from it, each number in the unit that its name ends with:
-
-- ``horizontal`` and ``vertical``: of fixes, east and north alike, and up. ``white_m2`` is independent from fix to fix; ``correlated`` is a
-  Gauss-Markov error of position, to be a state of each axis. Both are those of a fix that claims ``claimed_m2``, and in proportion to it.
-- ``odometries[role].velocity_m2ps``: the variance of the distance grows by so much a second of driving; a velocity at f Hz has the
-  variance ``velocity_m2ps * f``. Zero while the robot is stationary.
-- ``odometries[role].scale``: Gauss-Markov error of the scale around its mean, [1]; ``shared_scale``: the same for all odometries at once.
-- ``turns[role].white_rad2ps``: the variance of the angle grows by so much a second; ``bias``: Gauss-Markov error of the turn rate around
-  its mean, in rad/s.
-
-``data_share`` is the share that the data determine: 0 is only the prior, 1 only the data. Densities are never evidence against a sensor.
+`fit_noise` returns a `NoiseModel`: a `SensorNoise` for each quantity that a sensor measures. Densities are never evidence against a sensor.
 """
 
 from __future__ import annotations
@@ -21,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.level_motion import KNOT_S
+from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
 from tcpipe.fusion.measurements import GNSS, IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, TURN, TURN_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
@@ -53,50 +43,37 @@ class GaussMarkov:
 
 
 @dataclass(frozen=True, slots=True)
-class FixNoise:
-    """Errors of fixes along one axis, for a fix that claims ``claimed_m2``, the median variance of the run's fixes.
+class SensorNoise:
+    """Errors of one quantity that a sensor measures: white noise, and a Gauss-Markov process, which is to be a state of a filter.
 
     Attributes
     ----------
-    white_m2 : [m²], variance of the part that is independent from fix to fix.
-    correlated : one Gauss-Markov process [m] whose structure function is nearest to the fitted sum of processes between 1 and 40 s.
-    processes : the fitted processes themselves, by correlation time.
-    white_data_share : share of ``white_m2`` that the data determine.
+    white : of fixes along an axis the variance of each [m²]; of an odometry the variance that its distance gains in a second of driving
+        [m²/s], zero while the robot is stationary; of a yaw rate the variance that its angle gains in a second [rad²/s]. A rate at f Hz has
+        the variance ``white * f``.
+    correlated : of fixes the error of position [m], the process whose structure function is nearest to the fitted sum of processes between
+        1 and 40 s; of an odometry that of its scale around its mean [1]; of a yaw rate that of its bias around its mean [rad/s].
+    claimed_m2 : median variance of the fixes of a run; both parts are those of a fix that claims so much, and in proportion to it.
+    white_data_share : share of ``white`` that the data determine: 0 is only the prior, 1 only the data.
     """
 
-    claimed_m2: float
-    white_m2: float
+    white: float
     correlated: GaussMarkov
-    processes: tuple[GaussMarkov, ...]
-    white_data_share: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryNoise:
-    """Errors of an odometry's forward velocity: white noise, and a scale that varies around its mean."""
-
-    velocity_m2ps: float
-    scale: GaussMarkov
-    velocity_data_share: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class TurnNoise:
-    """Errors of a yaw rate: white noise, and a bias [rad/s] that varies around its mean."""
-
-    white_rad2ps: float
-    bias: GaussMarkov
+    claimed_m2: float = 0.0
     white_data_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise of all sensors of a section; ``horizontal`` and ``vertical`` are None without fixes. The module's text says what each means."""
+    """Noise of all sensors of a section; ``horizontal`` (east and north alike) and ``vertical`` are of fixes, and None without.
 
-    horizontal: FixNoise | None
-    vertical: FixNoise | None
-    odometries: Mapping[str, OdometryNoise]
-    turns: Mapping[str, TurnNoise]
+    ``shared_scale`` is the error of the scale of all odometries at once.
+    """
+
+    horizontal: SensorNoise | None
+    vertical: SensorNoise | None
+    odometries: Mapping[str, SensorNoise]
+    turns: Mapping[str, SensorNoise]
     shared_scale: GaussMarkov
     offset: GaussMarkov | None = None
     """Error of fixes beyond what the residuals show [m], east and north: slow, or constant between two steps; None without."""
@@ -185,7 +162,7 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
     noise = fit_noise(found, residuals)
     if noise.horizontal is None or noise.vertical is None:
         return m
-    shown_m2 = noise.horizontal.white_m2 + noise.horizontal.correlated.variance
+    shown_m2 = noise.horizontal.white + noise.horizontal.correlated.variance
     if shown_m2 < _ABOUT_RIGHT * noise.horizontal.claimed_m2:
         return m
     least_m2 = shown_m2 if shown_m2 < _CENTIMETRES_M2 else max(shown_m2, _CODE_PHASE_M2)
@@ -208,19 +185,21 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     by_turns, by_heights = (
         _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
     )
-    claims = measurements.gnss is not None and _has_claims(measurements.gnss)
-    prior = replace(
-        prior,
-        turns={role: by_turns.find_turn_noise(role, noise) for role, noise in prior.turns.items()},
-        vertical=by_heights.find_fix_noise("up", prior.vertical)
-        if prior.vertical and claims and prior.vertical.claimed_m2 < NO_TRUST
-        else prior.vertical,
-    )
+    turns = {role: by_turns.find_noise(of, f"{role} turn", f"{role} bias") for role, of in prior.turns.items()}
+    prior, horizontal = replace(prior, turns=turns), prior.horizontal
+    has_claims = measurements.gnss is not None and _has_claims(measurements.gnss)
+    if has_claims and prior.vertical and prior.vertical.claimed_m2 < NO_TRUST:
+        vertical = by_heights.find_noise(prior.vertical, "up white", "up process", "up moving")
+        prior = replace(prior, vertical=vertical, densities={UP: by_heights.get_densities()})
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
+    if has_claims and horizontal:
+        horizontal = plane.find_noise(horizontal, "fix white", "fix process", "fix moving")
     return replace(
         prior,
-        horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal and claims else prior.horizontal,
-        odometries={role: plane.find_odometry_noise(role, noise) for role, noise in prior.odometries.items()},
+        horizontal=horizontal,
+        odometries={
+            role: plane.find_noise(of, f"{role} velocity", f"{role} scale") for role, of in prior.odometries.items()
+        },
         shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
         densities={
             axis: fit.get_densities()
@@ -324,60 +303,45 @@ class _Fit:
         """Return every density by name."""
         return dict(zip(self._names, self._variances.tolist(), strict=True))
 
-    def find_density(self, name: str, prior: float) -> tuple[float, float]:
-        """Return a density, and the data's share of it; the larger of fit and prior where that is less than half."""
-        if name not in self._names:
-            return prior, 0.0
-        row = self._names.index(name)
-        data_share = self._compute_data_share(np.eye(len(self._names))[row])
-        fitted = float(self._variances[row])
-        return (fitted if data_share >= DETERMINED else max(fitted, prior)), data_share
+    def find_noise(self, prior: SensorNoise, white: str, *processes: str) -> SensorNoise:
+        """Return the noise of a sensor by the names of its white density and of its processes.
+
+        Of a white density of which the data determine less than half, the larger of fit and prior.
+        """
+        density, data_share = prior.white, 0.0
+        if white in self._names:
+            row = self._names.index(white)
+            data_share = self._compute_data_share(np.eye(len(self._names))[row])
+            density = float(self._variances[row])
+        if data_share < DETERMINED:
+            density = max(density, prior.white)
+        floor = max(_FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2) if prior.claimed_m2 else 0.0
+        correlated = self.find_process(prior.correlated, *processes)
+        return SensorNoise(max(density, floor), correlated, prior.claimed_m2, data_share)
 
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
         """Return the Gauss-Markov process that is nearest to the sum of those of these names.
 
         What the data do not tell, by its share or by the length of the section, is the larger of fit and prior.
         """
-        parts = self.find_parts(*names)
-        if not parts:
+        taus = {
+            row: float(name.rpartition(" ")[2])
+            for row, name in enumerate(self._names)
+            if name.rpartition(" ")[0] in names
+        }
+        if not taus:
             return prior
-        factors = np.zeros(len(self._names))
-        for tau, row, _ in parts:
+        factors, shape = np.zeros(len(self._names)), np.zeros((_SUMMARY_S.size, len(self._names)))
+        for row, tau in taus.items():
             factors[row] = -2.0 * np.expm1(-_SHARE_S / tau)
-        data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
-        shape = np.zeros((_SUMMARY_S.size, len(self._names)))
-        for tau, row, _ in parts:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
+        data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
         fitted = shape @ self._variances + _CAUTION * unsure
         undetermined = (self._longest_s < _SUMMARY_S) | (data_share < DETERMINED)
         return _summarize(
             np.where(undetermined, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), data_share
         )
-
-    def find_parts(self, *names: str) -> list[tuple[float, int, float]]:
-        """Return correlation time [s], row and variance of each process of these names."""
-        rows = [row for row, each in enumerate(self._names) if each.rpartition(" ")[0] in names]
-        return [(float(self._names[row].rpartition(" ")[2]), row, float(self._variances[row])) for row in rows]
-
-    def find_fix_noise(self, name: str, prior: FixNoise) -> FixNoise:
-        """Return the noise of fixes along an axis."""
-        names = (f"{name} process", f"{name} moving")
-        correlated = self.find_process(prior.correlated, *names)
-        processes = tuple(GaussMarkov(variance, tau) for tau, _, variance in sorted(self.find_parts(*names)))
-        white, data_share = self.find_density(f"{name} white", prior.white_m2)
-        white = max(white, _FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2)
-        return FixNoise(prior.claimed_m2, white, correlated, processes or prior.processes, data_share)
-
-    def find_odometry_noise(self, role: str, prior: OdometryNoise) -> OdometryNoise:
-        """Return the noise of an odometry's velocity."""
-        density, data_share = self.find_density(f"{role} velocity", prior.velocity_m2ps)
-        return OdometryNoise(density, self.find_process(prior.scale, f"{role} scale"), data_share)
-
-    def find_turn_noise(self, role: str, prior: TurnNoise) -> TurnNoise:
-        """Return the noise of a yaw rate."""
-        density, data_share = self.find_density(f"{role} turn", prior.white_rad2ps)
-        return TurnNoise(density, self.find_process(prior.bias, f"{role} bias"), data_share)
 
 
 def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
@@ -397,53 +361,54 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     """Return mean and standard deviation of a density before the data speak."""
     kind, _, last = name.rpartition(" ")
     if name.startswith(("fix ", "up ")) and prior.horizontal is not None and prior.vertical is not None:
-        return _find_fix_prior(name, prior.horizontal, prior.vertical)
+        return _find_fix_prior(name, prior.horizontal, prior.vertical, prior.densities.get(UP, {}))
+    known = PRIORS[kind if kind in PRIORS else name]
+    variance, taus = known.variance, TURN_S if kind.endswith((" bias", " turn scale")) else SCALE_S
     if last == "turn" or (last == "velocity" and kind in prior.odometries):
-        density = prior.turns[kind].white_rad2ps if last == "turn" else prior.odometries[kind].velocity_m2ps
-        return density, PRIORS[name].times * density
-    if name in PRIORS or kind == "sway":
-        known = PRIORS[name if name in PRIORS else kind]
-        return known.variance, known.times * known.variance
-    process = _make_process(kind)
-    if kind == "heading scale":
-        process = replace(process, variance=_find_heading_variance(prior))
-    taus = TURN_S if kind.endswith((" bias", " turn scale")) else SCALE_S
-    return _share_process(process, float(last), taus), PRIORS[kind].times * process.variance
+        variance = (prior.turns if last == "turn" else prior.odometries)[kind].white
+    elif kind == "heading scale":
+        variance = _find_heading_variance(prior)
+    share = _share_process(known.time_s, float(last), taus) if known.time_s else 1.0
+    return share * variance, known.times * variance
 
 
-def _find_fix_prior(name: str, horizontal: FixNoise, vertical: FixNoise) -> tuple[float, float]:
+def _find_fix_prior(
+    name: str, horizontal: SensorNoise, vertical: SensorNoise, of_heights: Mapping[str, float]
+) -> tuple[float, float]:
     """Return the same for fixes; in the plane it is what the heights show, as far as they tell, by the ratio of claims.
 
     Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in the plane.
     """
-    axis, kind, time_s = (*name.split(), "")[:3]
+    axis, kind, time_s = (*name.split(), "0")[:3]
     fixes = vertical if axis == "up" else horizontal
     if kind == "white":
-        return fixes.white_m2, fixes.claimed_m2
+        return fixes.white, fixes.claimed_m2
     if kind == "moving":
         return 0.0, _MOVING * fixes.claimed_m2
-    usual, usual_std = _share_process(fixes.correlated, float(time_s), FIX_S), _ONE_TIME * fixes.claimed_m2
-    data_share = vertical.correlated.data_share
+    usual = fixes.correlated.variance * _share_process(fixes.correlated.time_s, float(time_s), FIX_S)
+    usual_std, data_share = _ONE_TIME * fixes.claimed_m2, vertical.correlated.data_share
     if axis == "up" or data_share <= 0.0:
         return usual, usual_std
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
-    alike = ratio * sum(each.variance for each in vertical.processes if each.time_s == float(time_s))
-    total = max(ratio * sum(each.variance for each in vertical.processes), horizontal.correlated.variance)
-    return data_share * alike + (1.0 - data_share) * usual, data_share * _UNLIKE * total + (
-        1.01 - data_share
-    ) * usual_std
+    shown = {
+        each: ratio * variance for each, variance in of_heights.items() if each.startswith(("up process", "up moving"))
+    }
+    alike = sum(variance for each, variance in shown.items() if each.endswith(f" {time_s}"))
+    total = max(sum(shown.values()), horizontal.correlated.variance)
+    mean = data_share * alike + (1.0 - data_share) * usual
+    return mean, data_share * _UNLIKE * total + (1.01 - data_share) * usual_std
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:
     """Return the variance of the heading [rad²] that is left between the knots of the alignment: of a Brownian bridge."""
     best = next(iter(prior.turns.values()))
-    return KNOT_S / 6.0 * best.white_rad2ps + KNOT_S**2 / 100.0 * best.bias.variance
+    return KNOT_S / 6.0 * best.white + KNOT_S**2 / 100.0 * best.correlated.variance
 
 
-def _share_process(process: GaussMarkov, tau_s: float, taus_s: Sequence[float]) -> float:
-    """Return the part of a process's variance that belongs to one of several correlation times: linear in their logarithm."""
-    place = np.interp(np.log(process.time_s), np.log(taus_s), np.arange(len(taus_s)))
-    return float(process.variance * max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
+def _share_process(time_s: float, tau_s: float, taus_s: Sequence[float]) -> float:
+    """Return the part of a process that belongs to one of several correlation times: linear in their logarithm."""
+    place = np.interp(np.log(time_s), np.log(taus_s), np.arange(len(taus_s)))
+    return float(max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
 
 
 def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
@@ -458,48 +423,40 @@ def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
 
 def make_prior_model(measurements: Measurements) -> NoiseModel:
     """Return the noise by priors and claims alone."""
-    gnss = measurements.gnss
+    gnss, imu = measurements.gnss, [IMU] if measurements.imu is not None else []
     turning = [role for role, source in measurements.odometries().items() if np.isfinite(source.yaw_rate_radps).any()]
     return NoiseModel(
         horizontal=None if gnss is None else _make_fix_prior(gnss, slice(0, 2)),
         vertical=None if gnss is None else _make_fix_prior(gnss, slice(2, 3)),
         odometries={
-            role: OdometryNoise(
+            role: SensorNoise(
                 _compute_density(each.stamp_ns, each.velocity_mps[:, 0]) + PRIORS[f"{role} velocity"].variance,
                 _make_process(f"{role} scale"),
             )
             for role, each in measurements.odometries().items()
         },
         turns={
-            role: TurnNoise(_estimate_turn_density(measurements, role), _make_process(f"{role} bias"))
-            for role in (*([IMU] if measurements.imu is not None else []), *turning)
+            role: SensorNoise(
+                _compute_density(stamp_ns, rate[:, 2]) + PRIORS[f"{role} turn"].variance, _make_process(f"{role} bias")
+            )
+            for role in (*imu, *turning)
+            for stamp_ns, rate in [get_turn_rates(measurements, role)]
         },
         shared_scale=_make_process("shared scale"),
     )
 
 
-def _make_fix_prior(gnss: Positions, axes: slice) -> FixNoise:
+def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
     """Return the noise of fixes whose claims are right in total."""
     claimed = float(np.median(gnss.variance_m2[:, axes]))
     if claimed >= NO_TRUST:  # not measured: there is no error that lasts, which would be kilometres
-        return FixNoise(claimed, claimed, GaussMarkov(0.0, _SHARE_S), ())
+        return SensorNoise(claimed, GaussMarkov(0.0, _SHARE_S), claimed)
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
-    correlated = GaussMarkov(prior.variance * claimed, prior.time_s)
-    return FixNoise(claimed, (1.0 - prior.variance) * claimed, correlated, (correlated,))
+    return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
 
 
 def _make_process(name: str) -> GaussMarkov:
     return GaussMarkov(PRIORS[name].variance, PRIORS[name].time_s)
-
-
-def _estimate_turn_density(measurements: Measurements, role: str) -> float:
-    """Return the noise density of a yaw rate [rad²/s] by the scatter of its samples, and what is usual beside it."""
-    if role == IMU and measurements.imu is not None:
-        shown = _compute_density(measurements.imu.stamp_ns, measurements.imu.angular_velocity_radps[:, 2])
-    else:
-        source = measurements.odometries()[role]
-        shown = _compute_density(source.stamp_ns, source.yaw_rate_radps)
-    return shown + PRIORS[f"{role} turn"].variance
 
 
 def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
@@ -524,11 +481,8 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
     found = {}
     for name, fixes in ((GNSS, noise.horizontal), (f"{GNSS} height", noise.vertical)):
         if fixes is not None:
-            correlated = fixes.correlated.difference_variance(_TIME_S)
-            fitted = [
-                (np.full_like(_TIME_S, 2.0 * fixes.white_m2), fixes.white_data_share),
-                (correlated, fixes.correlated.data_share),
-            ]
+            correlated = fixes.correlated.difference_variance(_TIME_S), fixes.correlated.data_share
+            fitted = [(np.full_like(_TIME_S, 2.0 * fixes.white), fixes.white_data_share), correlated]
             found[name] = _make_facts("m", fitted, np.full_like(_TIME_S, 2.0 * fixes.claimed_m2))
     for role, odometry in m.odometries().items():
         speed_mps, own = np.abs(odometry.velocity_mps[:, 0]), noise.odometries[role]
@@ -536,20 +490,16 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
         usual_mps = float(np.median(speed_mps[driving])) if driving.any() else 0.0
         scales = [
             (usual_mps**2 * each.integral_variance(_TIME_S), each.data_share)
-            for each in (own.scale, noise.shared_scale)
+            for each in (own.correlated, noise.shared_scale)
         ]
-        fitted = [(own.velocity_m2ps * _TIME_S, own.velocity_data_share), *scales]
+        fitted = [(own.white * _TIME_S, own.white_data_share), *scales]
         found[role] = _make_facts("m", fitted, _sum_white(odometry.stamp_ns, odometry.variance_m2ps2[:, 0]))
     for role, turns in noise.turns.items():
-        if role == IMU and m.imu is not None:
-            claimed = _sum_white(m.imu.stamp_ns, np.array([m.imu.gyro_std_radps**2]))
-        else:
-            claimed = _sum_white(m.odometries()[role].stamp_ns, m.odometries()[role].yaw_rate_var)
-        fitted = [
-            (turns.white_rad2ps * _TIME_S, turns.white_data_share),
-            (turns.bias.integral_variance(_TIME_S), turns.bias.data_share),
-        ]
-        found[f"{role} turn"] = _make_facts("rad", fitted, claimed)
+        imu = m.imu if role == IMU else None
+        claimed = m.odometries()[role].yaw_rate_var if imu is None else np.array([imu.gyro_std_radps**2])
+        bias = turns.correlated.integral_variance(_TIME_S), turns.correlated.data_share
+        fitted = [(turns.white * _TIME_S, turns.white_data_share), bias]
+        found[f"{role} turn"] = _make_facts("rad", fitted, _sum_white(m.sensors()[role].stamp_ns, claimed))
     return found
 
 

@@ -200,7 +200,7 @@ class Hypothesis:
     def alter_noise(self, noise: NoiseModel) -> NoiseModel:
         """Return the noise of the sensors as it is under all changes."""
         roles = [ROLES[change.role] for change in self.changes if change.kind == "varies"]
-        varying = {role: replace(noise.odometries[role], scale=_VARYING) for role in roles}
+        varying = {role: replace(noise.odometries[role], correlated=_VARYING) for role in roles}
         # Either side of a step may be right: both are off by half of it, 1σ, for as long as they last.
         step_m, slow_m = (
             max((change.size for change in self.changes if change.kind == kind), default=0.0)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import FixNoise, NoiseModel
+from tcpipe.fusion.densities import NoiseModel, SensorNoise
 from tcpipe.fusion.measurements import (
     IMU,
     VISUAL,
@@ -147,7 +147,7 @@ def turn_scale_std(measurements: Measurements) -> float:
     return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
 
 
-def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
+def is_length_observable(m: Measurements, fixes: SensorNoise | None) -> bool:
     """Return whether fixes show, on the ground that they span, how long a metre of odometry is, twice as well as it is known.
 
     Else an accelerometer would show it, whose errors pass for a scale. The white noise of many fixes averages out.
@@ -155,7 +155,7 @@ def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
     if m.gnss is None or fixes is None or m.gnss.stamp_ns.size < 2:
         return False
     span_m = float(np.linalg.norm(np.ptp(m.gnss.position_enu_m[:, :2], axis=0)))
-    lasting_m2 = fixes.correlated.variance + fixes.white_m2 / m.gnss.stamp_ns.size
+    lasting_m2 = fixes.correlated.variance + fixes.white / m.gnss.stamp_ns.size
     return float(np.sqrt(2.0 * lasting_m2)) < 0.5 * find_best_scale_std(m) * max(span_m, 1e-3)
 
 
@@ -164,7 +164,7 @@ def find_best_scale_std(m: Measurements) -> float:
     return SCALE_STD[WHEELS if m.visual is None else VISUAL]
 
 
-def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> Mapping[str, float]:
+def find_scale_stds(measurements: Measurements, fixes: SensorNoise | None) -> Mapping[str, float]:
     """Return the standard deviations of the scales of odometries by role; 0 where a scale is unobservable: it stays 1.
 
     Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
@@ -185,7 +185,7 @@ def make_motion_noise(  # noqa: PLR0917
     density = np.zeros((stamp_ns.size, 6))
     by_gyro = mode >= state.GYRO_TURN
     if m.imu is not None:
-        density[by_gyro, :3] = noise.turns[IMU].white_rad2ps
+        density[by_gyro, :3] = noise.turns[IMU].white
     metres_per_s = _compute_speed(m, stamp_ns[~by_gyro])
     density[~by_gyro] = _make_turn_density(m, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
     inertial = mode == state.INERTIAL
