@@ -105,8 +105,6 @@ PRIORS = {
     # rad²: what the alignment leaves of heading and pitch; roll and pitch where no accelerometer measures them.
     "heading scale": Prior(0.005**2, 30.0),
     "pitch scale": Prior(0.0015**2, 30.0),
-    "sway": Prior(0.05**2),
-    "rocking": Prior(0.003**2),  # m²: heights of the driving body, white
     "stamp": Prior(0.003**2),  # s²: time stamps of fixes, which err by as much times the velocity
     # rad²/s beside the noise that the samples show.
     "imu turn": Prior(1e-8),
@@ -349,7 +347,7 @@ def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
     features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
     for is_still in (False, True):
         if is_still:  # what little the robot moves then must not explain them
-            features = features * np.array([" scale" not in name and not name.startswith("sway") for name in names])
+            features = features * np.array([" scale" not in name for name in names])
         rows = np.flatnonzero((each.is_still == is_still) & np.isfinite(each.value) & (each.value != 0.0))
         if rows.size < _FEWEST:
             continue

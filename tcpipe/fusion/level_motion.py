@@ -22,10 +22,11 @@ from tcpipe.fusion.signals import (
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
+    compute_window_means,
     multiply_by_vector,
     solve_least_squares,
 )
-from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotation_vector
+from tcpipe.geometry.rotation import matrix_from_quat, multiply, normalize, quat_from_rotation_vector, quat_from_rpy
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -103,7 +104,8 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     imu = measurements.imu
     if roles[0] != IMU or imu is None or not imu.accelerometer_usable:
         yaw = integrate_grid(rate[:, 2])
-        return Attitude(time_s, _rotation_about_up(yaw), yaw, rate, roles[0], stamp_ns, is_level=False)
+        rotation = matrix_from_quat(quat_from_rpy(0.0 * yaw, 0.0 * yaw, yaw))
+        return Attitude(time_s, rotation, yaw, rate, roles[0], stamp_ns, is_level=False)
     force = _mean_force(measurements, imu, zero_ns, time_s, rate)
     quat = _multiply_increments(rate[:-1] * STEP_S)
     up = _find_up(quat, force)
@@ -117,12 +119,6 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     return Attitude(time_s, rotation, yaw, rate - bias, IMU, stamp_ns, is_level=True)
 
 
-def _rotation_about_up(yaw: Floats) -> Floats:
-    half = 0.5 * yaw
-    zero = np.zeros_like(yaw)
-    return matrix_from_quat(np.stack((zero, zero, np.sin(half), np.cos(half)), -1))
-
-
 def _mean_force(
     measurements: Measurements, imu: InertialMeasurements, zero_ns: int, time_s: Floats, rate: Floats
 ) -> Floats:
@@ -131,22 +127,17 @@ def _mean_force(
         compute_seconds(imu.stamp_ns, zero_ns), imu.specific_force_mps2, time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S
     )
     for source in measurements.odometries().values():
-        speed = average_grid(
-            np.interp(time_s, compute_seconds(source.stamp_ns, zero_ns), source.velocity_mps[:, 0]), 0.5
-        )
+        speed_s = compute_seconds(source.stamp_ns, zero_ns)
+        speed = average_grid(np.interp(time_s, speed_s, source.velocity_mps[:, 0])[:, None], 0.5)[:, 0]
         acceleration = (np.gradient(speed, STEP_S), rate[:, 2] * speed, -rate[:, 1] * speed)
         return np.asarray(means - np.stack(acceleration, -1))
     return means
 
 
 def average_grid(values: Floats, window_s: float) -> Floats:
-    """Return the centred moving mean over a window, along the first axis; shorter at the ends."""
-    half = max(1, round(0.5 * window_s / STEP_S))
-    total = np.concatenate((np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)))
-    index = np.arange(len(values))
-    first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
-    count = (last - first).reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray((total[last] - total[first]) / count)
+    """Return the centred moving mean of (n, k) values over a window; shorter at the ends."""
+    rows = np.arange(len(values))
+    return compute_window_means(rows, values, rows, 2 * max(1, round(0.5 * window_s / STEP_S)))
 
 
 def _multiply_increments(turn_rad: Floats) -> Floats:
@@ -168,9 +159,7 @@ def _find_up(quat: Floats, force: Floats) -> Floats:
 def _level(up: Floats) -> Floats:
     """Return the smallest rotations (n, 3, 3) that turn each direction to z."""
     x, y, z = up.T
-    k = 1.0 / np.maximum(1.0 + z, 1e-3)
-    rows = ((1 - x * x * k, -x * y * k, -x), (-x * y * k, 1 - y * y * k, -y), (x, y, z))
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    return matrix_from_quat(normalize(np.stack((y, -x, 0.0 * x, np.maximum(1.0 + z, 1e-3)), -1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,6 +240,21 @@ class _Fit:
     arm_m: complex = 0j
     offset_s: float = 0.0
     noise_m: float = np.inf
+
+
+def solve_robust(matrix: Floats, target: Floats, start: Floats, std: Floats) -> Floats:
+    """Return the factors (C,) of M equations by weights that fall with the square of a residual (Cauchy's loss), with a prior about zero.
+
+    ``start`` are the first factors, ``std`` their standard deviations beforehand, infinite for none.
+    """
+    found = start
+    for _ in range(_ROUNDS):
+        off = target - multiply_by_vector(matrix, found)
+        noise = float(np.median(np.abs(off))) + 1e-9
+        root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
+        rows = np.concatenate((matrix * root[:, None], np.diag(noise / std)))
+        found = solve_least_squares(rows, np.concatenate((target * root, np.zeros(std.size))))
+    return found
 
 
 class _Alignment:
@@ -361,13 +365,6 @@ class _Alignment:
         hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - knots_s) / knots_s[1])
         path = self._difference(integrate_grid(speed)).real
         rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
-        pitch = np.zeros(knots_s.size)
-        for _ in range(_ROUNDS // 2):
-            off = rise - path * multiply_by_vector(hats, pitch)
-            noise = float(np.median(np.abs(off))) + 1e-6
-            root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
-            matrix = np.concatenate(
-                (hats * (path * root)[:, None], np.diag(np.full(pitch.size, noise / _PITCH_STD_RAD)))
-            )
-            pitch = solve_least_squares(matrix, np.concatenate((rise * root, np.zeros(pitch.size))))
+        start, std = np.zeros(knots_s.size), np.full(knots_s.size, _PITCH_STD_RAD)
+        pitch = solve_robust(hats * path[:, None], rise, start, std)
         return np.interp(self._attitude.time_s, knots_s, pitch)

@@ -32,6 +32,7 @@ from tcpipe.fusion.level_motion import (
     integrate_grid,
     make_free_track,
     remove_spikes,
+    solve_robust,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -40,8 +41,6 @@ from tcpipe.fusion.signals import (
     find_longest_step_ns,
     interpolate_signal,
     is_in_gap,
-    multiply_by_vector,
-    solve_least_squares,
 )
 
 Floats = NDArray[np.float64]
@@ -62,7 +61,6 @@ _FEWEST = 8  # windows of one length
 _OVERLAPPING = 8  # windows begin in the length of one
 _LONGEST_GAP_NS = 300_000_000
 _STILL_MPS, _STILL_RAD, _STILL_S = 0.02, 0.02, 0.5  # the last: speeds are averaged, so that noise is none
-_SWAY_M = (1.0, 3.0, 10.0, 30.0)  # the ground's slope changes over so much
 _PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
 
 
@@ -136,7 +134,7 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
     residuals = _compare_turns(section)
     forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
     tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
-    speed = np.max([np.abs(average_grid(each, _STILL_S)) for each in forward.values()], axis=0)
+    speed = np.abs(average_grid(np.column_stack([*forward.values()]), _STILL_S)).max(axis=1)
     for role, track in tracks.items():
         residuals += _compare_fixes(section, gnss, role, track, speed) if gnss is not None else []
     if len(tracks) < len(forward):
@@ -152,7 +150,6 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
     off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
-    sways = 0.0 if attitude.is_level else gnss.lever_arm_m[2]
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
     made = []
@@ -174,8 +171,6 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
             features |= window.describe_moving("up" if axis == UP else "fix")
             if axis != UP:
                 features["stamp"] = window.describe_stamps(axis)
-            if sways and axis != UP:
-                features |= {f"sway {each:g}": -2.0 * sways**2 * np.expm1(-window.length_m / each) for each in _SWAY_M}
             stamps = gnss.stamp_ns[first], gnss.stamp_ns[last]
             made.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
     return made
@@ -251,11 +246,7 @@ def align_turns(turn: Floats, step: int) -> Floats:
     if not change.size:
         return np.asarray(turn[:, 0] - turn[:, 1])
     matrix = np.stack((change[:, 1], np.ones(len(change))), -1)
-    found = np.array([1.0, 0.0])
-    for _ in range(5):
-        off = change[:, 0] - multiply_by_vector(matrix, found)
-        root = 1.0 / (1.0 + np.square(off / (2.5 * float(np.median(np.abs(off))) + 1e-9)))
-        found = solve_least_squares(matrix * root[:, None], change[:, 0] * root)
+    found = solve_robust(matrix, change[:, 0], np.array([1.0, 0.0]), np.full(2, np.inf))
     return np.asarray(turn[:, 0] - found[0] * turn[:, 1] - found[1] / step * np.arange(len(turn)))
 
 
@@ -300,9 +291,7 @@ class _Window:
     def describe(self, role: str, axis: str, *, has_others: bool) -> dict[str, Floats]:
         """Return the factors of the densities of an odometry that is compared with fixes."""
         if axis == UP:
-            moving = np.abs(self._speed[:, [0, -1]]) > _STILL_MPS
-            pitch = {"rocking": moving.sum(1).astype(np.float64)}
-            pitch |= {f"pitch scale {tau:g}": _integrate_process(self._speed, self.time_s, tau) for tau in SCALE_S}
+            pitch = {f"pitch scale {tau:g}": _integrate_process(self._speed, self.time_s, tau) for tau in SCALE_S}
             return pitch | {
                 f"{role} scale {tau:g}": _integrate_process(self._climb, self.time_s, tau) for tau in SCALE_S
             }

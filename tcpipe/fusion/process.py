@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import NoiseModel, SensorNoise
+from tcpipe.fusion.densities import PRIORS, NoiseModel, SensorNoise
 from tcpipe.fusion.measurements import (
     IMU,
     VISUAL,
@@ -25,14 +25,12 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
-    Plane,
     bridge_outliers,
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
     compute_slopes,
-    estimate_white_noise,
-    is_in_gap,
+    is_covered,
 )
 from tcpipe.robust import estimate_robust_std
 
@@ -55,7 +53,6 @@ _ACCELERATION_WINDOW_S = 0.6  # window of odometry's slope
 _ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration: one row
 _COURSE_TURN = 0.02  # rad²/s: 8° in a second, of a turn that only the course over ground tells
 _DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
-_MAX_GAP_NS = 300_000_000
 _STEADY = 1e-4  # m²/s³: 1 cm/s in a second, forward and aside
 _UNSEEN_SLIDE = 4e-4  # m²/s³
 _FIXES, _WINDOW_S = 5, 1.0  # fixes, and seconds, that show a velocity or how it slides
@@ -187,7 +184,7 @@ def make_motion_noise(  # noqa: PLR0917
     if m.imu is not None:
         density[by_gyro, :3] = noise.turns[IMU].white
     metres_per_s = _compute_speed(m, stamp_ns[~by_gyro])
-    density[~by_gyro] = _make_turn_density(m, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
+    density[~by_gyro, :3] = _make_turn_density(m, noise, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
     inertial = mode == state.INERTIAL
     if m.imu is not None and inertial.any():
         density[inertial, 3:] = _compute_accelerometer_density(m.imu, stamp_ns[inertial])[:, None]
@@ -198,11 +195,6 @@ def make_motion_noise(  # noqa: PLR0917
     return density * period_s
 
 
-def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
-    """Return how fast the variance of a gyroscope's angle grows [rad²/s]."""
-    return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
-
-
 def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
     """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
     source = m.first_odometry
@@ -211,28 +203,23 @@ def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
     return np.abs(np.interp(at_ns, source.stamp_ns, source.velocity_mps[:, 0]))
 
 
-def _make_turn_density(m: Measurements, mode: NDArray[np.int8], rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 6), its last columns 0."""
-    density = np.full((mode.size, 6), 0.0)
-    density[:, :3] = _DRIFT
-    sources = turn_sources(m)
+def _make_turn_density(
+    m: Measurements, noise: NoiseModel, mode: NDArray[np.int8], rate_radps: Floats, speed_mps: Floats
+) -> Floats:
+    """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 3).
+
+    The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is constant of it.
+    """
+    density = np.full((mode.size, 3), _DRIFT)
     ground = np.full(mode.size, 0.0 if is_gliding(m) else GROUND)
     if is_turned_by_course(m):
         density[:, 2] = _COURSE_TURN
-    for source in sources:
-        visual = source is m.visual
-        rows = mode == (state.VISUAL_TURN if visual else state.FLAT_TURN)
-        known = np.isfinite(source.yaw_rate_radps)
-        rate_hz = 1e9 / compute_median_period_ns(source.stamp_ns[known])
-        turns = source.yaw_rate_radps[known, None] if source.turn_rate_radps is None else source.turn_rate_radps[known]
-        spatial = turns.shape[1] == 3
-        density[rows, 0 if spatial else 2 : 3] = 1.1 * estimate_white_noise(turns) ** 2 / rate_hz + _DRIFT
-        if spatial:
-            ground[rows] = 0.0
-        best = m.imu is None and source is sources[-1]
-        # The scale is off by this share for a second at a time, beside what is constant of it.
-        share = 0.02 if visual else 0.1 if best else 0.3
-        density[rows, :3] += np.square(share * rate_radps[rows])
+    for role in noise.turns.keys() - {IMU}:
+        rows = mode == (state.VISUAL_TURN if role == VISUAL else state.FLAT_TURN)
+        is_spatial = m.odometries()[role].turn_rate_radps is not None
+        density[rows, 0 if is_spatial else 2 :] = noise.turns[role].white
+        ground[rows] *= not is_spatial
+        density[rows] += PRIORS[f"{role} turn scale"].variance * np.square(rate_radps[rows])
     density[:, :2] += (ground * speed_mps)[:, None]
     return density
 
@@ -251,7 +238,7 @@ def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
     sources = [source for source in m.odometries().values() if source.stamp_ns.size > 2]
     found = np.full(at_ns.size, np.nan)
     for source in sources:
-        covered = ~is_in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
+        covered = is_covered(source.stamp_ns, at_ns, at_ns)
         slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], _ACCELERATION_WINDOW_S)
         found[covered] = np.fmin(found[covered], np.interp(at_ns[covered], source.stamp_ns, np.abs(slope)))
     unseen = np.full(at_ns.size, _UNKNOWN) if sources else _compute_receiver_density(m, at_ns)
@@ -266,34 +253,23 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     source, least = m.doppler or m.gnss, 0.0
     if source is None or source.stamp_ns.size < _FIXES:
         return np.full(at_ns.size, _UNKNOWN)
+    period_s = 1e-9 * compute_median_period_ns(source.stamp_ns)
     if isinstance(source, Positions):
-        values, variance, order = source.position_enu_m, source.variance_m2, 2
+        std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
         least = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
+        places = source.position_enu_m[:, :2] @ np.array([1.0, 1j])
+        places = bridge_outliers(compute_seconds(source.stamp_ns, int(source.stamp_ns[0])), places, std)
+        axes = [places.real, places.imag]
     else:
-        values, variance, order = source.velocity_enu_mps, source.variance_m2ps2, 1
-    zero_ns, std = int(source.stamp_ns[0]), float(np.sqrt(np.median(variance[:, :2])))
-    stamp_s, plane = compute_seconds(source.stamp_ns, zero_ns), values[:, :2] @ np.array([1.0, 1j])
-    plane = bridge_outliers(stamp_s, plane, std) if order == 2 else plane
-    shown_s, acceleration = _compute_accelerations(stamp_s, plane, std, order)
-    lasts_s = max(_UNSEEN_LASTS_S, 1e-9 * compute_median_period_ns(source.stamp_ns))
-    density = np.maximum(_UNSEEN_STEADY + lasts_s * np.square(np.minimum(acceleration, MAX_ACCELERATION_MPS2)), least)
-    return np.interp(compute_seconds(at_ns, zero_ns), shown_s, density)
-
-
-def _compute_accelerations(stamp_s: Floats, values: Plane, std: float, order: int) -> tuple[Floats, Floats]:
-    """Return times [s] and accelerations [m/s²], shape (M,), by the derivative of this order of samples in the plane, shape (N,).
-
-    Successive means are compared, of so few samples of a standard deviation ``std`` as show an acceleration of `_SHOWN_MPS2`.
-    """
-    wanted = _SHOWN_MPS2 * float(np.median(np.diff(stamp_s))) ** order / std
-    # First and second differences have √2 and √6 times the standard deviation of a sample.
-    rows = int(np.ceil((np.sqrt(4.0 * order - 2.0) / wanted) ** (1.0 / (order + 0.5))))
-    rows = min(rows, stamp_s.size // (order + 2))
-    at_s, values = (np.convolve(each, np.full(rows, 1.0 / rows), "valid") for each in (stamp_s, values))
+        std, order = float(np.sqrt(np.median(source.variance_m2ps2[:, :2]))), 1
+        axes = [source.velocity_enu_mps[:, 0], source.velocity_enu_mps[:, 1]]
+    # The slope of a line through the samples of a window has √12 times their noise over √(samples), and over the window.
+    window_s = max(3.0 * period_s, (12.0 ** (order / 2.0) * std * period_s**0.5 / _SHOWN_MPS2) ** (1.0 / (order + 0.5)))
     for _ in range(order):
-        values = (values[rows:] - values[:-rows]) / (at_s[rows:] - at_s[:-rows])
-        at_s = 0.5 * (at_s[rows:] + at_s[:-rows])
-    return at_s, np.abs(values)
+        axes = [compute_slopes(source.stamp_ns, axis, window_s) for axis in axes]
+    acceleration = np.minimum(np.hypot(*axes), MAX_ACCELERATION_MPS2)
+    density = np.maximum(_UNSEEN_STEADY + max(_UNSEEN_LASTS_S, period_s) * acceleration**2, least)
+    return np.asarray(np.interp(at_ns, source.stamp_ns, density))
 
 
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:
