@@ -57,7 +57,7 @@ _STEADY = 1e-4  # m²/s³: 1 cm/s in a second, forward and aside
 _UNSEEN_SLIDE = 4e-4  # m²/s³
 _FIXES, _WINDOW_S = 5, 1.0  # fixes, and seconds, that show a velocity or how it slides
 _UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows
-_UNSEEN_STEADY = 1e-3  # m²/s³: least density by a receiver
+_UNSEEN_MPS2 = 0.07  # least acceleration between two measurements of a receiver
 _SHOWS_COURSE_MPS = 0.2  # worse velocity of fixes shows no course
 _UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show how it changes
 _SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver: half of the change that masks look for
@@ -268,7 +268,7 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     for _ in range(order):
         axes = [compute_slopes(source.stamp_ns, axis, window_s) for axis in axes]
     acceleration = np.minimum(np.hypot(*axes), MAX_ACCELERATION_MPS2)
-    density = np.maximum(_UNSEEN_STEADY + max(_UNSEEN_LASTS_S, period_s) * acceleration**2, least)
+    density = np.maximum(max(_UNSEEN_LASTS_S, period_s) * (_UNSEEN_MPS2**2 + acceleration**2), least)
     return np.asarray(np.interp(at_ns, source.stamp_ns, density))
 
 
