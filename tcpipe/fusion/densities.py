@@ -53,7 +53,7 @@ class SensorNoise:
         the variance ``white * f``.
     correlated : of fixes the error of position [m], the process whose structure function is nearest to the fitted sum of processes between
         1 and 40 s; of an odometry that of its scale around its mean [1]; of a yaw rate that of its bias around its mean [rad/s].
-    claimed_m2 : median variance of the fixes of a run; both parts are those of a fix that claims so much, and in proportion to it.
+    claimed_m2 : median variance of the fixes of a run; both parts are those of a fix of this claim, and in proportion to it.
     white_data_share : share of ``white`` that the data determine: 0 is only the prior, 1 only the data.
     """
 
@@ -119,40 +119,36 @@ PRIORS = {
     "wheel_odometry turn scale": Prior(0.1**2, 100.0),
     "visual_odometry turn scale": Prior(0.02**2, 100.0),
 }
-"""Variances and densities before the data speak; units in the comments."""
+"""Variances and densities before the fit; units in the comments."""
 
 _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
 """Of the white noise of fixes, absolute and of the claimed variance: receivers that filter repeat their errors to 0.1 mm."""
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
 _SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
 _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
-_SHARE_S = 10.0  # the share of the data is that of the change over so long
-_ROUNDS = 16  # of which the first half takes medians
-_GATE = 9.0  # of z², afterwards
-_TRUNCATED = 0.9733  # mean of z² below the gate
-_LONGEST = 15.0  # a section's length through this: longer windows are too few to tell a variance
-_CAUTION = 0.6  # standard deviations of a fitted process that a filter's process is larger by
-_OVERLAP = 2.0  # other lengths and axes tell the same: the number of windows is divided by this
-_FEWEST = 8  # windows
-DETERMINED = 0.5  # share that the data tell of a density: less, and the larger of fit and prior holds
-# Windows that are up to so many times as long as the longest enter the fit if they are not longer than this: few, but better than none.
-_FIT, _SHORTEST_S = 4.0, 20.0
-# Share of fixes without a claim: of a run with more, the noise is the recipe's, or more where the run shows more.
-_MOST_UNCLAIMED = 0.5
-_ABOUT_RIGHT = 1.5  # a claim is, within this factor of the variance
-_CODE_PHASE_M2 = 1.5**2  # of each axis; GPS Standard Positioning Service, Performance Standard 2020
-_ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
-_MOVING = 0.02  # the same of what errs only while the robot moves
-_UNLIKE = 0.25  # by this share of the total, processes in the plane differ from those of the height
-_LOOSEST = 25.0  # a prior's standard deviation grows by so much at most
-_LEAST_LEVEL = 1e-3  # of the squares, relative to the fitted sum
-_LEAST = 1e-10  # m² or rad²: rounding
+_SHARE_S = 10.0  # time difference [s] at which the data's share of a process is computed
+_ROUNDS = 16  # rounds of the fit [1]; medians in the first half, means below the gate in the second
+_GATE = 9.0  # gate of z² [1], 3σ
+_TRUNCATED = 0.9733  # mean of a χ² variate of one degree of freedom below the gate [1]
+_LEAST_WINDOWS = 15.0  # windows of the longest length in a section [1]: fewer do not determine a variance
+_FEW_WINDOWS, _FEW_WINDOWS_S = 4.0, 20.0  # longer windows by this factor [1] enter the fit up to this length [s]
+_PROCESS_MARGIN = 0.6  # standard deviations of a fitted process [1] by which the filter's is larger
+_REDUNDANCY = 2.0  # windows per independent one [1]: other lengths and axes share their errors
+_FEWEST = 8  # fewest windows of a cell [1]
+DETERMINED = 0.5  # share of a density by the data [1]; below it the larger of fit and prior counts
+_MAX_VARIANCE_RATIO = 1.5  # shown over stated variance of fixes without claims [1]; above it the shown one counts
+_CODE_PHASE_M2 = 1.5**2  # variance of each axis [m²]; GPS Standard Positioning Service, Performance Standard 2020
+_PROCESS_STD = 0.6  # 1σ of the share of the claim [1] that one correlation time has
+_MOVING_STD = 0.02  # the same of errors that are there only while the robot moves
+_AXES_STD = 0.25  # 1σ of the difference of processes in the plane and of heights [1], by their total
+_MAX_PRIOR_GROWTH = 25.0  # largest factor [1] by which a prior's standard deviation grows with the density
+_ROUNDING = 1e-10  # variance of rounding [m² or rad²]
 
 
 def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
     """Return measurements whose fixes claim what the run shows, where the receiver claims nothing for most and the recipe too little.
 
-    What errs by more than a decimetre has no fixed ambiguities: its error lasts longer than a run can show, and is that of the code phase.
+    Fixes with an error above a decimetre have no fixed ambiguities: they err as the code phase does, for longer than a run can show.
     """
     if m.gnss is None or m.gnss.unclaimed is None or _has_claims(m.gnss):
         return m
@@ -161,7 +157,7 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
     if noise.horizontal is None or noise.vertical is None:
         return m
     shown_m2 = noise.horizontal.white + noise.horizontal.correlated.variance
-    if shown_m2 < _ABOUT_RIGHT * noise.horizontal.claimed_m2:
+    if shown_m2 < _MAX_VARIANCE_RATIO * noise.horizontal.claimed_m2:
         return m
     least_m2 = shown_m2 if shown_m2 < _CENTIMETRES_M2 else max(shown_m2, _CODE_PHASE_M2)
     times = np.where(m.gnss.unclaimed[:, None], max(1.0, least_m2 / noise.horizontal.claimed_m2), 1.0)
@@ -170,7 +166,7 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
 
 def _has_claims(gnss: Positions) -> bool:
     """Return whether the receiver claims a variance for most fixes."""
-    return gnss.unclaimed is None or gnss.unclaimed.mean() < _MOST_UNCLAIMED
+    return gnss.unclaimed is None or gnss.unclaimed.mean() < 0.5
 
 
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
@@ -179,7 +175,7 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     if not residuals:
         return prior
     section_ns = max(each.end_ns.max() for each in residuals) - min(each.start_ns.min() for each in residuals)
-    longest_s = 1e-9 * float(section_ns) / _LONGEST
+    longest_s = 1e-9 * float(section_ns) / _LEAST_WINDOWS
     by_turns, by_heights = (
         _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
     )
@@ -219,7 +215,7 @@ class _Cell:
 
     def find_level(self, variances: Floats, *, truncated: bool) -> tuple[Floats, float]:
         """Return the features relative to the fitted sum, their mean (C,), and the level of the squares in the same measure."""
-        fitted = multiply_by_vector(self.features, variances) + _LEAST
+        fitted = multiply_by_vector(self.features, variances) + _ROUNDING
         z2 = self.square / fitted
         relative = (self.features / fitted[:, None]).mean(0)
         inside = z2[z2 < _GATE]
@@ -237,7 +233,7 @@ class _Fit:
         self._cells = [cell for each in residuals for cell in _split_cells(each, self._names)]
         pairs = np.array([_find_prior(name, prior) for name in self._names]).reshape(-1, 2)
         self._mean, self._std = pairs.T
-        # The height tells about the plane, so what both tell is measured against the claims.
+        # Heights determine processes in the plane too, so the data's share of both is measured against the claims.
         claims = {"up": prior.vertical, "fix": prior.horizontal}
         self._usual_std = np.array(
             [
@@ -247,7 +243,9 @@ class _Fit:
         )
         self._variances, self._covariance = self._mean, np.diag(self._std**2)
         cells = [
-            cell for cell in self._cells if cell.residuals.time_s <= max(longest_s, min(_FIT * longest_s, _SHORTEST_S))
+            cell
+            for cell in self._cells
+            if cell.residuals.time_s <= max(longest_s, min(_FEW_WINDOWS * longest_s, _FEW_WINDOWS_S))
         ]
         for number in range(_ROUNDS if cells else 0):
             rows, levels = zip(
@@ -255,12 +253,12 @@ class _Fit:
             )
             counts = self._count_windows(cells)
             weight = np.sqrt(0.5 * counts)
-            # What is many times the usual is not held back by it: a prior's standard deviation grows with the density.
-            std = np.clip(self._variances, self._std, _LOOSEST * self._std)
+            # A prior's standard deviation grows with the density, so that the prior does not bound a large one.
+            std = np.clip(self._variances, self._std, _MAX_PRIOR_GROWTH * self._std)
             matrix = np.concatenate((np.array(rows) * weight[:, None], np.diag(1.0 / std)))
             # The logarithm of a level misfits alike where the sum is too large and where it is too small.
             # Its mean is below that of the level by 1 / n.
-            logarithm = np.log(np.maximum(levels, _LEAST_LEVEL)) + np.minimum(1.0 / (_OVERLAP * counts), 0.5)
+            logarithm = np.log(levels) + np.minimum(1.0 / (_REDUNDANCY * counts), 0.5)
             target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
             # Solved in units of the prior, so that rounding does not decide.
             fitted = solve_non_negative(matrix * std, target) * std
@@ -277,7 +275,7 @@ class _Fit:
         for cell in cells:
             key = cell.residuals.pair, cell.residuals.axis, cell.is_still
             levels.setdefault(key, []).append(
-                (cell.residuals.time_s, float((multiply_by_vector(cell.features, self._variances)).mean()) + _LEAST)
+                (cell.residuals.time_s, float((multiply_by_vector(cell.features, self._variances)).mean()) + _ROUNDING)
             )
         counts = []
         for cell in cells:
@@ -289,11 +287,11 @@ class _Fit:
                 for each in (length_s + later_s, np.abs(length_s - later_s), later_s)
             ]
             correlation = (at[0] + at[1] - 2.0 * at[2]) / (2.0 * np.interp(length_s, time_s, level))
-            counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _OVERLAP)
+            counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _REDUNDANCY)
         return np.array(counts)
 
     def _compute_data_share(self, factors: Floats) -> float:
-        """Return which share the data tell of a sum of the densities, by factors (C,)."""
+        """Return the share of a sum of the densities, by factors (C,), that the data determine."""
         before = float(np.square(factors * self._usual_std).sum())
         return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
 
@@ -320,7 +318,7 @@ class _Fit:
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
         """Return the Gauss-Markov process that is nearest to the sum of those of these names.
 
-        What the data do not tell, by its share or by the length of the section, is the larger of fit and prior.
+        Where the data do not determine it, by their share or by the length of the section, it is the larger of fit and prior.
         """
         taus = {
             row: float(name.rpartition(" ")[2])
@@ -335,7 +333,7 @@ class _Fit:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
         data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
-        fitted = shape @ self._variances + _CAUTION * unsure
+        fitted = shape @ self._variances + _PROCESS_MARGIN * unsure
         undetermined = (self._longest_s < _SUMMARY_S) | (data_share < DETERMINED)
         return _summarize(
             np.where(undetermined, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), data_share
@@ -343,7 +341,7 @@ class _Fit:
 
 
 def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
-    """Yield the residuals of the moving and of the stationary robot, without exact zeros: a value that was repeated says nothing."""
+    """Yield the residuals of the moving and of the stationary robot, without exact zeros, which repeated values give."""
     features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
     for is_still in (False, True):
         if is_still:  # what little the robot moves then must not explain them
@@ -373,7 +371,7 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
 def _find_fix_prior(
     name: str, horizontal: SensorNoise, vertical: SensorNoise, of_heights: Mapping[str, float]
 ) -> tuple[float, float]:
-    """Return the same for fixes; in the plane it is what the heights show, as far as they tell, by the ratio of claims.
+    """Return the same for fixes; in the plane it is that of the heights, as far as the data determine it, by the ratio of claims.
 
     Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in the plane.
     """
@@ -382,9 +380,9 @@ def _find_fix_prior(
     if kind == "white":
         return fixes.white, fixes.claimed_m2
     if kind == "moving":
-        return 0.0, _MOVING * fixes.claimed_m2
+        return 0.0, _MOVING_STD * fixes.claimed_m2
     usual = fixes.correlated.variance * _share_process(fixes.correlated.time_s, float(time_s), FIX_S)
-    usual_std, data_share = _ONE_TIME * fixes.claimed_m2, vertical.correlated.data_share
+    usual_std, data_share = _PROCESS_STD * fixes.claimed_m2, vertical.correlated.data_share
     if axis == "up" or data_share <= 0.0:
         return usual, usual_std
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
@@ -394,7 +392,7 @@ def _find_fix_prior(
     alike = sum(variance for each, variance in shown.items() if each.endswith(f" {time_s}"))
     total = max(sum(shown.values()), horizontal.correlated.variance)
     mean = data_share * alike + (1.0 - data_share) * usual
-    return mean, data_share * _UNLIKE * total + (1.01 - data_share) * usual_std
+    return mean, data_share * _AXES_STD * total + (1.01 - data_share) * usual_std
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:

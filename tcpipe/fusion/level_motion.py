@@ -1,7 +1,7 @@
 """How the body moved by one odometry and the turn rates, in a level frame, aligned robustly with the fixes.
 
 Attitude is dead reckoning: the gyroscope's increments multiplied, in a frame that drifts. Up in that frame is the specific force averaged
-over seconds, less the accelerations that the odometry tells; heading is the direction of the body's x-axis about it, and wanders with the
+over seconds, less the accelerations of the odometry; heading is the direction of the body's x-axis about it, and wanders with the
 gyroscope. The alignment takes out what a filter estimates anyhow: the odometry's scale, the heading's slow drift, an error of the
 antenna's lever arm and a time offset, by iterated least squares with weights that fall with the square of a residual (Cauchy's loss).
 """
@@ -36,15 +36,15 @@ STEP_S = 0.05
 """Between the rows of a grid."""
 KNOT_S = 60.0
 """Between knots of the heading's drift."""
-_UP_S = 10.0  # the specific force is averaged over so much
+_UP_S = 10.0  # averaging of the specific force [s]
 _SLOWEST_IMU_NS = 100_000_000  # slower units do not show turns
 _ALIGN_S = 10.0  # windows of the alignment
 _PITCH_KNOT_S = 240.0  # the same of pitch, whose error is an accelerometer's bias
 _ROUNDS = 8
-_SPIKE = 8.0  # times the median distance from the median of five: more than 5σ
+_SPIKE_RATIO = 8.0  # times the median distance from the median of five: more than 5σ
 _ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1  # of what the alignment takes out
-_LEAST_SCALE = 0.2  # an odometry of less shows another motion
-_MOVES_M = 0.2  # shorter windows show no heading
+_MIN_SCALE = 0.2  # an odometry of less shows another motion
+_MIN_MOVE_M = 0.2  # shorter windows show no heading
 _FEWEST = 4  # windows that show a heading
 
 
@@ -109,7 +109,7 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     force = _mean_force(measurements, imu, zero_ns, time_s, rate)
     quat = _multiply_increments(rate[:-1] * STEP_S)
     up = _find_up(quat, force)
-    # What turns "up" in the drifting frame is the gyroscope's bias about the level axes.
+    # "Up" turns in the drifting frame by the gyroscope's bias about the level axes.
     turn = np.cross(up, np.gradient(up, STEP_S, axis=0))
     bias = np.median(np.einsum("nji,nj->ni", matrix_from_quat(quat), turn), axis=0)
     quat = _multiply_increments((rate[:-1] - bias) * STEP_S)
@@ -122,7 +122,7 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
 def _mean_force(
     measurements: Measurements, imu: InertialMeasurements, zero_ns: int, time_s: Floats, rate: Floats
 ) -> Floats:
-    """Return the specific force less the acceleration that an odometry tells, (n, 3)."""
+    """Return the specific force less the acceleration of an odometry, (n, 3)."""
     means = compute_interval_means(
         compute_seconds(imu.stamp_ns, zero_ns), imu.specific_force_mps2, time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S
     )
@@ -194,7 +194,7 @@ def remove_spikes(values: Floats, *, fill: Floats | float | None = None) -> Floa
     smooth = compute_median_of_five(values)
     off = np.abs(values - smooth)
     scatter = float(np.median(off[off > 0.0])) if (off > 0.0).any() else 0.0
-    return np.where(off > _SPIKE * scatter, smooth if fill is None else fill, values)
+    return np.where(off > _SPIKE_RATIO * scatter, smooth if fill is None else fill, values)
 
 
 def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:
@@ -227,13 +227,13 @@ def align_tracks(
     return {
         role: alignment.make_track(forward_mps[role], replace(best, scale=scale))
         for role, scale in scales.items()
-        if scale > _LEAST_SCALE
+        if scale > _MIN_SCALE
     }
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """What turns a dead-reckoned track into the fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
+    """Transformation of a dead-reckoned track to the fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
 
     turn_rad: Floats
     scale: float = 1.0
@@ -302,7 +302,7 @@ class _Alignment:
             velocity, arm = self._horizontal(forward, fit)
             moved = self._difference(integrate_grid(velocity) + arm)
             length = np.abs(moved)
-            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, _MOVES_M)
+            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, _MIN_MOVE_M)
             if moving.sum() < _FEWEST:
                 return None
             unit = np.conj(moved) / np.maximum(length, 1e-9)
@@ -343,7 +343,7 @@ class _Alignment:
         velocity, arm = self._horizontal(forward, replace(fit, scale=1.0))
         moved, fix = self._difference(integrate_grid(velocity)), self._moved_m[:, 0] + 1j * self._moved_m[:, 1]
         length = np.abs(moved)
-        moving = length > max(0.3 * float(np.median(length)), _MOVES_M)
+        moving = length > max(0.3 * float(np.median(length)), _MIN_MOVE_M)
         ratio = ((fix - self._difference(arm)) * np.conj(moved)).real[moving] / length[moving] ** 2
         return float(np.median(ratio)) if ratio.size else 0.0
 

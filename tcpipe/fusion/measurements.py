@@ -84,7 +84,7 @@ class GroundVelocities:
     Attributes
     ----------
     stamp_ns : [ns], shape (N,), int64, increasing.
-    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not told, its variance vast.
+    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not measured, its variance `NO_TRUST`.
     variance_m2ps2 : [m²/s²], shape (N, 3); floored, never unknown.
     """
 

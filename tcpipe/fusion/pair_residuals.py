@@ -1,6 +1,6 @@
 """Residuals of every pair of sensors over windows of several lengths, and what each density adds to their variance.
 
-A residual is how much farther one sensor says that the robot moved, or turned, than another, over a window of Δ seconds: of fixes against
+A residual is the motion, or turn, by one sensor less that by another, over a window of Δ seconds: of fixes against
 an odometry along and across the heading in the window's middle, and up; of two odometries along; of two yaw rates as an angle. Its variance
 is a sum of densities times features, which are integrals over the path driven in the window:
 
@@ -145,7 +145,7 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
 
 
 def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, speed_mps: Floats) -> list[Residuals]:
-    """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) tells whether the robot moves."""
+    """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) shows whether the robot moves."""
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
@@ -267,7 +267,7 @@ def _integrate_process(weight: Floats, window_s: float, tau_s: float) -> Floats:
 
 
 class _Window:
-    """The path within windows of one length, as a track tells it."""
+    """The path of a track within windows of one length."""
 
     def __init__(self, track: Track, attitude: Attitude, start_s: Floats, end_s: Floats) -> None:
         self._span = (start_s, end_s)

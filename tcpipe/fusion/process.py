@@ -38,36 +38,38 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SCALE_STD: Mapping[str, float] = {
-    WHEELS: 0.12,  # a skid-steered robot on grass slips by so much
+    WHEELS: 0.12,  # slip of a skid-steered robot on grass
     VISUAL: 0.05,  # stereo calibration
 }
 """By odometry, σ of its scale before the run shows it."""
-_GYRO_SCALE_STD = 0.01  # of MEMS gyroscopes, by their datasheets: 1 to 3 %
-_WHEEL_TURN_SCALE_STD = 0.2  # turn rate of skidding wheels
-_VISUAL_TURN_SCALE_STD = 0.03  # turn rate of a camera
-SLOPE_RAD = 0.1  # of ground, where nothing shows it
-DOPPLER_LASTS_S = 3.0  # what a correlation that fades in 1.5 s weighs
-UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
-GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
-_ACCELERATION_WINDOW_S = 0.6  # window of odometry's slope
-_ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration: one row
-_COURSE_TURN = 0.02  # rad²/s: 8° in a second, of a turn that only the course over ground tells
-_DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
-_STEADY = 1e-4  # m²/s³: 1 cm/s in a second, forward and aside
-_UNSEEN_SLIDE = 4e-4  # m²/s³
-_FIXES, _WINDOW_S = 5, 1.0  # fixes, and seconds, that show a velocity or how it slides
-_UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows
-_UNSEEN_MPS2 = 0.07  # least acceleration between two measurements of a receiver
-_SHOWS_COURSE_MPS = 0.2  # worse velocity of fixes shows no course
-_UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show how it changes
-_SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver: half of the change that masks look for
-_LEVEL_STD_RAD = 0.7  # roll and pitch are small to this σ
-_HELD_STD_RAD = 0.05  # the same where only the course gives turns
-_CHORD_S = 4.0  # baseline of slope from fixes
-_CHORD_M = 1.0  # shorter baselines give no slope
-_STEEPEST = 0.6  # rad: no robot climbs more
-_SLOPE_LASTS_M = 10.0  # length of one slope
-_UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
+_TURN_SCALE_STD: Mapping[str, float] = {
+    IMU: 0.01,  # MEMS gyroscopes, by their datasheets: 1 to 3 %
+    WHEELS: 0.2,  # skidding wheels
+    VISUAL: 0.03,  # camera
+}
+"""σ of the scale of a turn rate [1]."""
+SLOPE_RAD = 0.1  # slope of unknown ground [rad], 1σ
+DOPPLER_LASTS_S = 3.0  # weight of a correlation that fades in 1.5 s [s]
+UNSEEN_TURN_RADPS = 0.07  # roll and pitch rate on uneven ground [rad/s], 1σ
+GROUND = 2e-3  # density of the change of slope under a robot [rad²/m]: 2.6° over a metre
+_ACCELERATION_WINDOW_S = 0.6  # window of an odometry's slope [s]
+_ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row
+_COURSE_DENSITY = 0.02  # density of turns that only the course over ground shows [rad²/s]: 8° in a second
+_MIN_TURN_DENSITY = 5e-7  # least density of turns [rad²/s]: a tenth of a degree in a second
+_MIN_DENSITY = 1e-4  # least density of velocity [m²/s³]: 1 cm/s in a second, forward and aside
+_SLIDE_DENSITY = 4e-4  # density of sliding that no camera shows [m²/s³]
+_UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor shows [m²/s³]
+_FIXES, _WINDOW_S = 5, 1.0  # fewest fixes [1], and shortest time [s], that show a velocity or a slide
+_UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows [s]
+_UNSEEN_MPS2 = 0.07  # acceleration between two measurements of a receiver [m/s²], 1σ
+_MAX_COURSE_MPS = 0.2  # largest σ of a velocity by fixes that shows a course [m/s]
+_UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show its change [m/s]
+_SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver [m/s²]: half of the change that masks look for
+_LEVEL_STD_RAD = 0.7  # roll and pitch without an accelerometer [rad], 1σ
+_COURSE_ROLL_STD_RAD = 0.05  # roll where only the course gives turns [rad], 1σ
+_CHORD_S, _CHORD_M = 4.0, 1.0  # baseline of a slope by fixes [s], and its least length [m]
+_MAX_SLOPE_RAD = 0.6  # steepest slope that a robot climbs [rad]
+_SLOPE_LASTS_M = 10.0  # length of one slope [m]
 
 
 def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
@@ -82,7 +84,7 @@ def is_gliding(measurements: Measurements) -> bool:
     """
     if measurements.gnss is None or not measurements.is_antenna_alone:
         return False
-    return _compute_fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
+    return _compute_fix_velocity_std_mps(measurements.gnss) > _MAX_COURSE_MPS
 
 
 def is_turned_by_course(measurements: Measurements) -> bool:
@@ -101,7 +103,7 @@ def _compute_fix_velocity_std_mps(gnss: Positions) -> float:
 def estimate_slope_std_rad(measurements: Measurements) -> float | None:
     """Return how steep the ground is by how fixes climb it [rad], root mean square; None where they are too few or too noisy.
 
-    It is as steep across as along. One deviation is added of what so few slopes tell: each lasts for some metres.
+    It is as steep across as along. One standard deviation of an estimate by a few slopes, which last for some metres, is added.
     """
     gnss = measurements.gnss
     if gnss is None or gnss.stamp_ns.size < _FIXES:
@@ -113,7 +115,7 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
     climbs = way_m > _CHORD_M
     if climbs.sum() < _FIXES:
         return None
-    slope = (up / np.maximum(way_m, _CHORD_M))[climbs].clip(-_STEEPEST, _STEEPEST)
+    slope = (up / np.maximum(way_m, _CHORD_M))[climbs].clip(-_MAX_SLOPE_RAD, _MAX_SLOPE_RAD)
     noise = float(2.0 * np.median(gnss.variance_m2[:, 2]) / np.median(way_m[climbs]) ** 2)
     excess = float(np.mean(slope**2)) - noise
     slopes_seen = max(1.0, float(np.sum(way_m[climbs])) / rows / _SLOPE_LASTS_M)
@@ -123,10 +125,10 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
 def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
     """Return the standard deviations of a pitch and roll of zero, once a second, where no accelerometer measures them.
 
-    Where the course alone tells the turns, what the antenna sways by would pass for roll: it is held.
+    Where only the course shows turns, sway of the antenna would look like roll, so that roll has a small standard deviation.
     """
     is_held = is_turned_by_course(measurements) and not measurements.has_posed_tilt
-    return _LEVEL_STD_RAD, _HELD_STD_RAD if is_held else _LEVEL_STD_RAD
+    return _LEVEL_STD_RAD, _COURSE_ROLL_STD_RAD if is_held else _LEVEL_STD_RAD
 
 
 def turn_scale_std(measurements: Measurements) -> float:
@@ -137,11 +139,9 @@ def turn_scale_std(measurements: Measurements) -> float:
     if measurements.gnss is None:
         return 0.0
     if measurements.imu is not None:
-        return _GYRO_SCALE_STD
+        return _TURN_SCALE_STD[IMU]
     sources = turn_sources(measurements)
-    if not sources:
-        return 0.0
-    return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
+    return _TURN_SCALE_STD[VISUAL if sources[-1] is measurements.visual else WHEELS] if sources else 0.0
 
 
 def is_length_observable(m: Measurements, fixes: SensorNoise | None) -> bool:
@@ -210,10 +210,10 @@ def _make_turn_density(
 
     The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is constant of it.
     """
-    density = np.full((mode.size, 3), _DRIFT)
+    density = np.full((mode.size, 3), _MIN_TURN_DENSITY)
     ground = np.full(mode.size, 0.0 if is_gliding(m) else GROUND)
     if is_turned_by_course(m):
-        density[:, 2] = _COURSE_TURN
+        density[:, 2] = _COURSE_DENSITY
     for role in noise.turns.keys() - {IMU}:
         rows = mode == (state.VISUAL_TURN if role == VISUAL else state.FLAT_TURN)
         is_spatial = m.odometries()[role].turn_rate_radps is not None
@@ -241,22 +241,22 @@ def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
         covered = is_covered(source.stamp_ns, at_ns, at_ns)
         slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], _ACCELERATION_WINDOW_S)
         found[covered] = np.fmin(found[covered], np.interp(at_ns[covered], source.stamp_ns, np.abs(slope)))
-    unseen = np.full(at_ns.size, _UNKNOWN) if sources else _compute_receiver_density(m, at_ns)
-    return np.where(np.isnan(found), unseen, _STEADY + _ACCELERATION_LASTS_S * found**2)
+    unseen = np.full(at_ns.size, _UNKNOWN_DENSITY) if sources else _compute_receiver_density(m, at_ns)
+    return np.where(np.isnan(found), unseen, _MIN_DENSITY + _ACCELERATION_LASTS_S * found**2)
 
 
 def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     """Return the noise density without odometry: the square of the acceleration that a receiver shows, times how long it lasts.
 
-    What a slow receiver shows from fix to fix lasts as long. Fixes too noisy to show a velocity do not show how steady it is.
+    An acceleration between slow fixes lasts from one to the next. Fixes too noisy to show a velocity do not show how steady it is.
     """
     source, least = m.doppler or m.gnss, 0.0
     if source is None or source.stamp_ns.size < _FIXES:
-        return np.full(at_ns.size, _UNKNOWN)
+        return np.full(at_ns.size, _UNKNOWN_DENSITY)
     period_s = 1e-9 * compute_median_period_ns(source.stamp_ns)
     if isinstance(source, Positions):
         std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
-        least = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
+        least = _UNKNOWN_DENSITY * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
         places = source.position_enu_m[:, :2] @ np.array([1.0, 1j])
         places = bridge_outliers(compute_seconds(source.stamp_ns, int(source.stamp_ns[0])), places, std)
         axes = [places.real, places.imag]
@@ -273,8 +273,8 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
 
 
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:
-    """Return how fast a body that is held to drive straight comes to slide [m²/s³]: as visual odometry shows it, or a guess."""
+    """Return the density of sideways and upward velocity [m²/s³]: as visual odometry shows it, or a guess."""
     if visual is None or visual.stamp_ns.size < 3:
-        return _UNSEEN_SLIDE
+        return _SLIDE_DENSITY
     shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _WINDOW_S) for axis in (1, 2)]
-    return max(_STEADY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)
+    return max(_MIN_DENSITY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)

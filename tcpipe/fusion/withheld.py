@@ -35,7 +35,7 @@ Calibration = Literal["overconfident", "calibrated", "underconfident", "undecide
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What was withheld less what the track predicts, one value a second or a chord.
+    """Withheld measurements less those that the track predicts, one value a second or a chord.
 
     Attributes
     ----------
@@ -180,7 +180,7 @@ def compare_fixes(
 ) -> Comparison:
     """Compare one fix a second: those of a second share the error of the track, and much of their own.
 
-    What is not known of the arm is part of base_link's σ, not of the antenna's: an error of the arm moves both.
+    The uncertainty of the arm is part of base_link's σ, not of the antenna's: an error of the arm moves both.
     """
     number = np.searchsorted(windows_ns[:, 0], fixes.stamp_ns) - 1
     start_ns, end_ns = windows_ns[np.maximum(number, 0)].T
