@@ -150,7 +150,7 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
 
     Fixes with an error above a decimetre have no fixed ambiguities: they err as the code phase does, for longer than a run can show.
     """
-    if m.gnss is None or m.gnss.unclaimed is None or _has_claims(m.gnss):
+    if m.gnss is None or m.gnss.unclaimed is None or m.gnss.has_claims:
         return m
     found = replace(m, gnss=replace(m.gnss, unclaimed=None))
     noise = fit_noise(found, residuals)
@@ -162,11 +162,6 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
     least_m2 = shown_m2 if shown_m2 < _CENTIMETRES_M2 else max(shown_m2, _CODE_PHASE_M2)
     times = np.where(m.gnss.unclaimed[:, None], max(1.0, least_m2 / noise.horizontal.claimed_m2), 1.0)
     return replace(found, gnss=replace(m.gnss, unclaimed=None, variance_m2=m.gnss.variance_m2 * times))
-
-
-def _has_claims(gnss: Positions) -> bool:
-    """Return whether the receiver claims a variance for most fixes."""
-    return gnss.unclaimed is None or gnss.unclaimed.mean() < 0.5
 
 
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
@@ -181,7 +176,7 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     )
     turns = {role: by_turns.find_noise(of, f"{role} turn", f"{role} bias") for role, of in prior.turns.items()}
     prior, horizontal = replace(prior, turns=turns), prior.horizontal
-    has_claims = measurements.gnss is not None and _has_claims(measurements.gnss)
+    has_claims = measurements.gnss is not None and measurements.gnss.has_claims
     if has_claims and prior.vertical and prior.vertical.claimed_m2 < NO_TRUST:
         vertical = by_heights.find_noise(prior.vertical, "up white", "up process", "up moving")
         prior = replace(prior, vertical=vertical, densities={UP: by_heights.get_densities()})

@@ -72,6 +72,11 @@ class Positions:
     mounting_std_rad: float = 0.0
 
     @property
+    def has_claims(self) -> bool:
+        """Whether the receiver claims a variance for most fixes."""
+        return self.unclaimed is None or bool(self.unclaimed.mean() < 0.5)
+
+    @property
     def has_heights(self) -> bool:
         """Whether any fix measures the height."""
         return bool((self.variance_m2[:, 2] < NO_TRUST).any())

@@ -88,11 +88,13 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """A section's measurements and attitude."""
+    """A section's measurements and attitude; rows of the attitude's grid where windows without fixes may end, and their stamps [ns]."""
 
     measurements: Measurements
     attitude: Attitude
     zero_ns: int
+    rows: Ints
+    at_ns: Ints
 
     def choose_windows(self, at_ns: Ints, sources: Sequence[Ints]) -> Iterator[tuple[float, Ints, Ints]]:
         """Yield each time difference with first and last rows of its windows among increasing stamps (N,).
@@ -115,11 +117,6 @@ class _Section:
             if usable.sum() >= _FEWEST:
                 yield float(np.median(length_s[usable])), first[usable], last[usable]
 
-    def make_stamps(self) -> tuple[Ints, Ints]:
-        """Return rows of the grid where windows without fixes may end, and their stamps [ns]."""
-        rows = np.arange(0, self.attitude.time_s.size, round(_PAIR_STEP_S / STEP_S))
-        return rows, self.zero_ns + np.rint(self.attitude.time_s[rows] * 1e9).astype(np.int64)
-
 
 def find_residuals(measurements: Measurements) -> list[Residuals]:
     """Return the residuals of all pairs of sensors that can be compared; none without odometry or without turns."""
@@ -130,7 +127,9 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
     attitude = find_attitude(measurements, zero_ns, end_s)
     if attitude is None or not odometries:
         return []
-    section = _Section(measurements, attitude, zero_ns)
+    rows = np.arange(0, attitude.time_s.size, round(_PAIR_STEP_S / STEP_S))
+    at_ns = zero_ns + np.rint(attitude.time_s[rows] * 1e9).astype(np.int64)
+    section = _Section(measurements, attitude, zero_ns, rows, at_ns)
     residuals = _compare_turns(section)
     forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
     tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
@@ -150,6 +149,8 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
     off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
+    if gnss.unclaimed is not None and gnss.has_claims:  # the recipe's variance of the others is a guess
+        off[gnss.unclaimed] = np.nan
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
     made = []
@@ -190,7 +191,7 @@ def _describe_fixes(gnss: Positions, axis: str, first: Ints, last: Ints, time_s:
 
 def _compare_odometries(section: _Section, pair: tuple[str, str], first: Track, second: Track) -> list[Residuals]:
     """Return the residuals of two odometries along the heading of the first, the second scaled to it."""
-    (rows, at_ns), time_s = section.make_stamps(), section.attitude.time_s
+    rows, at_ns, time_s = section.rows, section.at_ns, section.attitude.time_s
     at_s = time_s[rows]
     length = [integrate_grid(track.speed_mps)[rows] for track in (first, second)]
     step = max(1, round(5.0 / _PAIR_STEP_S))
@@ -215,7 +216,7 @@ def _compare_odometries(section: _Section, pair: tuple[str, str], first: Track, 
 
 def _compare_turns(section: _Section) -> list[Residuals]:
     """Return the residuals of the yaw rates of each two sensors; scale and bias of the second are fitted to the first."""
-    (rows, at_ns), time_s = section.make_stamps(), section.attitude.time_s
+    rows, at_ns, time_s = section.rows, section.at_ns, section.attitude.time_s
     at_s = time_s[rows]
     rates, sources = {}, {}
     for role in find_turn_roles(section.measurements):

@@ -68,7 +68,8 @@ _MIN_SCATTER_RATIO = 3.0  # shown over stated scatter: of counts with every othe
 _MEAN_S = 0.5  # averaging of such a velocity
 _MIN_MOVING_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
 _JITTER_S = 0.05  # less does not matter
-_JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3  # pairs of fixes in a window; longest time between two [s]; slowest motion [m/s]
+_JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3
+"""Of an estimate of jitter: pairs of fixes in a window [1]; longest time between two [s]; slowest motion [m/s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +130,9 @@ def prepare_positions(
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
     degree_m = _DEGREE_M * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])
-    variance[:, :2] += _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
+    rounding = _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
+    unclaimed |= (rounding > variance[:, :2]).any(1)  # the receiver does not know how its coordinates are written
+    variance[:, :2] += rounding
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~is_fix], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
@@ -210,7 +213,8 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((2 * np.interp(stamp_s, odometry_s, speed[:, 0]) * jitter_s) ** 2)[:, None]
-    return add_turn_variance(replace(gnss, variance_m2=variance), 2 * jitter_s), jitter_s
+    unclaimed = jitter_s > 0.0 if gnss.unclaimed is None else gnss.unclaimed | (jitter_s > 0.0)
+    return add_turn_variance(replace(gnss, variance_m2=variance, unclaimed=unclaimed), 2 * jitter_s), jitter_s
 
 
 def _make_windows(values: Floats) -> Floats:

@@ -213,7 +213,8 @@ def _find_ground(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[N
     for _ in range(6):
         left = excess_m[:, *best] - _fit_tilt(xy_m, excess_m[:, *best])
         left = np.abs(left - np.median(left))
-        relief_m = np.ptp(excess_m[:, *_select_near(best)], axis=(1, 2))
+        row, column = np.clip(best, _NEAR, len(_SHIFT_M) - 1 - _NEAR) - _NEAR
+        relief_m = np.ptp(excess_m[:, row : row + 2 * _NEAR + 1, column : column + 2 * _NEAR + 1], axis=(1, 2))
         near = left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)  # steep ground misfits by a step
         good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
@@ -235,12 +236,6 @@ def _find_least(spread: FloatArray) -> tuple[int, int]:
     """Return the lattice indices (north, east) of the shift that leaves the least spread."""
     i, j = np.unravel_index(int(spread.argmin()), spread.shape)
     return int(i), int(j)
-
-
-def _select_near(best: tuple[int, int]) -> tuple[slice, slice]:
-    """Return the part of the lattice near a shift."""
-    i, j = (min(max(index, _NEAR), len(_SHIFT_M) - 1 - _NEAR) for index in best)
-    return slice(i - _NEAR, i + _NEAR + 1), slice(j - _NEAR, j + _NEAR + 1)
 
 
 def _flatten(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[FloatArray, FloatArray, Rows]:

@@ -167,6 +167,13 @@ def test_fixes_without_claims_keep_the_prior(short):
     assert model.horizontal.white + model.horizontal.correlated.variance == pytest.approx(1.0)
 
 
+def test_fixes_without_claims_do_not_enter_the_noise_of_those_with(short):
+    unclaimed = np.random.default_rng(4).random(short.gnss.stamp_ns.size) < 0.43
+    variance_m2 = np.where(unclaimed[:, None], 1.0, short.gnss.variance_m2)
+    mixed = drive.estimate_noise(change_fixes(short, unclaimed=unclaimed, variance_m2=variance_m2))
+    assert mixed.horizontal.white == pytest.approx(drive.estimate_noise(short).horizontal.white, rel=0.3)
+
+
 def test_fixes_at_one_hertz_and_of_metres():
     whole = measure(2, 0.2, 1.2, 60.0)
     rows = slice(None, None, 10)
