@@ -22,7 +22,7 @@ from campaign_drives import HUSKY, WHOLE, MemoryLog, simulated
 
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
-from tcpipe.fusion.densities import FixNoise, GaussMarkov, NoiseModel, fit_noise
+from tcpipe.fusion.densities import GaussMarkov, NoiseModel, SensorNoise, fit_noise
 from tcpipe.fusion.excursions import find_event_candidates
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.pair_residuals import find_residuals
@@ -118,8 +118,8 @@ def add_noise(measurements: Measurements, family: Family, seed: int) -> Measurem
     return replace(measurements, gnss=changed)
 
 
-def change_std_m(noise: FixNoise, time_s: float) -> float:
-    return float(np.sqrt(2.0 * noise.white_m2 + noise.correlated.difference_variance(np.array(time_s))))
+def change_std_m(noise: SensorNoise, time_s: float) -> float:
+    return float(np.sqrt(2.0 * noise.white + noise.correlated.difference_variance(np.array(time_s))))
 
 
 def simulate(seeds: list[int], length_m: float, only: str) -> None:
@@ -162,7 +162,7 @@ def describe(model: NoiseModel) -> Iterator[str]:
     for axis, noise in (("plane", model.horizontal), ("up", model.vertical)):
         if noise is not None:
             claimed, white, slow = (
-                1e3 * np.sqrt(each) for each in (noise.claimed_m2, noise.white_m2, noise.correlated.variance)
+                1e3 * np.sqrt(each) for each in (noise.claimed_m2, noise.white, noise.correlated.variance)
             )
             yield (
                 f"  fixes, {axis}: claimed {claimed:.1f} mm, white {white:.1f} mm, correlated {slow:.1f} mm over "
@@ -170,11 +170,11 @@ def describe(model: NoiseModel) -> Iterator[str]:
             )
     for role, each in model.odometries.items():
         yield (
-            f"  {role}: {1e3 * np.sqrt(each.velocity_m2ps):.1f} mm after 1 s (told {each.velocity_data_share:.2f}), scale "
-            f"{100 * np.sqrt(each.scale.variance):.2f} % over {each.scale.time_s:.0f} s (told {each.scale.data_share:.2f})"
+            f"  {role}: {1e3 * np.sqrt(each.white):.1f} mm after 1 s (told {each.white_data_share:.2f}), scale "
+            f"{100 * np.sqrt(each.correlated.variance):.2f} % over {each.correlated.time_s:.0f} s (told {each.correlated.data_share:.2f})"
         )
     for role, turn in model.turns.items():
-        yield f"  turns, {role}: {1e3 * np.sqrt(turn.white_rad2ps):.2f} mrad after 1 s"
+        yield f"  turns, {role}: {1e3 * np.sqrt(turn.white):.2f} mrad after 1 s"
 
 
 def read(path: Path) -> None:

@@ -1,16 +1,6 @@
 """Noise of each sensor, estimated from the run itself by pairwise residuals at several time differences (structure functions).
 
-`fit_noise` returns a `NoiseModel`. A filter takes from it, each number in the unit that its name ends with:
-
-- ``horizontal`` and ``vertical``: of fixes, east and north alike, and up. ``white_m2`` is independent from fix to fix; ``correlated`` is a
-  Gauss-Markov error of position, to be a state of each axis. Both are those of a fix that claims ``claimed_m2``, and in proportion to it.
-- ``odometries[role].velocity_m2ps``: the variance of the distance grows by so much a second of driving; a velocity at f Hz has the
-  variance ``velocity_m2ps * f``. Zero while the robot is stationary.
-- ``odometries[role].scale``: Gauss-Markov error of the scale around its mean, [1]; ``shared_scale``: the same for all odometries at once.
-- ``turns[role].white_rad2ps``: the variance of the angle grows by so much a second; ``bias``: Gauss-Markov error of the turn rate around
-  its mean, in rad/s.
-
-``data_share`` is the share that the data determine: 0 is only the prior, 1 only the data. Densities are never evidence against a sensor.
+`fit_noise` returns a `NoiseModel`: a `SensorNoise` for each quantity that a sensor measures. Densities are never evidence against a sensor.
 """
 
 from __future__ import annotations
@@ -21,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.level_motion import KNOT_S
+from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
 from tcpipe.fusion.measurements import GNSS, IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, TURN, TURN_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
@@ -53,50 +43,37 @@ class GaussMarkov:
 
 
 @dataclass(frozen=True, slots=True)
-class FixNoise:
-    """Errors of fixes along one axis, for a fix that claims ``claimed_m2``, the median variance of the run's fixes.
+class SensorNoise:
+    """Errors of one quantity that a sensor measures: white noise, and a Gauss-Markov process, which is to be a state of a filter.
 
     Attributes
     ----------
-    white_m2 : [m²], variance of the part that is independent from fix to fix.
-    correlated : one Gauss-Markov process [m] whose structure function is nearest to the fitted sum of processes between 1 and 40 s.
-    processes : the fitted processes themselves, by correlation time.
-    white_data_share : share of ``white_m2`` that the data determine.
+    white : of fixes along an axis the variance of each [m²]; of an odometry the variance that its distance gains in a second of driving
+        [m²/s], zero while the robot is stationary; of a yaw rate the variance that its angle gains in a second [rad²/s]. A rate at f Hz has
+        the variance ``white * f``.
+    correlated : of fixes the error of position [m], the process whose structure function is nearest to the fitted sum of processes between
+        1 and 40 s; of an odometry that of its scale around its mean [1]; of a yaw rate that of its bias around its mean [rad/s].
+    claimed_m2 : median variance of the fixes of a run; both parts are those of a fix of this claim, and in proportion to it.
+    white_data_share : share of ``white`` that the data determine: 0 is only the prior, 1 only the data.
     """
 
-    claimed_m2: float
-    white_m2: float
+    white: float
     correlated: GaussMarkov
-    processes: tuple[GaussMarkov, ...]
-    white_data_share: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryNoise:
-    """Errors of an odometry's forward velocity: white noise, and a scale that varies around its mean."""
-
-    velocity_m2ps: float
-    scale: GaussMarkov
-    velocity_data_share: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class TurnNoise:
-    """Errors of a yaw rate: white noise, and a bias [rad/s] that varies around its mean."""
-
-    white_rad2ps: float
-    bias: GaussMarkov
+    claimed_m2: float = 0.0
     white_data_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise of all sensors of a section; ``horizontal`` and ``vertical`` are None without fixes. The module's text says what each means."""
+    """Noise of all sensors of a section; ``horizontal`` (east and north alike) and ``vertical`` are of fixes, and None without.
 
-    horizontal: FixNoise | None
-    vertical: FixNoise | None
-    odometries: Mapping[str, OdometryNoise]
-    turns: Mapping[str, TurnNoise]
+    ``shared_scale`` is the error of the scale of all odometries at once.
+    """
+
+    horizontal: SensorNoise | None
+    vertical: SensorNoise | None
+    odometries: Mapping[str, SensorNoise]
+    turns: Mapping[str, SensorNoise]
     shared_scale: GaussMarkov
     densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
     """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
@@ -126,8 +103,6 @@ PRIORS = {
     # rad²: what the alignment leaves of heading and pitch; roll and pitch where no accelerometer measures them.
     "heading scale": Prior(0.005**2, 30.0),
     "pitch scale": Prior(0.0015**2, 30.0),
-    "sway": Prior(0.05**2),
-    "rocking": Prior(0.003**2),  # m²: heights of the driving body, white
     "stamp": Prior(0.003**2),  # s²: time stamps of fixes, which err by as much times the velocity
     # rad²/s beside the noise that the samples show.
     "imu turn": Prior(1e-8),
@@ -142,58 +117,49 @@ PRIORS = {
     "wheel_odometry turn scale": Prior(0.1**2, 100.0),
     "visual_odometry turn scale": Prior(0.02**2, 100.0),
 }
-"""Variances and densities before the data speak; units in the comments."""
+"""Variances and densities before the fit; units in the comments."""
 
 _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
 """Of the white noise of fixes, absolute and of the claimed variance: receivers that filter repeat their errors to 0.1 mm."""
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
 _SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
 _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
-_SHARE_S = 10.0  # the share of the data is that of the change over so long
-_ROUNDS = 16  # of which the first half takes medians
-_GATE = 9.0  # of z², afterwards
-_TRUNCATED = 0.9733  # mean of z² below the gate
-_LONGEST = 15.0  # a section's length through this: longer windows are too few to tell a variance
-_CAUTION = 0.6  # standard deviations of a fitted process that a filter's process is larger by
-_OVERLAP = 2.0  # other lengths and axes tell the same: the number of windows is divided by this
-_FEWEST = 8  # windows
-DETERMINED = 0.5  # share that the data tell of a density: less, and the larger of fit and prior holds
-# Windows that are up to so many times as long as the longest enter the fit if they are not longer than this: few, but better than none.
-_FIT, _SHORTEST_S = 4.0, 20.0
-# Share of fixes without a claim: of a run with more, the noise is the recipe's, or more where the run shows more.
-_MOST_UNCLAIMED = 0.5
-_ABOUT_RIGHT = 1.5  # a claim is, within this factor of the variance
-_CODE_PHASE_M2 = 1.5**2  # of each axis; GPS Standard Positioning Service, Performance Standard 2020
-_ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
-_MOVING = 0.02  # the same of what errs only while the robot moves
-_UNLIKE = 0.25  # by this share of the total, processes in the plane differ from those of the height
-_LOOSEST = 25.0  # a prior's standard deviation grows by so much at most
-_LEAST_LEVEL = 1e-3  # of the squares, relative to the fitted sum
-_LEAST = 1e-10  # m² or rad²: rounding
+_SHARE_S = 10.0  # time difference [s] at which the data's share of a process is computed
+_ROUNDS = 16  # rounds of the fit [1]; medians in the first half, means below the gate in the second
+_GATE = 9.0  # gate of z² [1], 3σ
+_TRUNCATED = 0.9733  # mean of a χ² variate of one degree of freedom below the gate [1]
+_LEAST_WINDOWS = 15.0  # windows of the longest length in a section [1]: fewer do not determine a variance
+_FEW_WINDOWS, _FEW_WINDOWS_S = 4.0, 20.0  # longer windows by this factor [1] enter the fit up to this length [s]
+_PROCESS_MARGIN = 0.6  # standard deviations of a fitted process [1] by which the filter's is larger
+_REDUNDANCY = 2.0  # windows per independent one [1]: other lengths and axes share their errors
+_FEWEST = 8  # fewest windows of a cell [1]
+DETERMINED = 0.5  # share of a density by the data [1]; below it the larger of fit and prior counts
+_MAX_VARIANCE_RATIO = 1.5  # shown over stated variance of fixes without claims [1]; above it the shown one counts
+_CODE_PHASE_M2 = 1.5**2  # variance of each axis [m²]; GPS Standard Positioning Service, Performance Standard 2020
+_PROCESS_STD = 0.6  # 1σ of the share of the claim [1] that one correlation time has
+_MOVING_STD = 0.02  # the same of errors that are there only while the robot moves
+_AXES_STD = 0.25  # 1σ of the difference of processes in the plane and of heights [1], by their total
+_MAX_PRIOR_GROWTH = 25.0  # largest factor [1] by which a prior's standard deviation grows with the density
+_ROUNDING = 1e-10  # variance of rounding [m² or rad²]
 
 
 def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
     """Return measurements whose fixes claim what the run shows, where the receiver claims nothing for most and the recipe too little.
 
-    What errs by more than a decimetre has no fixed ambiguities: its error lasts longer than a run can show, and is that of the code phase.
+    Fixes with an error above a decimetre have no fixed ambiguities: they err as the code phase does, for longer than a run can show.
     """
-    if m.gnss is None or m.gnss.unclaimed is None or _has_claims(m.gnss):
+    if m.gnss is None or m.gnss.unclaimed is None or m.gnss.has_claims:
         return m
     found = replace(m, gnss=replace(m.gnss, unclaimed=None))
     noise = fit_noise(found, residuals)
     if noise.horizontal is None or noise.vertical is None:
         return m
-    shown_m2 = noise.horizontal.white_m2 + noise.horizontal.correlated.variance
-    if shown_m2 < _ABOUT_RIGHT * noise.horizontal.claimed_m2:
+    shown_m2 = noise.horizontal.white + noise.horizontal.correlated.variance
+    if shown_m2 < _MAX_VARIANCE_RATIO * noise.horizontal.claimed_m2:
         return m
     least_m2 = shown_m2 if shown_m2 < _CENTIMETRES_M2 else max(shown_m2, _CODE_PHASE_M2)
     times = np.where(m.gnss.unclaimed[:, None], max(1.0, least_m2 / noise.horizontal.claimed_m2), 1.0)
     return replace(found, gnss=replace(m.gnss, unclaimed=None, variance_m2=m.gnss.variance_m2 * times))
-
-
-def _has_claims(gnss: Positions) -> bool:
-    """Return whether the receiver claims a variance for most fixes."""
-    return gnss.unclaimed is None or gnss.unclaimed.mean() < _MOST_UNCLAIMED
 
 
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
@@ -202,23 +168,25 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     if not residuals:
         return prior
     section_ns = max(each.end_ns.max() for each in residuals) - min(each.start_ns.min() for each in residuals)
-    longest_s = 1e-9 * float(section_ns) / _LONGEST
+    longest_s = 1e-9 * float(section_ns) / _LEAST_WINDOWS
     by_turns, by_heights = (
         _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
     )
-    claims = measurements.gnss is not None and _has_claims(measurements.gnss)
-    prior = replace(
-        prior,
-        turns={role: by_turns.find_turn_noise(role, noise) for role, noise in prior.turns.items()},
-        vertical=by_heights.find_fix_noise("up", prior.vertical)
-        if prior.vertical and claims and prior.vertical.claimed_m2 < NO_TRUST
-        else prior.vertical,
-    )
+    turns = {role: by_turns.find_noise(of, f"{role} turn", f"{role} bias") for role, of in prior.turns.items()}
+    prior, horizontal = replace(prior, turns=turns), prior.horizontal
+    has_claims = measurements.gnss is not None and measurements.gnss.has_claims
+    if has_claims and prior.vertical and prior.vertical.claimed_m2 < NO_TRUST:
+        vertical = by_heights.find_noise(prior.vertical, "up white", "up process", "up moving")
+        prior = replace(prior, vertical=vertical, densities={UP: by_heights.get_densities()})
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
+    if has_claims and horizontal:
+        horizontal = plane.find_noise(horizontal, "fix white", "fix process", "fix moving")
     return replace(
         prior,
-        horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal and claims else prior.horizontal,
-        odometries={role: plane.find_odometry_noise(role, noise) for role, noise in prior.odometries.items()},
+        horizontal=horizontal,
+        odometries={
+            role: plane.find_noise(of, f"{role} velocity", f"{role} scale") for role, of in prior.odometries.items()
+        },
         shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
         densities={
             axis: fit.get_densities()
@@ -240,7 +208,7 @@ class _Cell:
 
     def find_level(self, variances: Floats, *, truncated: bool) -> tuple[Floats, float]:
         """Return the features relative to the fitted sum, their mean (C,), and the level of the squares in the same measure."""
-        fitted = multiply_by_vector(self.features, variances) + _LEAST
+        fitted = multiply_by_vector(self.features, variances) + _ROUNDING
         z2 = self.square / fitted
         relative = (self.features / fitted[:, None]).mean(0)
         inside = z2[z2 < _GATE]
@@ -258,7 +226,7 @@ class _Fit:
         self._cells = [cell for each in residuals for cell in _split_cells(each, self._names)]
         pairs = np.array([_find_prior(name, prior) for name in self._names]).reshape(-1, 2)
         self._mean, self._std = pairs.T
-        # The height tells about the plane, so what both tell is measured against the claims.
+        # Heights determine processes in the plane too, so the data's share of both is measured against the claims.
         claims = {"up": prior.vertical, "fix": prior.horizontal}
         self._usual_std = np.array(
             [
@@ -268,7 +236,9 @@ class _Fit:
         )
         self._variances, self._covariance = self._mean, np.diag(self._std**2)
         cells = [
-            cell for cell in self._cells if cell.residuals.time_s <= max(longest_s, min(_FIT * longest_s, _SHORTEST_S))
+            cell
+            for cell in self._cells
+            if cell.residuals.time_s <= max(longest_s, min(_FEW_WINDOWS * longest_s, _FEW_WINDOWS_S))
         ]
         for number in range(_ROUNDS if cells else 0):
             rows, levels = zip(
@@ -276,12 +246,12 @@ class _Fit:
             )
             counts = self._count_windows(cells)
             weight = np.sqrt(0.5 * counts)
-            # What is many times the usual is not held back by it: a prior's standard deviation grows with the density.
-            std = np.clip(self._variances, self._std, _LOOSEST * self._std)
+            # A prior's standard deviation grows with the density, so that the prior does not bound a large one.
+            std = np.clip(self._variances, self._std, _MAX_PRIOR_GROWTH * self._std)
             matrix = np.concatenate((np.array(rows) * weight[:, None], np.diag(1.0 / std)))
             # The logarithm of a level misfits alike where the sum is too large and where it is too small.
             # Its mean is below that of the level by 1 / n.
-            logarithm = np.log(np.maximum(levels, _LEAST_LEVEL)) + np.minimum(1.0 / (_OVERLAP * counts), 0.5)
+            logarithm = np.log(levels) + np.minimum(1.0 / (_REDUNDANCY * counts), 0.5)
             target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
             # Solved in units of the prior, so that rounding does not decide.
             fitted = solve_non_negative(matrix * std, target) * std
@@ -298,7 +268,7 @@ class _Fit:
         for cell in cells:
             key = cell.residuals.pair, cell.residuals.axis, cell.is_still
             levels.setdefault(key, []).append(
-                (cell.residuals.time_s, float((multiply_by_vector(cell.features, self._variances)).mean()) + _LEAST)
+                (cell.residuals.time_s, float((multiply_by_vector(cell.features, self._variances)).mean()) + _ROUNDING)
             )
         counts = []
         for cell in cells:
@@ -310,11 +280,11 @@ class _Fit:
                 for each in (length_s + later_s, np.abs(length_s - later_s), later_s)
             ]
             correlation = (at[0] + at[1] - 2.0 * at[2]) / (2.0 * np.interp(length_s, time_s, level))
-            counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _OVERLAP)
+            counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _REDUNDANCY)
         return np.array(counts)
 
     def _compute_data_share(self, factors: Floats) -> float:
-        """Return which share the data tell of a sum of the densities, by factors (C,)."""
+        """Return the share of a sum of the densities, by factors (C,), that the data determine."""
         before = float(np.square(factors * self._usual_std).sum())
         return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
 
@@ -322,68 +292,53 @@ class _Fit:
         """Return every density by name."""
         return dict(zip(self._names, self._variances.tolist(), strict=True))
 
-    def find_density(self, name: str, prior: float) -> tuple[float, float]:
-        """Return a density, and the data's share of it; the larger of fit and prior where that is less than half."""
-        if name not in self._names:
-            return prior, 0.0
-        row = self._names.index(name)
-        data_share = self._compute_data_share(np.eye(len(self._names))[row])
-        fitted = float(self._variances[row])
-        return (fitted if data_share >= DETERMINED else max(fitted, prior)), data_share
+    def find_noise(self, prior: SensorNoise, white: str, *processes: str) -> SensorNoise:
+        """Return the noise of a sensor by the names of its white density and of its processes.
+
+        Of a white density of which the data determine less than half, the larger of fit and prior.
+        """
+        density, data_share = prior.white, 0.0
+        if white in self._names:
+            row = self._names.index(white)
+            data_share = self._compute_data_share(np.eye(len(self._names))[row])
+            density = float(self._variances[row])
+        if data_share < DETERMINED:
+            density = max(density, prior.white)
+        floor = max(_FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2) if prior.claimed_m2 else 0.0
+        correlated = self.find_process(prior.correlated, *processes)
+        return SensorNoise(max(density, floor), correlated, prior.claimed_m2, data_share)
 
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
         """Return the Gauss-Markov process that is nearest to the sum of those of these names.
 
-        What the data do not tell, by its share or by the length of the section, is the larger of fit and prior.
+        Where the data do not determine it, by their share or by the length of the section, it is the larger of fit and prior.
         """
-        parts = self.find_parts(*names)
-        if not parts:
+        taus = {
+            row: float(name.rpartition(" ")[2])
+            for row, name in enumerate(self._names)
+            if name.rpartition(" ")[0] in names
+        }
+        if not taus:
             return prior
-        factors = np.zeros(len(self._names))
-        for tau, row, _ in parts:
+        factors, shape = np.zeros(len(self._names)), np.zeros((_SUMMARY_S.size, len(self._names)))
+        for row, tau in taus.items():
             factors[row] = -2.0 * np.expm1(-_SHARE_S / tau)
-        data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
-        shape = np.zeros((_SUMMARY_S.size, len(self._names)))
-        for tau, row, _ in parts:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
+        data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
-        fitted = shape @ self._variances + _CAUTION * unsure
+        fitted = shape @ self._variances + _PROCESS_MARGIN * unsure
         undetermined = (self._longest_s < _SUMMARY_S) | (data_share < DETERMINED)
         return _summarize(
             np.where(undetermined, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), data_share
         )
 
-    def find_parts(self, *names: str) -> list[tuple[float, int, float]]:
-        """Return correlation time [s], row and variance of each process of these names."""
-        rows = [row for row, each in enumerate(self._names) if each.rpartition(" ")[0] in names]
-        return [(float(self._names[row].rpartition(" ")[2]), row, float(self._variances[row])) for row in rows]
-
-    def find_fix_noise(self, name: str, prior: FixNoise) -> FixNoise:
-        """Return the noise of fixes along an axis."""
-        names = (f"{name} process", f"{name} moving")
-        correlated = self.find_process(prior.correlated, *names)
-        processes = tuple(GaussMarkov(variance, tau) for tau, _, variance in sorted(self.find_parts(*names)))
-        white, data_share = self.find_density(f"{name} white", prior.white_m2)
-        white = max(white, _FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2)
-        return FixNoise(prior.claimed_m2, white, correlated, processes or prior.processes, data_share)
-
-    def find_odometry_noise(self, role: str, prior: OdometryNoise) -> OdometryNoise:
-        """Return the noise of an odometry's velocity."""
-        density, data_share = self.find_density(f"{role} velocity", prior.velocity_m2ps)
-        return OdometryNoise(density, self.find_process(prior.scale, f"{role} scale"), data_share)
-
-    def find_turn_noise(self, role: str, prior: TurnNoise) -> TurnNoise:
-        """Return the noise of a yaw rate."""
-        density, data_share = self.find_density(f"{role} turn", prior.white_rad2ps)
-        return TurnNoise(density, self.find_process(prior.bias, f"{role} bias"), data_share)
-
 
 def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
-    """Yield the residuals of the moving and of the stationary robot, without exact zeros: a value that was repeated says nothing."""
+    """Yield the residuals of the moving and of the stationary robot, without exact zeros, which repeated values give."""
     features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
     for is_still in (False, True):
         if is_still:  # what little the robot moves then must not explain them
-            features = features * np.array([" scale" not in name and not name.startswith("sway") for name in names])
+            features = features * np.array([" scale" not in name for name in names])
         rows = np.flatnonzero((each.is_still == is_still) & np.isfinite(each.value) & (each.value != 0.0))
         if rows.size < _FEWEST:
             continue
@@ -395,53 +350,54 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     """Return mean and standard deviation of a density before the data speak."""
     kind, _, last = name.rpartition(" ")
     if name.startswith(("fix ", "up ")) and prior.horizontal is not None and prior.vertical is not None:
-        return _find_fix_prior(name, prior.horizontal, prior.vertical)
+        return _find_fix_prior(name, prior.horizontal, prior.vertical, prior.densities.get(UP, {}))
+    known = PRIORS[kind if kind in PRIORS else name]
+    variance, taus = known.variance, TURN_S if kind.endswith((" bias", " turn scale")) else SCALE_S
     if last == "turn" or (last == "velocity" and kind in prior.odometries):
-        density = prior.turns[kind].white_rad2ps if last == "turn" else prior.odometries[kind].velocity_m2ps
-        return density, PRIORS[name].times * density
-    if name in PRIORS or kind == "sway":
-        known = PRIORS[name if name in PRIORS else kind]
-        return known.variance, known.times * known.variance
-    process = _make_process(kind)
-    if kind == "heading scale":
-        process = replace(process, variance=_find_heading_variance(prior))
-    taus = TURN_S if kind.endswith((" bias", " turn scale")) else SCALE_S
-    return _share_process(process, float(last), taus), PRIORS[kind].times * process.variance
+        variance = (prior.turns if last == "turn" else prior.odometries)[kind].white
+    elif kind == "heading scale":
+        variance = _find_heading_variance(prior)
+    share = _share_process(known.time_s, float(last), taus) if known.time_s else 1.0
+    return share * variance, known.times * variance
 
 
-def _find_fix_prior(name: str, horizontal: FixNoise, vertical: FixNoise) -> tuple[float, float]:
-    """Return the same for fixes; in the plane it is what the heights show, as far as they tell, by the ratio of claims.
+def _find_fix_prior(
+    name: str, horizontal: SensorNoise, vertical: SensorNoise, of_heights: Mapping[str, float]
+) -> tuple[float, float]:
+    """Return the same for fixes; in the plane it is that of the heights, as far as the data determine it, by the ratio of claims.
 
     Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in the plane.
     """
-    axis, kind, time_s = (*name.split(), "")[:3]
+    axis, kind, time_s = (*name.split(), "0")[:3]
     fixes = vertical if axis == "up" else horizontal
     if kind == "white":
-        return fixes.white_m2, fixes.claimed_m2
+        return fixes.white, fixes.claimed_m2
     if kind == "moving":
-        return 0.0, _MOVING * fixes.claimed_m2
-    usual, usual_std = _share_process(fixes.correlated, float(time_s), FIX_S), _ONE_TIME * fixes.claimed_m2
-    data_share = vertical.correlated.data_share
+        return 0.0, _MOVING_STD * fixes.claimed_m2
+    usual = fixes.correlated.variance * _share_process(fixes.correlated.time_s, float(time_s), FIX_S)
+    usual_std, data_share = _PROCESS_STD * fixes.claimed_m2, vertical.correlated.data_share
     if axis == "up" or data_share <= 0.0:
         return usual, usual_std
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
-    alike = ratio * sum(each.variance for each in vertical.processes if each.time_s == float(time_s))
-    total = max(ratio * sum(each.variance for each in vertical.processes), horizontal.correlated.variance)
-    return data_share * alike + (1.0 - data_share) * usual, data_share * _UNLIKE * total + (
-        1.01 - data_share
-    ) * usual_std
+    shown = {
+        each: ratio * variance for each, variance in of_heights.items() if each.startswith(("up process", "up moving"))
+    }
+    alike = sum(variance for each, variance in shown.items() if each.endswith(f" {time_s}"))
+    total = max(sum(shown.values()), horizontal.correlated.variance)
+    mean = data_share * alike + (1.0 - data_share) * usual
+    return mean, data_share * _AXES_STD * total + (1.01 - data_share) * usual_std
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:
     """Return the variance of the heading [rad²] that is left between the knots of the alignment: of a Brownian bridge."""
     best = next(iter(prior.turns.values()))
-    return KNOT_S / 6.0 * best.white_rad2ps + KNOT_S**2 / 100.0 * best.bias.variance
+    return KNOT_S / 6.0 * best.white + KNOT_S**2 / 100.0 * best.correlated.variance
 
 
-def _share_process(process: GaussMarkov, tau_s: float, taus_s: Sequence[float]) -> float:
-    """Return the part of a process's variance that belongs to one of several correlation times: linear in their logarithm."""
-    place = np.interp(np.log(process.time_s), np.log(taus_s), np.arange(len(taus_s)))
-    return float(process.variance * max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
+def _share_process(time_s: float, tau_s: float, taus_s: Sequence[float]) -> float:
+    """Return the part of a process that belongs to one of several correlation times: linear in their logarithm."""
+    place = np.interp(np.log(time_s), np.log(taus_s), np.arange(len(taus_s)))
+    return float(max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
 
 
 def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
@@ -456,48 +412,40 @@ def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
 
 def make_prior_model(measurements: Measurements) -> NoiseModel:
     """Return the noise by priors and claims alone."""
-    gnss = measurements.gnss
+    gnss, imu = measurements.gnss, [IMU] if measurements.imu is not None else []
     turning = [role for role, source in measurements.odometries().items() if np.isfinite(source.yaw_rate_radps).any()]
     return NoiseModel(
         horizontal=None if gnss is None else _make_fix_prior(gnss, slice(0, 2)),
         vertical=None if gnss is None else _make_fix_prior(gnss, slice(2, 3)),
         odometries={
-            role: OdometryNoise(
+            role: SensorNoise(
                 _compute_density(each.stamp_ns, each.velocity_mps[:, 0]) + PRIORS[f"{role} velocity"].variance,
                 _make_process(f"{role} scale"),
             )
             for role, each in measurements.odometries().items()
         },
         turns={
-            role: TurnNoise(_estimate_turn_density(measurements, role), _make_process(f"{role} bias"))
-            for role in (*([IMU] if measurements.imu is not None else []), *turning)
+            role: SensorNoise(
+                _compute_density(stamp_ns, rate[:, 2]) + PRIORS[f"{role} turn"].variance, _make_process(f"{role} bias")
+            )
+            for role in (*imu, *turning)
+            for stamp_ns, rate in [get_turn_rates(measurements, role)]
         },
         shared_scale=_make_process("shared scale"),
     )
 
 
-def _make_fix_prior(gnss: Positions, axes: slice) -> FixNoise:
+def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
     """Return the noise of fixes whose claims are right in total."""
     claimed = float(np.median(gnss.variance_m2[:, axes]))
     if claimed >= NO_TRUST:  # not measured: there is no error that lasts, which would be kilometres
-        return FixNoise(claimed, claimed, GaussMarkov(0.0, _SHARE_S), ())
+        return SensorNoise(claimed, GaussMarkov(0.0, _SHARE_S), claimed)
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
-    correlated = GaussMarkov(prior.variance * claimed, prior.time_s)
-    return FixNoise(claimed, (1.0 - prior.variance) * claimed, correlated, (correlated,))
+    return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
 
 
 def _make_process(name: str) -> GaussMarkov:
     return GaussMarkov(PRIORS[name].variance, PRIORS[name].time_s)
-
-
-def _estimate_turn_density(measurements: Measurements, role: str) -> float:
-    """Return the noise density of a yaw rate [rad²/s] by the scatter of its samples, and what is usual beside it."""
-    if role == IMU and measurements.imu is not None:
-        shown = _compute_density(measurements.imu.stamp_ns, measurements.imu.angular_velocity_radps[:, 2])
-    else:
-        source = measurements.odometries()[role]
-        shown = _compute_density(source.stamp_ns, source.yaw_rate_radps)
-    return shown + PRIORS[f"{role} turn"].variance
 
 
 def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
@@ -522,11 +470,8 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
     found = {}
     for name, fixes in ((GNSS, noise.horizontal), (f"{GNSS} height", noise.vertical)):
         if fixes is not None:
-            correlated = fixes.correlated.difference_variance(_TIME_S)
-            fitted = [
-                (np.full_like(_TIME_S, 2.0 * fixes.white_m2), fixes.white_data_share),
-                (correlated, fixes.correlated.data_share),
-            ]
+            correlated = fixes.correlated.difference_variance(_TIME_S), fixes.correlated.data_share
+            fitted = [(np.full_like(_TIME_S, 2.0 * fixes.white), fixes.white_data_share), correlated]
             found[name] = _make_facts("m", fitted, np.full_like(_TIME_S, 2.0 * fixes.claimed_m2))
     for role, odometry in m.odometries().items():
         speed_mps, own = np.abs(odometry.velocity_mps[:, 0]), noise.odometries[role]
@@ -534,20 +479,16 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
         usual_mps = float(np.median(speed_mps[driving])) if driving.any() else 0.0
         scales = [
             (usual_mps**2 * each.integral_variance(_TIME_S), each.data_share)
-            for each in (own.scale, noise.shared_scale)
+            for each in (own.correlated, noise.shared_scale)
         ]
-        fitted = [(own.velocity_m2ps * _TIME_S, own.velocity_data_share), *scales]
+        fitted = [(own.white * _TIME_S, own.white_data_share), *scales]
         found[role] = _make_facts("m", fitted, _sum_white(odometry.stamp_ns, odometry.variance_m2ps2[:, 0]))
     for role, turns in noise.turns.items():
-        if role == IMU and m.imu is not None:
-            claimed = _sum_white(m.imu.stamp_ns, np.array([m.imu.gyro_std_radps**2]))
-        else:
-            claimed = _sum_white(m.odometries()[role].stamp_ns, m.odometries()[role].yaw_rate_var)
-        fitted = [
-            (turns.white_rad2ps * _TIME_S, turns.white_data_share),
-            (turns.bias.integral_variance(_TIME_S), turns.bias.data_share),
-        ]
-        found[f"{role} turn"] = _make_facts("rad", fitted, claimed)
+        imu = m.imu if role == IMU else None
+        claimed = m.odometries()[role].yaw_rate_var if imu is None else np.array([imu.gyro_std_radps**2])
+        bias = turns.correlated.integral_variance(_TIME_S), turns.correlated.data_share
+        fitted = [(turns.white * _TIME_S, turns.white_data_share), bias]
+        found[f"{role} turn"] = _make_facts("rad", fitted, _sum_white(m.sensors()[role].stamp_ns, claimed))
     return found
 
 

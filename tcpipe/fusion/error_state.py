@@ -311,7 +311,7 @@ def make_trajectory(
     if noise.horizontal is not None and noise.vertical is not None:
         # What fixes claim beyond what the run shows lasts longer than the run can show.
         for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
-            position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
+            position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white - fix.correlated.variance)
     if m.gnss is not None and m.imu is None and not m.has_posed_tilt:
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
         # Without a gyroscope the noise of roll passes for sway: the height of the antenna is no better known than it was stated.

@@ -1,7 +1,7 @@
 """How the body moved by one odometry and the turn rates, in a level frame, aligned robustly with the fixes.
 
 Attitude is dead reckoning: the gyroscope's increments multiplied, in a frame that drifts. Up in that frame is the specific force averaged
-over seconds, less the accelerations that the odometry tells; heading is the direction of the body's x-axis about it, and wanders with the
+over seconds, less the accelerations of the odometry; heading is the direction of the body's x-axis about it, and wanders with the
 gyroscope. The alignment takes out what a filter estimates anyhow: the odometry's scale, the heading's slow drift, an error of the
 antenna's lever arm and a time offset, by iterated least squares with weights that fall with the square of a residual (Cauchy's loss).
 """
@@ -22,10 +22,11 @@ from tcpipe.fusion.signals import (
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
+    compute_window_means,
     multiply_by_vector,
     solve_least_squares,
 )
-from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotation_vector
+from tcpipe.geometry.rotation import matrix_from_quat, multiply, normalize, quat_from_rotation_vector, quat_from_rpy
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,15 +36,15 @@ STEP_S = 0.05
 """Between the rows of a grid."""
 KNOT_S = 60.0
 """Between knots of the heading's drift."""
-_UP_S = 10.0  # the specific force is averaged over so much
+_UP_S = 10.0  # averaging of the specific force [s]
 _SLOWEST_IMU_NS = 100_000_000  # slower units do not show turns
 _ALIGN_S = 10.0  # windows of the alignment
 _PITCH_KNOT_S = 240.0  # the same of pitch, whose error is an accelerometer's bias
 _ROUNDS = 8
-_SPIKE = 8.0  # times the median distance from the median of five: more than 5σ
+_SPIKE_RATIO = 8.0  # times the median distance from the median of five: more than 5σ
 _ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1  # of what the alignment takes out
-_LEAST_SCALE = 0.2  # an odometry of less shows another motion
-_MOVES_M = 0.2  # shorter windows show no heading
+_MIN_SCALE = 0.2  # an odometry of less shows another motion
+_MIN_MOVE_M = 0.2  # shorter windows show no heading
 _FEWEST = 4  # windows that show a heading
 
 
@@ -103,11 +104,12 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     imu = measurements.imu
     if roles[0] != IMU or imu is None or not imu.accelerometer_usable:
         yaw = integrate_grid(rate[:, 2])
-        return Attitude(time_s, _rotation_about_up(yaw), yaw, rate, roles[0], stamp_ns, is_level=False)
+        rotation = matrix_from_quat(quat_from_rpy(0.0 * yaw, 0.0 * yaw, yaw))
+        return Attitude(time_s, rotation, yaw, rate, roles[0], stamp_ns, is_level=False)
     force = _mean_force(measurements, imu, zero_ns, time_s, rate)
     quat = _multiply_increments(rate[:-1] * STEP_S)
     up = _find_up(quat, force)
-    # What turns "up" in the drifting frame is the gyroscope's bias about the level axes.
+    # "Up" turns in the drifting frame by the gyroscope's bias about the level axes.
     turn = np.cross(up, np.gradient(up, STEP_S, axis=0))
     bias = np.median(np.einsum("nji,nj->ni", matrix_from_quat(quat), turn), axis=0)
     quat = _multiply_increments((rate[:-1] - bias) * STEP_S)
@@ -117,36 +119,25 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     return Attitude(time_s, rotation, yaw, rate - bias, IMU, stamp_ns, is_level=True)
 
 
-def _rotation_about_up(yaw: Floats) -> Floats:
-    half = 0.5 * yaw
-    zero = np.zeros_like(yaw)
-    return matrix_from_quat(np.stack((zero, zero, np.sin(half), np.cos(half)), -1))
-
-
 def _mean_force(
     measurements: Measurements, imu: InertialMeasurements, zero_ns: int, time_s: Floats, rate: Floats
 ) -> Floats:
-    """Return the specific force less the acceleration that an odometry tells, (n, 3)."""
+    """Return the specific force less the acceleration of an odometry, (n, 3)."""
     means = compute_interval_means(
         compute_seconds(imu.stamp_ns, zero_ns), imu.specific_force_mps2, time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S
     )
     for source in measurements.odometries().values():
-        speed = average_grid(
-            np.interp(time_s, compute_seconds(source.stamp_ns, zero_ns), source.velocity_mps[:, 0]), 0.5
-        )
+        speed_s = compute_seconds(source.stamp_ns, zero_ns)
+        speed = average_grid(np.interp(time_s, speed_s, source.velocity_mps[:, 0])[:, None], 0.5)[:, 0]
         acceleration = (np.gradient(speed, STEP_S), rate[:, 2] * speed, -rate[:, 1] * speed)
         return np.asarray(means - np.stack(acceleration, -1))
     return means
 
 
 def average_grid(values: Floats, window_s: float) -> Floats:
-    """Return the centred moving mean over a window, along the first axis; shorter at the ends."""
-    half = max(1, round(0.5 * window_s / STEP_S))
-    total = np.concatenate((np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)))
-    index = np.arange(len(values))
-    first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
-    count = (last - first).reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray((total[last] - total[first]) / count)
+    """Return the centred moving mean of (n, k) values over a window; shorter at the ends."""
+    rows = np.arange(len(values))
+    return compute_window_means(rows, values, rows, 2 * max(1, round(0.5 * window_s / STEP_S)))
 
 
 def _multiply_increments(turn_rad: Floats) -> Floats:
@@ -168,9 +159,7 @@ def _find_up(quat: Floats, force: Floats) -> Floats:
 def _level(up: Floats) -> Floats:
     """Return the smallest rotations (n, 3, 3) that turn each direction to z."""
     x, y, z = up.T
-    k = 1.0 / np.maximum(1.0 + z, 1e-3)
-    rows = ((1 - x * x * k, -x * y * k, -x), (-x * y * k, 1 - y * y * k, -y), (x, y, z))
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    return matrix_from_quat(normalize(np.stack((y, -x, 0.0 * x, np.maximum(1.0 + z, 1e-3)), -1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +194,7 @@ def remove_spikes(values: Floats, *, fill: Floats | float | None = None) -> Floa
     smooth = compute_median_of_five(values)
     off = np.abs(values - smooth)
     scatter = float(np.median(off[off > 0.0])) if (off > 0.0).any() else 0.0
-    return np.where(off > _SPIKE * scatter, smooth if fill is None else fill, values)
+    return np.where(off > _SPIKE_RATIO * scatter, smooth if fill is None else fill, values)
 
 
 def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:
@@ -238,19 +227,34 @@ def align_tracks(
     return {
         role: alignment.make_track(forward_mps[role], replace(best, scale=scale))
         for role, scale in scales.items()
-        if scale > _LEAST_SCALE
+        if scale > _MIN_SCALE
     }
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """What turns a dead-reckoned track into the fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
+    """Transformation of a dead-reckoned track to the fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
 
     turn_rad: Floats
     scale: float = 1.0
     arm_m: complex = 0j
     offset_s: float = 0.0
     noise_m: float = np.inf
+
+
+def solve_robust(matrix: Floats, target: Floats, start: Floats, std: Floats) -> Floats:
+    """Return the factors (C,) of M equations by weights that fall with the square of a residual (Cauchy's loss), with a prior about zero.
+
+    ``start`` are the first factors, ``std`` their standard deviations beforehand, infinite for none.
+    """
+    found = start
+    for _ in range(_ROUNDS):
+        off = target - multiply_by_vector(matrix, found)
+        noise = float(np.median(np.abs(off))) + 1e-9
+        root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
+        rows = np.concatenate((matrix * root[:, None], np.diag(noise / std)))
+        found = solve_least_squares(rows, np.concatenate((target * root, np.zeros(std.size))))
+    return found
 
 
 class _Alignment:
@@ -298,7 +302,7 @@ class _Alignment:
             velocity, arm = self._horizontal(forward, fit)
             moved = self._difference(integrate_grid(velocity) + arm)
             length = np.abs(moved)
-            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, _MOVES_M)
+            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, _MIN_MOVE_M)
             if moving.sum() < _FEWEST:
                 return None
             unit = np.conj(moved) / np.maximum(length, 1e-9)
@@ -339,7 +343,7 @@ class _Alignment:
         velocity, arm = self._horizontal(forward, replace(fit, scale=1.0))
         moved, fix = self._difference(integrate_grid(velocity)), self._moved_m[:, 0] + 1j * self._moved_m[:, 1]
         length = np.abs(moved)
-        moving = length > max(0.3 * float(np.median(length)), _MOVES_M)
+        moving = length > max(0.3 * float(np.median(length)), _MIN_MOVE_M)
         ratio = ((fix - self._difference(arm)) * np.conj(moved)).real[moving] / length[moving] ** 2
         return float(np.median(ratio)) if ratio.size else 0.0
 
@@ -361,13 +365,6 @@ class _Alignment:
         hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - knots_s) / knots_s[1])
         path = self._difference(integrate_grid(speed)).real
         rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
-        pitch = np.zeros(knots_s.size)
-        for _ in range(_ROUNDS // 2):
-            off = rise - path * multiply_by_vector(hats, pitch)
-            noise = float(np.median(np.abs(off))) + 1e-6
-            root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
-            matrix = np.concatenate(
-                (hats * (path * root)[:, None], np.diag(np.full(pitch.size, noise / _PITCH_STD_RAD)))
-            )
-            pitch = solve_least_squares(matrix, np.concatenate((rise * root, np.zeros(pitch.size))))
+        start, std = np.zeros(knots_s.size), np.full(knots_s.size, _PITCH_STD_RAD)
+        pitch = solve_robust(hats * path[:, None], rise, start, std)
         return np.interp(self._attitude.time_s, knots_s, pitch)

@@ -72,6 +72,11 @@ class Positions:
     mounting_std_rad: float = 0.0
 
     @property
+    def has_claims(self) -> bool:
+        """Whether the receiver claims a variance for most fixes."""
+        return self.unclaimed is None or bool(self.unclaimed.mean() < 0.5)
+
+    @property
     def has_heights(self) -> bool:
         """Whether any fix measures the height."""
         return bool((self.variance_m2[:, 2] < NO_TRUST).any())
@@ -84,7 +89,7 @@ class GroundVelocities:
     Attributes
     ----------
     stamp_ns : [ns], shape (N,), int64, increasing.
-    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not told, its variance vast.
+    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not measured, its variance `NO_TRUST`.
     variance_m2ps2 : [m²/s²], shape (N, 3); floored, never unknown.
     """
 

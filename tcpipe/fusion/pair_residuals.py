@@ -1,6 +1,6 @@
 """Residuals of every pair of sensors over windows of several lengths, and what each density adds to their variance.
 
-A residual is how much farther one sensor says that the robot moved, or turned, than another, over a window of Δ seconds: of fixes against
+A residual is the motion, or turn, by one sensor less that by another, over a window of Δ seconds: of fixes against
 an odometry along and across the heading in the window's middle, and up; of two odometries along; of two yaw rates as an angle. Its variance
 is a sum of densities times features, which are integrals over the path driven in the window:
 
@@ -32,6 +32,7 @@ from tcpipe.fusion.level_motion import (
     integrate_grid,
     make_free_track,
     remove_spikes,
+    solve_robust,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -40,8 +41,6 @@ from tcpipe.fusion.signals import (
     find_longest_step_ns,
     interpolate_signal,
     is_in_gap,
-    multiply_by_vector,
-    solve_least_squares,
 )
 
 Floats = NDArray[np.float64]
@@ -62,7 +61,6 @@ _FEWEST = 8  # windows of one length
 _OVERLAPPING = 8  # windows begin in the length of one
 _LONGEST_GAP_NS = 300_000_000
 _STILL_MPS, _STILL_RAD, _STILL_S = 0.02, 0.02, 0.5  # the last: speeds are averaged, so that noise is none
-_SWAY_M = (1.0, 3.0, 10.0, 30.0)  # the ground's slope changes over so much
 _PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
 
 
@@ -90,11 +88,13 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """A section's measurements and attitude."""
+    """A section's measurements and attitude; rows of the attitude's grid where windows without fixes may end, and their stamps [ns]."""
 
     measurements: Measurements
     attitude: Attitude
     zero_ns: int
+    rows: Ints
+    at_ns: Ints
 
     def choose_windows(self, at_ns: Ints, sources: Sequence[Ints]) -> Iterator[tuple[float, Ints, Ints]]:
         """Yield each time difference with first and last rows of its windows among increasing stamps (N,).
@@ -117,11 +117,6 @@ class _Section:
             if usable.sum() >= _FEWEST:
                 yield float(np.median(length_s[usable])), first[usable], last[usable]
 
-    def make_stamps(self) -> tuple[Ints, Ints]:
-        """Return rows of the grid where windows without fixes may end, and their stamps [ns]."""
-        rows = np.arange(0, self.attitude.time_s.size, round(_PAIR_STEP_S / STEP_S))
-        return rows, self.zero_ns + np.rint(self.attitude.time_s[rows] * 1e9).astype(np.int64)
-
 
 def find_residuals(measurements: Measurements) -> list[Residuals]:
     """Return the residuals of all pairs of sensors that can be compared; none without odometry or without turns."""
@@ -132,11 +127,13 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
     attitude = find_attitude(measurements, zero_ns, end_s)
     if attitude is None or not odometries:
         return []
-    section = _Section(measurements, attitude, zero_ns)
+    rows = np.arange(0, attitude.time_s.size, round(_PAIR_STEP_S / STEP_S))
+    at_ns = zero_ns + np.rint(attitude.time_s[rows] * 1e9).astype(np.int64)
+    section = _Section(measurements, attitude, zero_ns, rows, at_ns)
     residuals = _compare_turns(section)
     forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
     tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
-    speed = np.max([np.abs(average_grid(each, _STILL_S)) for each in forward.values()], axis=0)
+    speed = np.abs(average_grid(np.column_stack([*forward.values()]), _STILL_S)).max(axis=1)
     for role, track in tracks.items():
         residuals += _compare_fixes(section, gnss, role, track, speed) if gnss is not None else []
     if len(tracks) < len(forward):
@@ -147,12 +144,13 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
 
 
 def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, speed_mps: Floats) -> list[Residuals]:
-    """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) tells whether the robot moves."""
+    """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) shows whether the robot moves."""
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
     off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
-    sways = 0.0 if attitude.is_level else gnss.lever_arm_m[2]
+    if gnss.unclaimed is not None and gnss.has_claims:  # the recipe's variance of the others is a guess
+        off[gnss.unclaimed] = np.nan
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
     made = []
@@ -174,8 +172,6 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
             features |= window.describe_moving("up" if axis == UP else "fix")
             if axis != UP:
                 features["stamp"] = window.describe_stamps(axis)
-            if sways and axis != UP:
-                features |= {f"sway {each:g}": -2.0 * sways**2 * np.expm1(-window.length_m / each) for each in _SWAY_M}
             stamps = gnss.stamp_ns[first], gnss.stamp_ns[last]
             made.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
     return made
@@ -195,7 +191,7 @@ def _describe_fixes(gnss: Positions, axis: str, first: Ints, last: Ints, time_s:
 
 def _compare_odometries(section: _Section, pair: tuple[str, str], first: Track, second: Track) -> list[Residuals]:
     """Return the residuals of two odometries along the heading of the first, the second scaled to it."""
-    (rows, at_ns), time_s = section.make_stamps(), section.attitude.time_s
+    rows, at_ns, time_s = section.rows, section.at_ns, section.attitude.time_s
     at_s = time_s[rows]
     length = [integrate_grid(track.speed_mps)[rows] for track in (first, second)]
     step = max(1, round(5.0 / _PAIR_STEP_S))
@@ -220,7 +216,7 @@ def _compare_odometries(section: _Section, pair: tuple[str, str], first: Track, 
 
 def _compare_turns(section: _Section) -> list[Residuals]:
     """Return the residuals of the yaw rates of each two sensors; scale and bias of the second are fitted to the first."""
-    (rows, at_ns), time_s = section.make_stamps(), section.attitude.time_s
+    rows, at_ns, time_s = section.rows, section.at_ns, section.attitude.time_s
     at_s = time_s[rows]
     rates, sources = {}, {}
     for role in find_turn_roles(section.measurements):
@@ -251,11 +247,7 @@ def align_turns(turn: Floats, step: int) -> Floats:
     if not change.size:
         return np.asarray(turn[:, 0] - turn[:, 1])
     matrix = np.stack((change[:, 1], np.ones(len(change))), -1)
-    found = np.array([1.0, 0.0])
-    for _ in range(5):
-        off = change[:, 0] - multiply_by_vector(matrix, found)
-        root = 1.0 / (1.0 + np.square(off / (2.5 * float(np.median(np.abs(off))) + 1e-9)))
-        found = solve_least_squares(matrix * root[:, None], change[:, 0] * root)
+    found = solve_robust(matrix, change[:, 0], np.array([1.0, 0.0]), np.full(2, np.inf))
     return np.asarray(turn[:, 0] - found[0] * turn[:, 1] - found[1] / step * np.arange(len(turn)))
 
 
@@ -276,7 +268,7 @@ def _integrate_process(weight: Floats, window_s: float, tau_s: float) -> Floats:
 
 
 class _Window:
-    """The path within windows of one length, as a track tells it."""
+    """The path of a track within windows of one length."""
 
     def __init__(self, track: Track, attitude: Attitude, start_s: Floats, end_s: Floats) -> None:
         self._span = (start_s, end_s)
@@ -300,9 +292,7 @@ class _Window:
     def describe(self, role: str, axis: str, *, has_others: bool) -> dict[str, Floats]:
         """Return the factors of the densities of an odometry that is compared with fixes."""
         if axis == UP:
-            moving = np.abs(self._speed[:, [0, -1]]) > _STILL_MPS
-            pitch = {"rocking": moving.sum(1).astype(np.float64)}
-            pitch |= {f"pitch scale {tau:g}": _integrate_process(self._speed, self.time_s, tau) for tau in SCALE_S}
+            pitch = {f"pitch scale {tau:g}": _integrate_process(self._speed, self.time_s, tau) for tau in SCALE_S}
             return pitch | {
                 f"{role} scale {tau:g}": _integrate_process(self._climb, self.time_s, tau) for tau in SCALE_S
             }

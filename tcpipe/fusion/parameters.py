@@ -100,11 +100,11 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
             rows = slice(parameter.place, parameter.place + parameter.count)
             std[rows], walk[rows] = parameter.std, parameter.walk
     if m.imu is not None:
-        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = find_walk(noise.turns[IMU].bias)
+        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = find_walk(noise.turns[IMU].correlated)
     scales = find_scale_stds(m, noise.horizontal)
     for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
-            std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].scale.variance / _MEAN_LASTS_S)
+            std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].correlated.variance / _MEAN_LASTS_S)
     time_s = np.full(state.N, np.inf)
     for place, process in _list_varying_scales(m, noise).items():
         std[place], time_s[place] = np.sqrt(process.variance), process.time_s
@@ -132,7 +132,7 @@ def _list_varying_scales(m: Measurements, noise: NoiseModel) -> dict[int, GaussM
     if not is_length_observable(m, noise.horizontal):
         return {}
     places = {WHEELS: state.WHEEL_SLIP, VISUAL: state.VISUAL_SLIP}
-    found = {places[role]: noise.odometries[role].scale for role in m.odometries()}
+    found = {places[role]: noise.odometries[role].correlated for role in m.odometries()}
     return found | ({state.SHARED_SCALE: noise.shared_scale} if found else {})
 
 

@@ -60,15 +60,16 @@ _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _FROZEN_NS = 1_000_000_000  # fixes that repeat for less, or for two of their periods, are those of a slow receiver
 _DATUM_FIXES = 10  # the ENU origin is their median
 _NOISE_WINDOW_NS = 2_000_000_000  # window of noise around each sample
-_TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
+_MIN_COSINE = 0.1  # cosine: an unmeasured axis affects another, 6°
 _DEGREE_M = 111_320.0  # one degree of latitude, or of longitude at the equator [m]
-_PIECE = 1 << 16
+_SLICE_ROWS = 1 << 16
 _FEWEST = 20  # samples that show a scatter, a grid, a turn, or the axes of a twist
-_SCATTERS_MORE = 3.0  # shown over stated scatter: of counts with every other message, not of a rough road
+_MIN_SCATTER_RATIO = 3.0  # shown over stated scatter: of counts with every other message, not of a rough road
 _MEAN_S = 0.5  # averaging of such a velocity
-_MOVES_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
+_MIN_MOVING_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
 _JITTER_S = 0.05  # less does not matter
-_JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3  # between fixes: so many together, the longest, the slowest
+_JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3
+"""Of an estimate of jitter: pairs of fixes in a window [1]; longest time between two [s]; slowest motion [m/s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +130,9 @@ def prepare_positions(
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
     degree_m = _DEGREE_M * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])
-    variance[:, :2] += _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
+    rounding = _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
+    unclaimed |= (rounding > variance[:, :2]).any(1)  # the receiver does not know how its coordinates are written
+    variance[:, :2] += rounding
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~is_fix], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
@@ -175,7 +178,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
-    frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > _MOVES_MPS * kept_ns * 1e-9))
+    frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > _MIN_MOVING_MPS * kept_ns * 1e-9))
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
     return select_rows(gnss, changes), tuple(found)
 
@@ -210,7 +213,8 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((2 * np.interp(stamp_s, odometry_s, speed[:, 0]) * jitter_s) ** 2)[:, None]
-    return add_turn_variance(replace(gnss, variance_m2=variance), 2 * jitter_s), jitter_s
+    unclaimed = jitter_s > 0.0 if gnss.unclaimed is None else gnss.unclaimed | (jitter_s > 0.0)
+    return add_turn_variance(replace(gnss, variance_m2=variance, unclaimed=unclaimed), 2 * jitter_s), jitter_s
 
 
 def _make_windows(values: Floats) -> Floats:
@@ -247,7 +251,7 @@ def prepare_body_velocities(
 
     Its twist is used where it has one. One that has no forward velocity, or is zero throughout while the poses move, is none: the velocity
     is then that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is
-    surely along the axes of the pose's frame is turned by the pose. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
+    clearly along the axes of the pose's frame is turned by the pose. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
     """
     pose = _stack_columns(columns, ("x_m", "y_m", "z_m"))
     velocity = _stack_columns(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
@@ -314,7 +318,7 @@ def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -
     if moving.sum() < _FEWEST:
         return shown
     noise = estimate_robust_std(second[moving]) / np.sqrt(6.0)
-    if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
+    if noise > _MIN_SCATTER_RATIO * float(np.sqrt(np.median(variance[known]))):
         shown[known] = np.square(_estimate_local_noise(stamp_ns[known], values[known, None]))
     return shown
 
@@ -323,7 +327,7 @@ def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
     """Return ``matrix`` (3, 3) times vectors (N, 3); NaN, what is not measured, makes each axis NaN into which it turns."""
     unknown = np.isnan(values)
     turned = np.where(unknown, 0.0, values) @ matrix.T
-    return np.where(unknown @ (np.abs(matrix).T > _TURNS_INTO), np.nan, turned)
+    return np.where(unknown @ (np.abs(matrix).T > _MIN_COSINE), np.nan, turned)
 
 
 def prepare_imu(
@@ -370,8 +374,8 @@ def prepare_imu(
 
 
 def _iterate_slices(rows: int) -> Iterator[slice]:
-    """Yield slices of so many rows: what is reckoned row by row takes little room then, however long a log is."""
-    return (slice(first, first + _PIECE) for first in range(0, rows, _PIECE))
+    """Yield slices of rows, so that temporary arrays stay small for a log of any length."""
+    return (slice(first, first + _SLICE_ROWS) for first in range(0, rows, _SLICE_ROWS))
 
 
 def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
@@ -438,15 +442,15 @@ def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[F
 
 
 _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
-_MOVED_M = 0.1  # smaller moves may be stationary
-_FITS, _FITS_NOT = 0.1, 0.3  # largest residual share along its axes (18°); smallest along other axes (33°)
-_TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
+_MIN_MOVED_M = 0.1  # smaller moves may be stationary
+_MAX_MISFIT, _MIN_MISFIT = 0.1, 0.3  # largest residual share along its axes (18°); smallest along other axes (33°)
+_MIN_TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
 
 
 def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
     """Return whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
     posed = pose_m[np.isfinite(pose_m).all(1)]
-    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > _MOVED_M
+    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > _MIN_MOVED_M
     return bool(np.isfinite(velocity_mps).any() and (np.nan_to_num(velocity_mps).any() or not moves))
 
 
@@ -478,7 +482,7 @@ def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Flo
         return rate_radps, np.zeros(3, np.bool_)
     stamp, quat = stamp_ns[known], quat_xyzw[known]
     turned_rad = np.cumsum(compute_turns(quat), axis=0)
-    turns = zero & (np.ptp(turned_rad, axis=0) > _TURNED_RAD)
+    turns = zero & (np.ptp(turned_rad, axis=0) > _MIN_TURNED_RAD)
     # Over two steps, so that the rate is that in the middle, at the stamp itself.
     step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
     rate = compute_turns(quat, 2) / step_s
@@ -489,7 +493,7 @@ def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Flo
 
 
 def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
-    """Return whether velocities are surely along the axes of the pose's frame: its increments fit them so, and not turned by the pose.
+    """Return whether velocities are clearly along the axes of the pose's frame: its increments fit them so, and not turned by the pose.
 
     Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
     """
@@ -498,7 +502,7 @@ def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, qua
     good = ((step_s > 0) & (step_s <= _MAX_INCREMENT_S))[:, 0]
     way = np.diff(pose_m[known, :2], axis=0)[good] / step_s[good]
     size = np.linalg.norm(way, axis=1)
-    moving = size > _MOVES_MPS
+    moving = size > _MIN_MOVING_MPS
     if moving.sum() < _FEWEST:
         return False
     measured, misfit = np.nan_to_num(velocity_mps[known]), []
@@ -507,7 +511,7 @@ def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, qua
         scale = np.median(np.linalg.norm(velocity, axis=1) / size[moving])
         rest = np.sum((velocity - scale * way[moving]) ** 2, axis=1) / (scale * size[moving]) ** 2
         misfit.append(np.median(rest))  # poses may jump
-    return bool(misfit[0] < _FITS and misfit[1] > _FITS_NOT)
+    return bool(misfit[0] < _MAX_MISFIT and misfit[1] > _MIN_MISFIT)
 
 
 def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import FixNoise, NoiseModel
+from tcpipe.fusion.densities import PRIORS, NoiseModel, SensorNoise
 from tcpipe.fusion.measurements import (
     IMU,
     VISUAL,
@@ -25,14 +25,12 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
-    Plane,
     bridge_outliers,
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
     compute_slopes,
-    estimate_white_noise,
-    is_in_gap,
+    is_covered,
 )
 from tcpipe.robust import estimate_robust_std
 
@@ -40,37 +38,38 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SCALE_STD: Mapping[str, float] = {
-    WHEELS: 0.12,  # a skid-steered robot on grass slips by so much
+    WHEELS: 0.12,  # slip of a skid-steered robot on grass
     VISUAL: 0.05,  # stereo calibration
 }
 """By odometry, σ of its scale before the run shows it."""
-_GYRO_SCALE_STD = 0.01  # of MEMS gyroscopes, by their datasheets: 1 to 3 %
-_WHEEL_TURN_SCALE_STD = 0.2  # turn rate of skidding wheels
-_VISUAL_TURN_SCALE_STD = 0.03  # turn rate of a camera
-SLOPE_RAD = 0.1  # of ground, where nothing shows it
-DOPPLER_LASTS_S = 3.0  # what a correlation that fades in 1.5 s weighs
-UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
-GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
-_ACCELERATION_WINDOW_S = 0.6  # window of odometry's slope
-_ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration: one row
-_COURSE_TURN = 0.02  # rad²/s: 8° in a second, of a turn that only the course over ground tells
-_DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
-_MAX_GAP_NS = 300_000_000
-_STEADY = 1e-4  # m²/s³: 1 cm/s in a second, forward and aside
-_UNSEEN_SLIDE = 4e-4  # m²/s³
-_FIXES, _WINDOW_S = 5, 1.0  # fixes, and seconds, that show a velocity or how it slides
-_UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows
-_UNSEEN_STEADY = 1e-3  # m²/s³: least density by a receiver
-_SHOWS_COURSE_MPS = 0.2  # worse velocity of fixes shows no course
-_UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show how it changes
-_SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver: half of the change that masks look for
-_LEVEL_STD_RAD = 0.7  # roll and pitch are small to this σ
-_HELD_STD_RAD = 0.05  # the same where only the course gives turns
-_CHORD_S = 4.0  # baseline of slope from fixes
-_CHORD_M = 1.0  # shorter baselines give no slope
-_STEEPEST = 0.6  # rad: no robot climbs more
-_SLOPE_LASTS_M = 10.0  # length of one slope
-_UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
+_TURN_SCALE_STD: Mapping[str, float] = {
+    IMU: 0.01,  # MEMS gyroscopes, by their datasheets: 1 to 3 %
+    WHEELS: 0.2,  # skidding wheels
+    VISUAL: 0.03,  # camera
+}
+"""σ of the scale of a turn rate [1]."""
+SLOPE_RAD = 0.1  # slope of unknown ground [rad], 1σ
+DOPPLER_LASTS_S = 3.0  # weight of a correlation that fades in 1.5 s [s]
+UNSEEN_TURN_RADPS = 0.07  # roll and pitch rate on uneven ground [rad/s], 1σ
+GROUND = 2e-3  # density of the change of slope under a robot [rad²/m]: 2.6° over a metre
+_ACCELERATION_WINDOW_S = 0.6  # window of an odometry's slope [s]
+_ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row
+_COURSE_DENSITY = 0.02  # density of turns that only the course over ground shows [rad²/s]: 8° in a second
+_MIN_TURN_DENSITY = 5e-7  # least density of turns [rad²/s]: a tenth of a degree in a second
+_MIN_DENSITY = 1e-4  # least density of velocity [m²/s³]: 1 cm/s in a second, forward and aside
+_SLIDE_DENSITY = 4e-4  # density of sliding that no camera shows [m²/s³]
+_UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor shows [m²/s³]
+_FIXES, _WINDOW_S = 5, 1.0  # fewest fixes [1], and shortest time [s], that show a velocity or a slide
+_UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows [s]
+_UNSEEN_MPS2 = 0.07  # acceleration between two measurements of a receiver [m/s²], 1σ
+_MAX_COURSE_MPS = 0.2  # largest σ of a velocity by fixes that shows a course [m/s]
+_UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show its change [m/s]
+_SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver [m/s²]: half of the change that masks look for
+_LEVEL_STD_RAD = 0.7  # roll and pitch without an accelerometer [rad], 1σ
+_COURSE_ROLL_STD_RAD = 0.05  # roll where only the course gives turns [rad], 1σ
+_CHORD_S, _CHORD_M = 4.0, 1.0  # baseline of a slope by fixes [s], and its least length [m]
+_MAX_SLOPE_RAD = 0.6  # steepest slope that a robot climbs [rad]
+_SLOPE_LASTS_M = 10.0  # length of one slope [m]
 
 
 def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
@@ -85,7 +84,7 @@ def is_gliding(measurements: Measurements) -> bool:
     """
     if measurements.gnss is None or not measurements.is_antenna_alone:
         return False
-    return _compute_fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
+    return _compute_fix_velocity_std_mps(measurements.gnss) > _MAX_COURSE_MPS
 
 
 def is_turned_by_course(measurements: Measurements) -> bool:
@@ -104,7 +103,7 @@ def _compute_fix_velocity_std_mps(gnss: Positions) -> float:
 def estimate_slope_std_rad(measurements: Measurements) -> float | None:
     """Return how steep the ground is by how fixes climb it [rad], root mean square; None where they are too few or too noisy.
 
-    It is as steep across as along. One deviation is added of what so few slopes tell: each lasts for some metres.
+    It is as steep across as along. One standard deviation of an estimate by a few slopes, which last for some metres, is added.
     """
     gnss = measurements.gnss
     if gnss is None or gnss.stamp_ns.size < _FIXES:
@@ -116,7 +115,7 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
     climbs = way_m > _CHORD_M
     if climbs.sum() < _FIXES:
         return None
-    slope = (up / np.maximum(way_m, _CHORD_M))[climbs].clip(-_STEEPEST, _STEEPEST)
+    slope = (up / np.maximum(way_m, _CHORD_M))[climbs].clip(-_MAX_SLOPE_RAD, _MAX_SLOPE_RAD)
     noise = float(2.0 * np.median(gnss.variance_m2[:, 2]) / np.median(way_m[climbs]) ** 2)
     excess = float(np.mean(slope**2)) - noise
     slopes_seen = max(1.0, float(np.sum(way_m[climbs])) / rows / _SLOPE_LASTS_M)
@@ -126,10 +125,10 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
 def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
     """Return the standard deviations of a pitch and roll of zero, once a second, where no accelerometer measures them.
 
-    Where the course alone tells the turns, what the antenna sways by would pass for roll: it is held.
+    Where only the course shows turns, sway of the antenna would look like roll, so that roll has a small standard deviation.
     """
     is_held = is_turned_by_course(measurements) and not measurements.has_posed_tilt
-    return _LEVEL_STD_RAD, _HELD_STD_RAD if is_held else _LEVEL_STD_RAD
+    return _LEVEL_STD_RAD, _COURSE_ROLL_STD_RAD if is_held else _LEVEL_STD_RAD
 
 
 def turn_scale_std(measurements: Measurements) -> float:
@@ -140,14 +139,12 @@ def turn_scale_std(measurements: Measurements) -> float:
     if measurements.gnss is None:
         return 0.0
     if measurements.imu is not None:
-        return _GYRO_SCALE_STD
+        return _TURN_SCALE_STD[IMU]
     sources = turn_sources(measurements)
-    if not sources:
-        return 0.0
-    return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
+    return _TURN_SCALE_STD[VISUAL if sources[-1] is measurements.visual else WHEELS] if sources else 0.0
 
 
-def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
+def is_length_observable(m: Measurements, fixes: SensorNoise | None) -> bool:
     """Return whether fixes show, on the ground that they span, how long a metre of odometry is, twice as well as it is known.
 
     Else an accelerometer would show it, whose errors pass for a scale. The white noise of many fixes averages out.
@@ -155,7 +152,7 @@ def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
     if m.gnss is None or fixes is None or m.gnss.stamp_ns.size < 2:
         return False
     span_m = float(np.linalg.norm(np.ptp(m.gnss.position_enu_m[:, :2], axis=0)))
-    lasting_m2 = fixes.correlated.variance + fixes.white_m2 / m.gnss.stamp_ns.size
+    lasting_m2 = fixes.correlated.variance + fixes.white / m.gnss.stamp_ns.size
     return float(np.sqrt(2.0 * lasting_m2)) < 0.5 * find_best_scale_std(m) * max(span_m, 1e-3)
 
 
@@ -164,7 +161,7 @@ def find_best_scale_std(m: Measurements) -> float:
     return SCALE_STD[WHEELS if m.visual is None else VISUAL]
 
 
-def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> Mapping[str, float]:
+def find_scale_stds(measurements: Measurements, fixes: SensorNoise | None) -> Mapping[str, float]:
     """Return the standard deviations of the scales of odometries by role; 0 where a scale is unobservable: it stays 1.
 
     Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
@@ -185,9 +182,9 @@ def make_motion_noise(  # noqa: PLR0917
     density = np.zeros((stamp_ns.size, 6))
     by_gyro = mode >= state.GYRO_TURN
     if m.imu is not None:
-        density[by_gyro, :3] = noise.turns[IMU].white_rad2ps
+        density[by_gyro, :3] = noise.turns[IMU].white
     metres_per_s = _compute_speed(m, stamp_ns[~by_gyro])
-    density[~by_gyro] = _make_turn_density(m, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
+    density[~by_gyro, :3] = _make_turn_density(m, noise, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
     inertial = mode == state.INERTIAL
     if m.imu is not None and inertial.any():
         density[inertial, 3:] = _compute_accelerometer_density(m.imu, stamp_ns[inertial])[:, None]
@@ -198,11 +195,6 @@ def make_motion_noise(  # noqa: PLR0917
     return density * period_s
 
 
-def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
-    """Return how fast the variance of a gyroscope's angle grows [rad²/s]."""
-    return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
-
-
 def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
     """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
     source = m.first_odometry
@@ -211,28 +203,23 @@ def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
     return np.abs(np.interp(at_ns, source.stamp_ns, source.velocity_mps[:, 0]))
 
 
-def _make_turn_density(m: Measurements, mode: NDArray[np.int8], rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 6), its last columns 0."""
-    density = np.full((mode.size, 6), 0.0)
-    density[:, :3] = _DRIFT
-    sources = turn_sources(m)
+def _make_turn_density(
+    m: Measurements, noise: NoiseModel, mode: NDArray[np.int8], rate_radps: Floats, speed_mps: Floats
+) -> Floats:
+    """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 3).
+
+    The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is constant of it.
+    """
+    density = np.full((mode.size, 3), _MIN_TURN_DENSITY)
     ground = np.full(mode.size, 0.0 if is_gliding(m) else GROUND)
     if is_turned_by_course(m):
-        density[:, 2] = _COURSE_TURN
-    for source in sources:
-        visual = source is m.visual
-        rows = mode == (state.VISUAL_TURN if visual else state.FLAT_TURN)
-        known = np.isfinite(source.yaw_rate_radps)
-        rate_hz = 1e9 / compute_median_period_ns(source.stamp_ns[known])
-        turns = source.yaw_rate_radps[known, None] if source.turn_rate_radps is None else source.turn_rate_radps[known]
-        spatial = turns.shape[1] == 3
-        density[rows, 0 if spatial else 2 : 3] = 1.1 * estimate_white_noise(turns) ** 2 / rate_hz + _DRIFT
-        if spatial:
-            ground[rows] = 0.0
-        best = m.imu is None and source is sources[-1]
-        # The scale is off by this share for a second at a time, beside what is constant of it.
-        share = 0.02 if visual else 0.1 if best else 0.3
-        density[rows, :3] += np.square(share * rate_radps[rows])
+        density[:, 2] = _COURSE_DENSITY
+    for role in noise.turns.keys() - {IMU}:
+        rows = mode == (state.VISUAL_TURN if role == VISUAL else state.FLAT_TURN)
+        is_spatial = m.odometries()[role].turn_rate_radps is not None
+        density[rows, 0 if is_spatial else 2 :] = noise.turns[role].white
+        ground[rows] *= not is_spatial
+        density[rows] += PRIORS[f"{role} turn scale"].variance * np.square(rate_radps[rows])
     density[:, :2] += (ground * speed_mps)[:, None]
     return density
 
@@ -251,54 +238,43 @@ def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
     sources = [source for source in m.odometries().values() if source.stamp_ns.size > 2]
     found = np.full(at_ns.size, np.nan)
     for source in sources:
-        covered = ~is_in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
+        covered = is_covered(source.stamp_ns, at_ns, at_ns)
         slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], _ACCELERATION_WINDOW_S)
         found[covered] = np.fmin(found[covered], np.interp(at_ns[covered], source.stamp_ns, np.abs(slope)))
-    unseen = np.full(at_ns.size, _UNKNOWN) if sources else _compute_receiver_density(m, at_ns)
-    return np.where(np.isnan(found), unseen, _STEADY + _ACCELERATION_LASTS_S * found**2)
+    unseen = np.full(at_ns.size, _UNKNOWN_DENSITY) if sources else _compute_receiver_density(m, at_ns)
+    return np.where(np.isnan(found), unseen, _MIN_DENSITY + _ACCELERATION_LASTS_S * found**2)
 
 
 def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     """Return the noise density without odometry: the square of the acceleration that a receiver shows, times how long it lasts.
 
-    What a slow receiver shows from fix to fix lasts as long. Fixes too noisy to show a velocity do not show how steady it is.
+    An acceleration between slow fixes lasts from one to the next. Fixes too noisy to show a velocity do not show how steady it is.
     """
     source, least = m.doppler or m.gnss, 0.0
     if source is None or source.stamp_ns.size < _FIXES:
-        return np.full(at_ns.size, _UNKNOWN)
+        return np.full(at_ns.size, _UNKNOWN_DENSITY)
+    period_s = 1e-9 * compute_median_period_ns(source.stamp_ns)
     if isinstance(source, Positions):
-        values, variance, order = source.position_enu_m, source.variance_m2, 2
-        least = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
+        std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
+        least = _UNKNOWN_DENSITY * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
+        places = source.position_enu_m[:, :2] @ np.array([1.0, 1j])
+        places = bridge_outliers(compute_seconds(source.stamp_ns, int(source.stamp_ns[0])), places, std)
+        axes = [places.real, places.imag]
     else:
-        values, variance, order = source.velocity_enu_mps, source.variance_m2ps2, 1
-    zero_ns, std = int(source.stamp_ns[0]), float(np.sqrt(np.median(variance[:, :2])))
-    stamp_s, plane = compute_seconds(source.stamp_ns, zero_ns), values[:, :2] @ np.array([1.0, 1j])
-    plane = bridge_outliers(stamp_s, plane, std) if order == 2 else plane
-    shown_s, acceleration = _compute_accelerations(stamp_s, plane, std, order)
-    lasts_s = max(_UNSEEN_LASTS_S, 1e-9 * compute_median_period_ns(source.stamp_ns))
-    density = np.maximum(_UNSEEN_STEADY + lasts_s * np.square(np.minimum(acceleration, MAX_ACCELERATION_MPS2)), least)
-    return np.interp(compute_seconds(at_ns, zero_ns), shown_s, density)
-
-
-def _compute_accelerations(stamp_s: Floats, values: Plane, std: float, order: int) -> tuple[Floats, Floats]:
-    """Return times [s] and accelerations [m/s²], shape (M,), by the derivative of this order of samples in the plane, shape (N,).
-
-    Successive means are compared, of so few samples of a standard deviation ``std`` as show an acceleration of `_SHOWN_MPS2`.
-    """
-    wanted = _SHOWN_MPS2 * float(np.median(np.diff(stamp_s))) ** order / std
-    # First and second differences have √2 and √6 times the standard deviation of a sample.
-    rows = int(np.ceil((np.sqrt(4.0 * order - 2.0) / wanted) ** (1.0 / (order + 0.5))))
-    rows = min(rows, stamp_s.size // (order + 2))
-    at_s, values = (np.convolve(each, np.full(rows, 1.0 / rows), "valid") for each in (stamp_s, values))
+        std, order = float(np.sqrt(np.median(source.variance_m2ps2[:, :2]))), 1
+        axes = [source.velocity_enu_mps[:, 0], source.velocity_enu_mps[:, 1]]
+    # The slope of a line through the samples of a window has √12 times their noise over √(samples), and over the window.
+    window_s = max(3.0 * period_s, (12.0 ** (order / 2.0) * std * period_s**0.5 / _SHOWN_MPS2) ** (1.0 / (order + 0.5)))
     for _ in range(order):
-        values = (values[rows:] - values[:-rows]) / (at_s[rows:] - at_s[:-rows])
-        at_s = 0.5 * (at_s[rows:] + at_s[:-rows])
-    return at_s, np.abs(values)
+        axes = [compute_slopes(source.stamp_ns, axis, window_s) for axis in axes]
+    acceleration = np.minimum(np.hypot(*axes), MAX_ACCELERATION_MPS2)
+    density = np.maximum(max(_UNSEEN_LASTS_S, period_s) * (_UNSEEN_MPS2**2 + acceleration**2), least)
+    return np.asarray(np.interp(at_ns, source.stamp_ns, density))
 
 
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:
-    """Return how fast a body that is held to drive straight comes to slide [m²/s³]: as visual odometry shows it, or a guess."""
+    """Return the density of sideways and upward velocity [m²/s³]: as visual odometry shows it, or a guess."""
     if visual is None or visual.stamp_ns.size < 3:
-        return _UNSEEN_SLIDE
+        return _SLIDE_DENSITY
     shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _WINDOW_S) for axis in (1, 2)]
-    return max(_STEADY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)
+    return max(_MIN_DENSITY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)

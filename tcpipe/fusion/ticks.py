@@ -191,7 +191,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
 def _compute_shares(noise: NoiseModel) -> tuple[Floats, Floats]:
     """Return white and correlated share of the claimed variance of fixes, each east, north, up."""
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
-    shares = np.array([(fix.white_m2 / fix.claimed_m2, fix.correlated.variance / fix.claimed_m2) for fix in axes])
+    shares = np.array([(fix.white / fix.claimed_m2, fix.correlated.variance / fix.claimed_m2) for fix in axes])
     return shares[:, 0], shares[:, 1]
 
 
@@ -213,8 +213,8 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     found = claimed.copy()
     relative = claimed[:, 0] / np.median(claimed[:, 0])
     of_run, scatter = noise.odometries[role], _estimate_scatter(source.velocity_mps[:, 0])
-    density = max(of_run.velocity_m2ps, _LEAST_M2PS)
-    if of_run.velocity_data_share < DETERMINED:  # what is claimed beyond the scatter of the samples lasts
+    density = max(of_run.white, _LEAST_M2PS)
+    if of_run.white_data_share < DETERMINED:  # what is claimed beyond the scatter of the samples lasts
         density = max(density, _LASTING_S * (float(np.median(claimed[:, 0])) - scatter))
     found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
     for axis in range(1, 3):

@@ -13,7 +13,7 @@ from scipy.special import betaincinv
 from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import GNSS, BodyVelocities, Positions
 from tcpipe.fusion.process import SCALE_STD
-from tcpipe.fusion.signals import compute_seconds, integrate_signal, is_covered
+from tcpipe.fusion.signals import compute_seconds, integrate_signal, is_covered, is_in_gap
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,7 @@ Calibration = Literal["overconfident", "calibrated", "underconfident", "undecide
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What was withheld less what the track predicts, one value a second or a chord.
+    """Withheld measurements less those that the track predicts, one value a second or a chord.
 
     Attributes
     ----------
@@ -137,13 +137,7 @@ class TrackRows:
 
     def find(self, stamp_ns: Ints) -> NDArray[np.bool_]:
         """Return whether there is a track at each stamp, shape (N,)."""
-        after = np.searchsorted(self.stamp_ns, stamp_ns)
-        inside = (after > 0) & (after < self.stamp_ns.size)
-        after = np.clip(after, 1, max(self.stamp_ns.size - 1, 1))
-        if self.stamp_ns.size < 2:
-            return np.zeros(stamp_ns.size, np.bool_)
-        found: NDArray[np.bool_] = inside & (self.stamp_ns[after] - self.stamp_ns[after - 1] <= self._longest_ns)
-        return found
+        return ~is_in_gap(self.stamp_ns, stamp_ns, stamp_ns, longest_ns=self._longest_ns)
 
     def interpolate(self, name: str, stamp_ns: Ints, *, is_angle: bool = False) -> Floats:
         """Return a column at stamps [ns], shape (N,)."""
@@ -186,32 +180,28 @@ def compare_fixes(
 ) -> Comparison:
     """Compare one fix a second: those of a second share the error of the track, and much of their own.
 
-    What is not known of the arm is part of base_link's σ, not of the antenna's: an error of the arm moves both.
+    The uncertainty of the arm is part of base_link's σ, not of the antenna's: an error of the arm moves both.
     """
-    chosen, window, straight = [], [], []
-    for number in numbers.tolist():
-        start_ns, end_ns = windows_ns[number].tolist()
-        inside = np.flatnonzero((fixes.stamp_ns > start_ns) & (fixes.stamp_ns < end_ns))
-        inside = inside[rows.find(fixes.stamp_ns[inside])]
-        second = (fixes.stamp_ns[inside] - start_ns) // 1_000_000_000
-        inside = inside[np.unique(second, return_index=True)[1]]
-        ends = [np.searchsorted(fixes.stamp_ns, start_ns, "right") - 1, np.searchsorted(fixes.stamp_ns, end_ns)]
-        at_s, ends_s = (compute_seconds(fixes.stamp_ns[rows], start_ns) for rows in (inside, ends))
-        line = [np.interp(at_s, ends_s, fixes.position_enu_m[ends, axis]) for axis in (0, 1)]
-        straight.append(np.hypot(*(np.stack(line) - fixes.position_enu_m[inside, :2].T)))
-        chosen.append(inside)
-        window.append(np.full(inside.size, number))
-    kept, stamp_ns = np.concatenate(chosen), fixes.stamp_ns[np.concatenate(chosen)]
+    number = np.searchsorted(windows_ns[:, 0], fixes.stamp_ns) - 1
+    start_ns, end_ns = windows_ns[np.maximum(number, 0)].T
+    inside = np.flatnonzero(np.isin(number, numbers) & (fixes.stamp_ns < end_ns) & rows.find(fixes.stamp_ns))
+    second = (fixes.stamp_ns - start_ns) // 1_000_000_000
+    kept = inside[np.unique([number[inside], second[inside]], axis=1, return_index=True)[1]]
     if not kept.size:
         raise FusionError("no fix lies on the track of the rest")
+    stamp_ns, places = fixes.stamp_ns[kept], fixes.position_enu_m[:, :2]
+    before = np.searchsorted(fixes.stamp_ns, start_ns[kept], "right") - 1
+    after = np.searchsorted(fixes.stamp_ns, end_ns[kept])
+    share = (stamp_ns - fixes.stamp_ns[before]) / (fixes.stamp_ns[after] - fixes.stamp_ns[before])
+    straight_m = np.hypot(*(places[before] + share[:, None] * (places[after] - places[before]) - places[kept]).T)
     rpy = [rows.interpolate(f"{name}_rad", stamp_ns, is_angle=True) for name in ("roll", "pitch", "yaw")]
     rotation = matrix_from_quat(quat_from_rpy(*rpy))[:, :2]
     predicted = np.stack([rows.interpolate(f"{axis}_m", stamp_ns) for axis in "xy"], -1) + rotation @ arm_m
     std = np.stack([rows.interpolate(f"{axis}_std_m", stamp_ns) for axis in "xy"], -1)
     variance = np.maximum(std**2 - rotation**2 @ arm_std_m**2, 0.0)
     return Comparison(
-        GNSS, window_s, None, np.concatenate(window), fixes.position_enu_m[kept, :2] - predicted,
-        np.sqrt(variance + fixes.variance_m2[kept, :2]), np.concatenate(straight),
+        GNSS, window_s, None, number[kept], places[kept] - predicted,
+        np.sqrt(variance + fixes.variance_m2[kept, :2]), straight_m,
     )  # fmt: skip
 
 

@@ -16,7 +16,6 @@ Every rule is prorated at both ends of a span. Negative power (regeneration) cou
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -93,18 +92,12 @@ def make_rail(name: str, voltage: Samples, current: Samples, *, averaged: bool) 
     return Rail(name, voltage, current, averaged, union, volt, amp)
 
 
-def interpolate_value(
-    signal: Samples,
-    at_ns: Stamps,
-    *,
-    averaged: bool,
-    straight: Callable[[Stamps, Floats, Stamps], Floats] = interpolate,
-) -> Floats:
+def interpolate_value(signal: Samples, at_ns: Stamps, *, averaged: bool) -> Floats:
     """Return a signal of at least one sample at each time, shape (M,), by the one rule; its ends are held beyond them."""
     if averaged:
         ends_at = np.searchsorted(signal.stamp_ns, at_ns, side="left")
         return signal.value[np.minimum(ends_at, len(signal.value) - 1)]
-    return straight(signal.stamp_ns, signal.value, at_ns)
+    return interpolate(signal.stamp_ns, signal.value, at_ns)
 
 
 def interpolate_rail(each: Rail, at_ns: Stamps) -> tuple[Floats, Floats]:
@@ -140,42 +133,25 @@ def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tu
     """
     if not rails:
         return (np.full(at_ns.size, np.nan),) * 3
-    voltage, current = (
-        np.stack(
-            [
-                _interpolate_known(signal, at_ns, averaged=each.averaged, max_gap_ns=max_gap_ns)
-                for each, signal in signals
-            ]
-        )
-        for signals in ([(each, each.voltage) for each in rails], [(each, each.current) for each in rails])
-    )
-    power = voltage * current
-    known = np.isfinite(power).all(0)
-    volt, amp, watt = voltage.mean(0), current.sum(0), power.sum(0)
-    measured = known & (not any(is_power_only(each.voltage.value) for each in rails))
-    return np.where(measured, volt, np.nan), np.where(measured, amp, np.nan), np.where(known, watt, np.nan)
+    voltage, current = np.stack([interpolate_rail(each, at_ns) for each in rails], axis=1)
+    for each in rails:
+        for signal in (each.voltage, each.current):
+            current[:, ~_is_near_samples(signal.stamp_ns, at_ns, max_gap_ns)] = np.nan
+    watt = (voltage * current).sum(0)
+    measured = np.isfinite(watt) & (not any(is_power_only(each.voltage.value) for each in rails))
+    volt, amp = (np.where(measured, value, np.nan) for value in (voltage.mean(0), current.sum(0)))
+    return volt, amp, watt
 
 
-def _interpolate_known(signal: Samples, at_ns: Stamps, *, averaged: bool, max_gap_ns: int) -> Floats:
-    """Return a signal at each stamp; NaN where that lies neither on a sample nor between two that are near each other."""
-    stamp_ns = signal.stamp_ns
+def _is_near_samples(stamp_ns: Stamps, at_ns: Stamps, max_gap_ns: int) -> NDArray[np.bool_]:
+    """Return whether each time, shape (M,), is that of a sample, or between two that are near each other."""
     if stamp_ns.size == 0:
-        return np.full(at_ns.size, np.nan)
+        return np.zeros(at_ns.size, np.bool_)
     longest = max(max_gap_ns, _PERIODS * (int(np.median(np.diff(stamp_ns))) if stamp_ns.size > 1 else 1))
-    before = np.searchsorted(stamp_ns, at_ns, "right") - 1
+    before, last = np.searchsorted(stamp_ns, at_ns, "right") - 1, stamp_ns.size - 1
     after = np.searchsorted(stamp_ns, at_ns, "left")
-    covered = (before >= 0) & (after < stamp_ns.size)
-    last = stamp_ns.size - 1
-    width = stamp_ns[np.minimum(after, last)] - stamp_ns[np.clip(before, 0, last)]
-    value = interpolate_value(signal, at_ns, averaged=averaged, straight=_interpolate_ns)
-    return np.where(covered & (width <= longest), value, np.nan)
-
-
-def _interpolate_ns(stamp_ns: Stamps, value: Floats, at_ns: Stamps) -> Floats:
-    """Return what `interpolate` does, computed in nanoseconds: in seconds the last digits of every track would be others."""
-    zero = stamp_ns[0]
-    between: Floats = np.interp((at_ns - zero).astype(np.float64), (stamp_ns - zero).astype(np.float64), value)
-    return between
+    width = stamp_ns[np.minimum(after, last)] - stamp_ns[np.maximum(before, 0)]
+    return np.asarray((before >= 0) & (after <= last) & (width <= longest))
 
 
 Ints = NDArray[np.int64]
@@ -187,11 +163,10 @@ def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: R
     """Return the energy of all rails over each span [J], shape (M,); NaN without rails, or where a rail is unknown in part of it."""
     total = np.full(len(start_ns), np.nan if not rails else 0.0)
     for each in rails:
-        energy = np.full(len(start_ns), np.nan)
+        inside = np.zeros(len(start_ns), np.bool_)
         if len(each.stamp_ns) >= 2:
             inside = (start_ns >= each.stamp_ns[0]) & (end_ns <= each.stamp_ns[-1])
-            energy[inside] = _integrate_to(each, end_ns[inside], rule) - _integrate_to(each, start_ns[inside], rule)
-        total += energy
+        total += np.where(inside, integrate_recorded_energy([each], start_ns, end_ns, rule=rule), np.nan)
     return total
 
 
@@ -216,7 +191,8 @@ def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tup
     count = np.zeros(len(start_ns), dtype=np.int64)
     mean = np.full(len(start_ns), np.nan if not rails else 0.0)
     for i, each in enumerate(rails):
-        mine = _count(each.current.stamp_ns, start_ns, end_ns)
+        before, until = (np.searchsorted(each.current.stamp_ns, at, side="right") for at in (start_ns, end_ns))
+        mine = (until - before).astype(np.int64)
         count = mine if i == 0 else np.minimum(count, mine)
         sums = np.concatenate(([0.0], np.cumsum(each.voltage_volt * each.current_amp)))
         first, last = (np.searchsorted(each.stamp_ns, at, side="right") for at in (start_ns, end_ns))
@@ -224,11 +200,6 @@ def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tup
         np.divide(sums[last] - sums[first], last - first, out=part, where=last > first)
         mean += part
     return count, mean
-
-
-def _count(stamp_ns: Ints, start_ns: Ints, end_ns: Ints) -> Ints:
-    after = np.searchsorted(stamp_ns, end_ns, side="right") - np.searchsorted(stamp_ns, start_ns, side="right")
-    return after.astype(np.int64)
 
 
 def _integrate_to(each: Rail, at_ns: Ints, rule: Rule) -> Floats:

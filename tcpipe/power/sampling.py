@@ -127,61 +127,19 @@ def is_stated_averaged(
     power_ns, power_watt : [ns], [W], shape (N,), rising stamps, finite.
     motion_ns, forward_mps, yaw_rate_radps : [ns], [m/s], [rad/s], shape (M,), rising stamps, finite.
     """
-    if min(power_ns.size, motion_ns.size) < _FEWEST:
+    if power_ns.size < _FEWEST:
         return None
-    period_ns = float(np.median(np.diff(power_ns)))
-    margin_ns = 2.0 * period_ns
-    inside = (power_ns > motion_ns[0] + margin_ns) & (power_ns < motion_ns[-1] - margin_ns)
-    if inside.sum() < _FEWEST:
+    period_s = float(np.median(np.diff(power_ns))) / 1e9
+    power, motion = Samples(power_ns, power_watt), np.column_stack((forward_mps, yaw_rate_radps, forward_mps**2))
+    fit = make_power_fit(power, motion_ns, motion, averaged=False, margin_s=2.0 * period_s)
+    if fit is None:
         return None
-    at_s, motion_s, period_s = (
-        (power_ns[inside] - motion_ns[0]) / 1e9,
-        (motion_ns - motion_ns[0]) / 1e9,
-        period_ns / 1e9,
-    )
-    causes = np.column_stack((_collect_causes(motion_s, forward_mps, yaw_rate_radps), forward_mps**2))
-    sums = _integrate_causes(motion_s, causes)
-    left = np.array(
-        [
-            _compute_squared_residuals(
-                power_watt[inside], _mean_about(at_s - late * period_s, period_s, motion_s, sums)
-            ).sum()
-            for late in _LATE
-        ]
-    )
+    left = np.array([fit.fit_means(late * period_s, period_s).sum() for late in _LATE])
     best = _LATE[int(np.argmin(left))]
     sampled, averaged = (float(np.interp(late, _LATE, left)) for late in (0.0, 0.5))
     if min(abs(best), abs(best - 0.5)) > _NEAR or min(sampled, averaged) > _CLEARLY * max(sampled, averaged):
         return None
     return averaged < sampled
-
-
-def _collect_causes(motion_s: Floats, forward_mps: Floats, yaw_rate_radps: Floats) -> Floats:
-    """Return what power follows, shape (M, 4): a constant, speed, turning and the gain of kinetic energy."""
-    speed, turning = np.abs(forward_mps), np.abs(yaw_rate_radps)
-    gained = np.gradient(0.5 * speed**2, motion_s)
-    return np.column_stack((np.ones_like(speed), speed, turning, gained))
-
-
-def _integrate_causes(motion_s: Floats, causes: Floats) -> Floats:
-    """Return the integral of each cause from the first time, shape (M, K)."""
-    steps = np.diff(motion_s)[:, None] * (causes[1:] + causes[:-1]) / 2.0
-    return np.concatenate((np.zeros((1, causes.shape[1])), np.cumsum(steps, axis=0)))
-
-
-def _mean_about(at_s: Floats, width_s: float, motion_s: Floats, sums: Floats) -> Floats:
-    """Return the means of the causes over a width about each time, shape (N, K)."""
-    later, earlier = at_s + width_s / 2, at_s - width_s / 2
-    return (
-        np.column_stack(
-            [np.interp(later, motion_s, integral) - np.interp(earlier, motion_s, integral) for integral in sums.T]
-        )
-        / width_s
-    )
-
-
-def _compute_squared_residuals(power_watt: Floats, causes: Floats) -> Floats:
-    return np.asarray(np.square(power_watt - causes @ np.linalg.lstsq(causes, power_watt, rcond=None)[0]))
 
 
 _INSTANT_S = 0.1
@@ -205,7 +163,8 @@ class PowerFit:
     Attributes
     ----------
     at_s, power_watt : times of the samples (the middle of a stated mean) and values, shape (N,).
-    motion_s, sums : times of the motion, shape (M,), and integrals of the causes of power, shape (M, 5).
+    motion_s, sums : times of the motion, shape (M,), and integrals of the causes of power from the first time, shape (M, 5): a constant,
+        speed, turning, the gain of kinetic energy, and one more.
     stated_s : width of the means that the source states; 0 for instantaneous values.
     """
 
@@ -217,9 +176,17 @@ class PowerFit:
 
     def compute_squared_residuals(self, smoothing: Smoothing) -> Floats:
         """Return the squared residuals [W²], shape (N,), of power that is smoothed and delayed so; zero width is a delay alone."""
-        width_s = max(self.stated_s + smoothing.width_s, _INSTANT_S)
-        means = _mean_about(self.at_s - smoothing.late_s, width_s, self.motion_s, self.sums)
-        return _compute_squared_residuals(self.power_watt, means)
+        return self.fit_means(smoothing.late_s, max(self.stated_s + smoothing.width_s, _INSTANT_S))
+
+    def fit_means(self, late_s: float, width_s: float) -> Floats:
+        """Return the squared residuals [W²], shape (N,), of power by means of its causes over a width, about a delay before each stamp."""
+        later, earlier = (
+            np.column_stack([np.interp(self.at_s - late_s + half_s, self.motion_s, each) for each in self.sums.T])
+            for half_s in (width_s / 2.0, -width_s / 2.0)
+        )
+        causes = (later - earlier) / width_s
+        found = np.linalg.lstsq(causes, self.power_watt, rcond=None)[0]
+        return np.asarray(np.square(self.power_watt - causes @ found))
 
 
 def make_power_fit(
@@ -229,7 +196,8 @@ def make_power_fit(
 
     Parameters
     ----------
-    motion_ns, motion : rising stamps [ns], shape (M,), with forward velocity, yaw rate and rate of climb, shape (M, 3).
+    motion_ns, motion : rising stamps [ns], shape (M,), with forward velocity, yaw rate and one more cause of power, as the rate of climb,
+        shape (M, 3).
     averaged : whether a value is stated to be the mean since the one before it.
     margin_s : motion that must be known before and after a sample [s].
     """
@@ -242,7 +210,10 @@ def make_power_fit(
     inside = inside[:: -(-inside.size // _MAX_ROWS)]
     stated_s = float(np.median(np.diff(power.stamp_ns))) / 1e9 if averaged else 0.0
     at_s, motion_s = (power.stamp_ns[inside] - motion_ns[0]) / 1e9 - stated_s / 2.0, (motion_ns - motion_ns[0]) / 1e9
-    sums = _integrate_causes(motion_s, np.column_stack((_collect_causes(motion_s, *motion[:, :2].T), motion[:, 2])))
+    speed, steps_s = np.abs(motion[:, 0]), np.diff(motion_s)[:, None]
+    gained = np.gradient(0.5 * speed**2, motion_s)
+    causes = np.column_stack((np.ones_like(speed), speed, np.abs(motion[:, 1]), gained, motion[:, 2]))
+    sums = np.concatenate((np.zeros((1, 5)), np.cumsum(steps_s * (causes[1:] + causes[:-1]) / 2.0, axis=0)))
     return PowerFit(at_s, power.value[inside], motion_s, sums, stated_s)
 
 

@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.power.plausibility import REJECTED
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
@@ -92,9 +93,6 @@ def reject_power(topic: str, reason: str, *, names: Mapping[str, str] | None = N
     return make_finding(REJECTED, Subject("topic", topic), names={"reason": reason, **(names or {})}, **numbers)
 
 
-REJECTED = "power-rejected"
-
-
 @dataclass(frozen=True, slots=True)
 class RailReadings:
     """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,).
@@ -161,12 +159,8 @@ def list_power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[
 
 
 def _select_most_specific(fitting: Sequence[PowerSource]) -> list[PowerSource]:
-    best = max(map(_rank_specificity, fitting), default=None)
-    return [source for source in fitting if _rank_specificity(source) == best]
-
-
-def _rank_specificity(source: PowerSource) -> tuple[bool, bool, bool]:
-    return source.husky_power is not None, source.platform is not None, source.topic is not None
+    ranks = [(each.husky_power is not None, each.platform is not None, each.topic is not None) for each in fitting]
+    return [source for source, rank in zip(fitting, ranks, strict=True) if rank == max(ranks)]
 
 
 _QUANTITY = re.compile(r"volt(?:age)?|curr(?:ent)?|amp(?:ere)?s?")

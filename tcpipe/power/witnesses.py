@@ -163,9 +163,8 @@ def compare_meters(drive_watt: Floats, pack_watt: Floats) -> tuple[float, float]
     drive, pack = drive_watt[known], pack_watt[known]
     if known.sum() < _MIN_METER_ROWS or not drive.std() > 0.0 or not pack.std() > 0.0:
         return None
-    drive, pack = drive - drive.mean(), pack - pack.mean()
-    product = float(drive @ pack)
-    return product / float(drive @ drive), product / float(np.sqrt((drive @ drive) * (pack @ pack)))
+    (of_drive, both), (_, of_pack) = np.cov(drive, pack)
+    return float(both / of_drive), float(both / np.sqrt(of_drive * of_pack))
 
 
 _MAX_HALF_SHARE = 0.36

@@ -21,8 +21,8 @@ from tcpipe.cost.labels import (
     spans_near,
     touches_voltage_outside,
 )
+from tcpipe.fusion.densities import PRIORS
 from tcpipe.fusion.measurements import FIXES, IMU
-from tcpipe.fusion.process import estimate_gyro_density
 from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.distance_breakdown import find_interval_reason, sum_by_reason
@@ -93,7 +93,7 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArr
     for each in facts.stretches:
         if each.clock_epoch == epoch and IMU in each.sensors and each.gyro_noise_radps is not None:
             mine = (start_ns >= each.start_ns) & (start_ns <= each.end_ns)
-            density[mine] = estimate_gyro_density(each.gyro_noise_radps, rate_hz)
+            density[mine] = 1.5 * each.gyro_noise_radps**2 / rate_hz + PRIORS["imu turn"].variance
     return density
 
 

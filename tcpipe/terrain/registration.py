@@ -3,8 +3,9 @@
 Heights of track and map differ by a constant (geoid, the robot's own height). The rest is the shape of the ground. The shift at which the
 two shapes agree best is searched on a lattice, as in terrain-aided navigation (Hollowell 1990; Nuth & Kääb 2011), and refined by a
 paraboloid through the squared misfits. A tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, are
-fitted with it. Along directions in which the ground does not vary the shift is not observable, and stays zero. All uncertainties are
-by a delete-one-block jackknife, since errors of GNSS are alike over seconds, and those of the map over metres.
+fitted with it. The shift's uncertainty is the scatter of the best shift among blocks of the path drawn at random (block bootstrap, Künsch
+1989), since errors of GNSS are alike over seconds, and those of the map over metres. It is large along directions in which the ground does
+not vary, or repeats itself: there the shift is not observable, and stays zero.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates, minimum_filter
+from scipy.ndimage import map_coordinates
 from scipy.optimize import brentq, least_squares
 from scipy.stats import chi2
 
@@ -34,26 +36,31 @@ _SHIFT_M = np.arange(-round(REACH_M / _STEP_M), round(REACH_M / _STEP_M) + 1) * 
 _LATTICE_M = np.stack(np.meshgrid(_SHIFT_M, _SHIFT_M), axis=-1)
 """Shifts to the east and north, by row (north) and column (east), (K, K, 2)."""
 _MIDDLE = len(_SHIFT_M) // 2, len(_SHIFT_M) // 2
-_NORTH_M, _EAST_M = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1) * _STEP_M
+
+
+def _expand_square(east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+    """Return the terms by which value, gradient and curvature of a paraboloid enter its value at places (N,), shape (N, 6)."""
+    squares = east_m**2 / 2.0, east_m * north_m, north_m**2 / 2.0
+    return np.stack([np.ones_like(east_m), east_m, north_m, *squares], axis=-1)
+
+
 _PARABOLOID = np.linalg.pinv(
-    np.stack([np.ones_like(_EAST_M), _EAST_M, _NORTH_M, _EAST_M**2, _EAST_M * _NORTH_M, _NORTH_M**2], axis=1)
+    _expand_square(*(np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1)[::-1] * _STEP_M))
 )
 _SPACING_M, _DRIFT_M, _CLIFF_M = 0.5, 25.0, 1.0
 """Spacing of points; path over which the track's heights have one error; relief among near shifts that no robot drives on [m]."""
 _FEWEST_POINTS, _MOST_POINTS, _MOST_TOGETHER = 60, 1_200, 6_000
 """Fewest points, and most of one track and of several."""
-_BLOCKS, _FEW_BLOCKS = 12, 1.26
-"""Blocks of the jackknife, and factor of a variance from so few (square of the ratio of Student's t and normal at 95 %)."""
-_SIGMAS, _RIVAL_SIGMAS, _OUTLIER = 5.0, 3.0, 3.5
-"""Standard deviations by which a shift lowers the misfit, and by which it must be better than a rival; of an outlier."""
-_APART_M, _EDGE_M = 0.75, 0.75 * _STEP_M
-"""Least distances of a rival from the best shift, and of the best shift beyond the lattice's edge from the best one inside [m]."""
+_BLOCKS, _DRAWS, _FEW_BLOCKS = 12, 200, 1.38
+"""Blocks of the path, draws of them, and factor of a variance by so few: 12 / 11, and the squared ratio of Student's t and normal."""
+_SIGMAS, _OUTLIER, _EDGE_M = 5.0, 3.5, 0.75 * _STEP_M
+"""Standard deviations by which a shift lowers the misfit, and of an outlier; least step from the best inner shift beyond the edge [m]."""
 _CHI2_999, _AGREE, _SCATTER_QUANTILE = 13.82, 0.999, 0.1
 """99.9 % of χ² with two degrees of freedom; probabilities that runs agree, and below their scatter."""
 _LEAST_GAIN = -2.0 * np.log(0.9)
 """A shift that leaves more than 90 % of the misfit is not what was wrong."""
-_FLAT, _RIDGE = 1e-4, 1e-12
-"""Relative curvature of the misfit along a direction in which the ground does not vary; smallest divisor."""
+_RIDGE = 1e-12
+"""Smallest divisor."""
 _UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
 _UNITS |= {1.0 / metres: "m" for metres in _UNITS}
 """Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
@@ -100,8 +107,8 @@ class Registration:
     ``shift_xy_m`` is what to add to the track's positions to find their ground on the map [m, the map's axes], along determined
     directions only. ``height_offset_m`` is track minus map. ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left
     without and with the shift, ``shape_misfit_m`` of what is left with the shift, a tilt and a drift. ``significant``: the shift is not
-    chance. ``at_reach``: the true shift may be beyond the lattice. ``scale`` is of heights. ``information`` is the inverse of the shift's
-    covariance, (2, 2) [1/m²], 0 along directions that are not determined.
+    chance. ``at_reach``: the true shift may be beyond the lattice. ``scale`` is of heights. ``covariance`` is that of the shift, (2, 2)
+    [m²]; its variance is ``REACH_M**2`` along directions that are not determined.
     """
 
     points: int
@@ -113,7 +120,7 @@ class Registration:
     significant: bool
     at_reach: bool
     scale: HeightScale
-    information: FloatArray
+    covariance: FloatArray
 
     @property
     def shift_m(self) -> float:
@@ -123,14 +130,13 @@ class Registration:
     @property
     def shift_std_m(self) -> float:
         """Largest standard deviation of the shift along determined directions [m], NaN where none is determined."""
-        values = np.linalg.eigvalsh(self.information)
-        return float(max(values[values > 1.0 / REACH_M**2] ** -0.5, default=np.nan))
+        variances = np.linalg.eigvalsh(self.covariance)
+        return float(max(variances[variances < KNOWN_M**2] ** 0.5, default=np.nan))
 
     @property
     def axis_std_m(self) -> FloatArray:
         """Standard deviations of the shift along both axes [m], NaN unless it is determined in both directions."""
-        known = _count_known(self.information) > 1
-        return np.sqrt(np.diag(np.linalg.inv(self.information))) if known else np.full(2, np.nan)
+        return np.sqrt(np.diag(self.covariance)) if _count_known(self.covariance) > 1 else np.full(2, np.nan)
 
     @property
     def position_std_m(self) -> float:
@@ -207,7 +213,8 @@ def _find_ground(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[N
     for _ in range(6):
         left = excess_m[:, *best] - _fit_tilt(xy_m, excess_m[:, *best])
         left = np.abs(left - np.median(left))
-        relief_m = np.ptp(excess_m[:, *_select_near(best)], axis=(1, 2))
+        row, column = np.clip(best, _NEAR, len(_SHIFT_M) - 1 - _NEAR) - _NEAR
+        relief_m = np.ptp(excess_m[:, row : row + 2 * _NEAR + 1, column : column + 2 * _NEAR + 1], axis=(1, 2))
         near = left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)  # steep ground misfits by a step
         good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
@@ -231,25 +238,17 @@ def _find_least(spread: FloatArray) -> tuple[int, int]:
     return int(i), int(j)
 
 
-def _select_near(best: tuple[int, int]) -> tuple[slice, slice]:
-    """Return the part of the lattice near a shift."""
-    i, j = (min(max(index, _NEAR), len(_SHIFT_M) - 1 - _NEAR) for index in best)
-    return slice(i - _NEAR, i + _NEAR + 1), slice(j - _NEAR, j + _NEAR + 1)
-
-
 def _flatten(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[FloatArray, FloatArray, Rows]:
-    """Return the excess without drift and tilt, the columns of a tilt, (N, 2), and the stretch of path of each point, (N,), rising.
-
-    Means over stretches are zero: the drift is constant in each.
-    """
-    tracks = np.split(np.arange(len(track)), np.flatnonzero(np.diff(track)) + 1)
-    paths_m = [np.hypot(*np.diff(xy_m[rows], axis=0).T).sum() for rows in tracks]
-    counts = [max(-(-_BLOCKS // len(tracks)), round(float(path_m) / _DRIFT_M)) for path_m in paths_m]
-    parts = [part for rows, count in zip(tracks, counts, strict=True) for part in np.array_split(rows, count)]
-    sizes = np.array([part.size for part in parts if part.size])
-    first, stretch = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
+    """Return the excess without tilt and drift, constant in each stretch of path; the columns of a tilt, (N, 2); each point's block."""
+    path_m = np.cumsum(np.hypot(*np.diff(xy_m, axis=0, prepend=xy_m[:1]).T))
+    count = max(_BLOCKS, round(float(path_m[-1]) / _DRIFT_M))
+    place = track, np.minimum(path_m * count // path_m[-1], count - 1)
+    _, first, stretch, sizes = np.unique(place, axis=1, return_index=True, return_inverse=True, return_counts=True)
     flat_m, tilt = (each - (np.add.reduceat(each, first).T / sizes).T[stretch] for each in (excess_m, xy_m))
-    return _remove_tilt(flat_m, tilt), tilt, stretch
+    # Blocks of stretches near each other: errors of the map are alike wherever several tracks pass.
+    east_m, north_m = ((xy_m - tilt)[first] - xy_m.min(axis=0)).T
+    rank = np.argsort(np.argsort(compute_morton(east_m.astype(np.int64), north_m.astype(np.int64)), kind="stable"))
+    return _remove_tilt(flat_m, tilt), tilt, (rank * min(_BLOCKS, len(sizes)) // len(sizes))[stretch]
 
 
 def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
@@ -283,85 +282,58 @@ def _refine_shift(
     near_m: FloatArray, good_m: FloatArray, xy_m: FloatArray, track: Rows, scale: HeightScale
 ) -> Registration:
     """Return the best shift of the lattice, refined by the excess at good points; misfits are those of near points."""
-    flat_m, tilt, stretch = _flatten(good_m, xy_m, track)
-    variance, inside = flat_m.var(axis=0), slice(_NEAR, -_NEAR)
-    best, inner = _find_least(variance), _find_least(variance[inside, inside])
-    at = inner[0] + _NEAR, inner[1] + _NEAR
-    fits = [_fit_bottom(flat_m, tilt, block, at) for block in _group_stretches(xy_m, stretch)]
-    step_m, covariance, squares = max(fits, key=lambda fit: float(np.trace(fit[1])))
-    variances, axes = np.linalg.eigh(covariance)
-    known = axes[:, variances < KNOWN_M**2]
-    if not _is_distinct(squares, at, known):
-        known = axes[:, :0]
-    step_m = known @ np.clip(known.T @ step_m, -_STEP_M, _STEP_M)
-    fitted = known @ known.T @ _LATTICE_M[at] + step_m
-    information = (known / variances[: known.shape[1]]) @ known.T
-    gain, sigmas = _compare(squares, _MIDDLE, at)
+    flat_m, tilt, block = _flatten(good_m, xy_m, track)
+    squares = _resample_squares(flat_m, tilt, block)
+    at, paraboloids = _fit_paraboloids(squares)
+    curvature, axes = np.linalg.eigh(paraboloids[:, [3, 4, 4, 5]].reshape(-1, 2, 2))
+    inverse = (axes / np.maximum(curvature, _RIDGE)[:, None]) @ axes.swapaxes(1, 2)
+    steps_m = np.clip(-np.einsum("rij,rj->ri", inverse, paraboloids[:, 1:3]), -REACH_M, REACH_M)
+    first_m = _LATTICE_M[*at[0]]
+    error_m = _LATTICE_M[*at.T] + steps_m - first_m - steps_m[0]
+    independent = 2.0 * paraboloids[0, 0] / len(flat_m) * inverse[0]
+    variances, axes = np.linalg.eigh(_FEW_BLOCKS * error_m.T @ error_m / _DRAWS + independent)
+    is_known = variances < KNOWN_M**2
+    known = (axes * is_known) @ axes.T
+    step_m = np.clip(known @ steps_m[0], -_STEP_M, _STEP_M)
+    fitted_m, covariance = known @ first_m + step_m, (axes * np.where(is_known, variances, REACH_M**2)) @ axes.T
+    gains = np.log(squares[:, *_MIDDLE] / squares[:, *at[0]])
+    is_better = gains[0] > max(_LEAST_GAIN, _SIGMAS * gains[1:].std())
+    terms = _expand_square(*step_m)
     return Registration(
         points=len(flat_m),
-        shift_xy_m=(float(fitted[0]), float(fitted[1])),
-        height_offset_m=-float(near_m[:, *at].mean()),
+        shift_xy_m=(float(fitted_m[0]), float(fitted_m[1])),
+        height_offset_m=-float(near_m[:, *at[0]].mean()),
         misfit_m=float(near_m[:, *_MIDDLE].std()),
-        shifted_misfit_m=_measure_misfit(near_m, at, step_m),
-        shape_misfit_m=_measure_misfit(flat_m, at, step_m),
-        significant=float(fitted @ information @ fitted) > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
-        at_reach=bool((np.abs(known.T @ (_LATTICE_M[best] - _LATTICE_M[at])) > _EDGE_M).any()),
+        shifted_misfit_m=float(np.sqrt(_fit_paraboloids(near_m.var(axis=0)[None], at[:1])[1][0] @ terms)),
+        shape_misfit_m=float(np.sqrt(paraboloids[0] @ terms / len(flat_m))),
+        significant=bool(is_better and fitted_m @ np.linalg.inv(covariance) @ fitted_m > _CHI2_999),
+        at_reach=bool(np.linalg.norm(known @ (_LATTICE_M[_find_least(squares[0])] - first_m)) > _EDGE_M),
         scale=scale,
-        information=information,
+        covariance=covariance,
     )
 
 
-def _group_stretches(xy_m: FloatArray, stretch: Rows) -> list[Rows]:
-    """Return the block of each point, (N,), along the path and by place: errors of GNSS are alike in time, those of the map in place."""
-    centre_m = np.stack([np.bincount(stretch, axis_m) for axis_m in xy_m.T]) / np.bincount(stretch)
-    order = np.argsort(compute_morton(*np.floor(centre_m.T - centre_m.min(axis=1)).astype(np.int64).T), kind="stable")
-    blocks = np.array_split(np.arange(len(order)), min(_BLOCKS, len(order)))
-    number = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
-    return [number[stretch], number[np.argsort(order)][stretch]]
+def _resample_squares(flat_m: FloatArray, tilt: FloatArray, block: Rows) -> FloatArray:
+    """Return the squared misfits of all points, and of blocks drawn at random, shape (1 + draws, K, K), each without tilt."""
+    flat, count = flat_m.reshape(len(flat_m), -1), int(block.max()) + 1
+    drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), _DRAWS)
+    weights, blocks = np.vstack((np.ones((1, count)), drawn)), [block == number for number in range(count)]
+    squares = weights @ np.stack([np.square(flat[rows]).sum(axis=0) for rows in blocks])
+    by_flat, by_tilt = (
+        np.tensordot(weights, np.stack([tilt[rows].T @ each[rows] for rows in blocks]), 1) for each in (flat, tilt)
+    )
+    squares -= np.einsum("rik,rik->rk", by_flat, np.linalg.pinv(by_tilt, hermitian=True) @ by_flat)
+    return np.asarray(squares.reshape(-1, *flat_m.shape[1:]))
 
 
-def _fit_bottom(
-    flat_m: FloatArray, tilt: FloatArray, block: Rows, at: tuple[int, int]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the step (2,) [m] from a shift to the bottom of a paraboloid, its covariance, and the squared misfits by block, (B, K, K).
-
-    Along a furrow there is no bottom: the step is 0, its standard deviation the lattice's size. The covariance is that of blocks left out,
-    and what independent errors of so many points would give.
-    """
-    members = [block == number for number in range(block.max() + 1)]
-    squares = np.stack([np.square(flat_m[rows]).sum(axis=0) for rows in members])
-    near_m, rests = flat_m[:, *_select_near(at)], [np.ones(len(block), np.bool_), *(~rows for rows in members)]
-    misfit = np.stack([np.square(_remove_tilt(near_m[rest], tilt[rest])).sum(axis=0).ravel() for rest in rests])
-    _, east, north, east2, both, north2 = _PARABOLOID @ misfit.T
-    curvature, axes = np.linalg.eigh(np.moveaxis(np.array([[2.0 * east2, both], [both, 2.0 * north2]]), 2, 0))
-    is_flat = curvature <= _FLAT * curvature[:, 1:] + _RIDGE
-    inverse = np.where(is_flat, 0.0, 1.0 / np.where(is_flat, 1.0, curvature))
-    steps_m = -np.einsum("nij,nj,nkj,kn->ni", axes, inverse, axes, np.stack([east, north]))
-    variance = np.where(is_flat[0], REACH_M**2, 2.0 * misfit[0].min() / len(flat_m) * inverse[0])
-    return steps_m[0], _FEW_BLOCKS * _estimate_covariance(steps_m[1:]) + (axes[0] * variance) @ axes[0].T, squares
-
-
-def _is_distinct(squares: FloatArray, best: tuple[int, int], known: FloatArray) -> bool:
-    """Return whether every other shift that fits best around it, away along the known directions, fits clearly worse."""
-    total = squares.sum(axis=0)
-    away = np.linalg.norm((_LATTICE_M - _LATTICE_M[best]) @ known, axis=-1) >= _APART_M
-    rivals = np.argwhere(away & (total == minimum_filter(total, 3, mode="nearest"))).tolist()
-    return all(_compare(squares, (i, j), best)[1] > _RIVAL_SIGMAS for i, j in rivals)
-
-
-def _compare(squares: FloatArray, other: tuple[int, int], best: tuple[int, int]) -> tuple[float, float]:
-    """Return by how much the log of the squared misfit falls from another shift to the best, and over how many standard deviations."""
-    total = squares.sum(axis=0)
-    gain, without = np.log(total[other] / total[best]), total - squares
-    std = np.sqrt(_estimate_covariance(np.log(without[:, *other] / without[:, *best])[:, None])[0, 0])
-    return float(gain), float(gain / max(std, 1e-12))
-
-
-def _measure_misfit(excess_m: FloatArray, at: tuple[int, int], step_m: FloatArray) -> float:
-    """Return the standard deviation of the excess at a step [m] beside a shift of the lattice [m]."""
-    i, j = at
-    east, north = excess_m[:, i, j + 1] - excess_m[:, i, j - 1], excess_m[:, i + 1, j] - excess_m[:, i - 1, j]
-    return float((excess_m[:, i, j] + np.stack([east, north], axis=1) @ step_m / (2.0 * _STEP_M)).std())
+def _fit_paraboloids(misfits: FloatArray, at: Rows | None = None) -> tuple[Rows, FloatArray]:
+    """Return the indices (north, east) of the least of each misfit, (R, 2), and the paraboloid around it, (R, 6), as `_expand_square`."""
+    near = sliding_window_view(misfits, (2 * _NEAR + 1,) * 2, axis=(1, 2))
+    if at is None:
+        inner = near[:, :, :, _NEAR, _NEAR]
+        at = np.stack(np.unravel_index(inner.reshape(len(inner), -1).argmin(axis=1), inner.shape[1:]), axis=1) + _NEAR
+    windows = near[np.arange(len(misfits)), *(at - _NEAR).T]
+    return at, windows.reshape(len(misfits), -1) @ _PARABOLOID.T
 
 
 def _estimate_covariance(without: FloatArray) -> FloatArray:
@@ -386,54 +358,49 @@ def share_shift(
     The shift that all have in common, plus each run's own about it: by the standard deviation (DRMS) of its track, (N,) [m], and by what
     the runs' shifts scatter more. None is taken where they contradict each other, or too few are determined to bound their scatter.
     """
-    shift_m, variance = np.array([registration.shift_xy_m for registration in alone]), track_std_m**2 / 2.0
-    information = np.stack([registration.information for registration in alone])
-    weights = _widen(information, variance)
-    mean_m = np.linalg.pinv(weights.sum(axis=0), hermitian=True) @ np.einsum("nij,nj->i", weights, shift_m)
-    freedom = int(_count_known(information).sum()) - 2
+    shift_m = np.array([registration.shift_xy_m for registration in alone])
+    covariance = np.stack([registration.covariance for registration in alone])
+    widened = covariance + np.square(track_std_m)[:, None, None] / 2.0 * np.eye(2)
+    weights = np.linalg.inv(widened)
+    mean_m = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, shift_m))
+    freedom = int(_count_known(covariance).sum()) - 2
     none = [SharedShift(None, float("nan")) for _ in alone]
     if freedom <= 0:
         return none
-    if _square(shift_m - mean_m, weights).sum() > chi2.ppf(_AGREE, freedom):
-        return _find_contradictions(shift_m, weights)
+    if _square(shift_m - mean_m, widened).sum() > chi2.ppf(_AGREE, freedom):
+        return _find_contradictions(shift_m, widened)
     if together is None or together.at_reach or not np.isfinite(together.position_std_m):
         return none
     error_m = shift_m - together.shift_xy_m
 
     def exceed(scatter: float) -> float:
         """Return by how much the squared errors exceed their lower quantile."""
-        squares = _square(error_m, _widen(information, variance + scatter))
+        squares = _square(error_m, widened + scatter * np.eye(2))
         return float(squares.sum() - chi2.ppf(_SCATTER_QUANTILE, freedom))
 
     scatter = float(brentq(exceed, 0.0, 1e6)) if exceed(0.0) > 0.0 else 0.0
-    widened = _widen(together.information[None], variance + scatter)
+    shared = together.covariance + widened - covariance + scatter * np.eye(2)
     shift_xy_m, left_m = together.shift_xy_m, together.shifted_misfit_m
     return [
-        SharedShift(replace(own, shift_xy_m=shift_xy_m, shifted_misfit_m=left_m, information=wider), np.nan)
-        for own, wider in zip(alone, widened, strict=True)
+        SharedShift(replace(own, shift_xy_m=shift_xy_m, shifted_misfit_m=left_m, covariance=wider), np.nan)
+        for own, wider in zip(alone, shared, strict=True)
     ]
 
 
-def _find_contradictions(shift_m: FloatArray, weights: FloatArray) -> list[SharedShift]:
+def _find_contradictions(shift_m: FloatArray, covariance: FloatArray) -> list[SharedShift]:
     """Return how far the shifts of runs, (N, 2) [m], are from the median of those that are determined; NaN where by chance."""
-    is_known = _count_known(weights) > 1
+    is_known = _count_known(covariance) > 1
     error_m = shift_m - (np.median(shift_m[is_known], axis=0) if is_known.any() else shift_m)
-    squares = np.where(is_known, _square(error_m, weights), 0.0)
+    squares = np.where(is_known, _square(error_m, covariance), 0.0)
     is_odd = is_known & (squares >= min(_CHI2_999, squares.max()))
     return [SharedShift(None, float(apart_m)) for apart_m in np.where(is_odd, np.hypot(*error_m.T), np.nan)]
 
 
-def _square(error_m: FloatArray, weights: FloatArray) -> FloatArray:
+def _square(error_m: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return squared errors over their variances, (N,)."""
-    return np.asarray(np.einsum("ni,nij,nj->n", error_m, weights, error_m))
+    return np.asarray(np.einsum("ni,nij,nj->n", error_m, np.linalg.inv(covariance), error_m))
 
 
-def _count_known(information: FloatArray) -> Rows:
-    """Return how many directions an information, (..., 2, 2) [1/m²], determines."""
-    return np.asarray((np.linalg.eigvalsh(information) > 1.0 / REACH_M**2).sum(axis=-1))
-
-
-def _widen(information: FloatArray, variance: FloatArray) -> FloatArray:
-    """Return an information, (N, 2, 2) [1/m²], with a variance, (N,) [m²], added; what is not determined stays so."""
-    unit = np.eye(2)
-    return np.asarray(np.linalg.inv(np.linalg.inv(information + 1e-6 * unit) + variance[:, None, None] * unit))
+def _count_known(covariance: FloatArray) -> Rows:
+    """Return how many directions a covariance, (..., 2, 2) [m²], determines."""
+    return np.asarray((np.linalg.eigvalsh(covariance) < REACH_M**2 / 2.0).sum(axis=-1))

@@ -48,7 +48,7 @@ def measure(seed=0, white_m=0.015, correlated_m=0.0, time_s=10.0, *, seconds=LON
 
 def compute_change_std(noise, time_s):
     """Return the standard deviation of the change of a fix's error over a time [s]."""
-    return float(np.sqrt(2.0 * noise.white_m2 + noise.correlated.difference_variance(np.array(time_s))))
+    return float(np.sqrt(2.0 * noise.white + noise.correlated.difference_variance(np.array(time_s))))
 
 
 def numbers(value):
@@ -76,22 +76,22 @@ def test_correlated_noise_of_fixes_is_recovered(seed, correlated_m, time_s, visu
         wanted = np.sqrt(2.0 * 0.006**2 + true.difference_variance(np.array(after_s)))
         assert 0.75 < compute_change_std(model.horizontal, after_s) / wanted < 1.4
         assert 0.75 < compute_change_std(model.vertical, after_s) / wanted / 1.6 < 1.6
-    assert model.horizontal.white_m2 == pytest.approx(0.006**2, rel=0.4)
+    assert model.horizontal.white == pytest.approx(0.006**2, rel=0.4)
     assert model.horizontal.correlated.data_share > 0.5
 
 
 def test_white_noise_is_hardly_taken_for_correlated():
     model = drive.estimate_noise(measure())
-    assert np.sqrt(model.horizontal.white_m2) == pytest.approx(0.015, rel=0.1)
+    assert np.sqrt(model.horizontal.white) == pytest.approx(0.015, rel=0.1)
     assert np.sqrt(model.horizontal.correlated.variance) < 0.007
     assert np.sqrt(model.vertical.correlated.variance) < 0.018
 
 
 def test_odometries_and_turns_are_recovered():
     model = drive.estimate_noise(measure(seed=3, visual_scale=1.05))
-    assert model.odometries["visual_odometry"].velocity_m2ps == pytest.approx(0.03**2 / 30.0, rel=0.6)
-    assert model.turns["wheel_odometry"].white_rad2ps == pytest.approx(0.02**2 / 50.0, rel=0.5)
-    slip = model.odometries["wheel_odometry"].scale
+    assert model.odometries["visual_odometry"].white == pytest.approx(0.03**2 / 30.0, rel=0.6)
+    assert model.turns["wheel_odometry"].white == pytest.approx(0.02**2 / 50.0, rel=0.5)
+    slip = model.odometries["wheel_odometry"].correlated
     assert 0.002 < np.sqrt(slip.variance) < 0.03  # 3 % at most, which comes and goes
 
 
@@ -164,7 +164,14 @@ def test_fixes_without_claims_keep_the_prior(short):
     )
     model = drive.estimate_noise(unclaimed)
     assert model.horizontal == make_prior_model(unclaimed).horizontal
-    assert model.horizontal.white_m2 + model.horizontal.correlated.variance == pytest.approx(1.0)
+    assert model.horizontal.white + model.horizontal.correlated.variance == pytest.approx(1.0)
+
+
+def test_fixes_without_claims_do_not_enter_the_noise_of_those_with(short):
+    unclaimed = np.random.default_rng(4).random(short.gnss.stamp_ns.size) < 0.43
+    variance_m2 = np.where(unclaimed[:, None], 1.0, short.gnss.variance_m2)
+    mixed = drive.estimate_noise(change_fixes(short, unclaimed=unclaimed, variance_m2=variance_m2))
+    assert mixed.horizontal.white == pytest.approx(drive.estimate_noise(short).horizontal.white, rel=0.3)
 
 
 def test_fixes_at_one_hertz_and_of_metres():

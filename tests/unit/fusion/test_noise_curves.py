@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import dblquad
 from unit.fusion import drive
 
-from tcpipe.fusion.densities import FixNoise, GaussMarkov, OdometryNoise, describe_noise, make_prior_model
+from tcpipe.fusion.densities import GaussMarkov, SensorNoise, describe_noise, make_prior_model
 
 TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 
@@ -24,9 +24,7 @@ def at(facts, time_s):
 
 def test_a_fix_changes_by_white_noise_and_by_what_its_process_forgets(measured):
     process = GaussMarkov(0.02**2, 10.0, data_share=0.5)
-    fixes = FixNoise(
-        claimed_m2=0.03**2, white_m2=0.01**2, correlated=process, processes=(process,), white_data_share=1.0
-    )
+    fixes = SensorNoise(white=0.01**2, correlated=process, claimed_m2=0.03**2, white_data_share=1.0)
     noise = replace(make_prior_model(measured), horizontal=fixes)
     found = describe_noise(measured, noise)["gnss"]
     assert (found.unit, found.time_s) == ("m", TIMES_S)
@@ -41,7 +39,7 @@ def test_a_fix_changes_by_white_noise_and_by_what_its_process_forgets(measured):
 def test_a_distance_errs_by_the_integral_of_velocity_noise_and_scale(measured, time_s):
     scale, none = GaussMarkov(0.02**2, 15.0, data_share=1.0), GaussMarkov(0.0, 10.0)
     prior = make_prior_model(measured)
-    odometries = prior.odometries | {"wheel_odometry": OdometryNoise(1e-4, scale, velocity_data_share=0.0)}
+    odometries = prior.odometries | {"wheel_odometry": SensorNoise(1e-4, scale)}
     found = describe_noise(measured, replace(prior, odometries=odometries, shared_scale=none))["wheel_odometry"]
     speed = np.abs(measured.wheels.velocity_mps[:, 0])
     usual = np.median(speed[speed > 0.1])

@@ -74,6 +74,7 @@ def test_rounded_coordinates_err_as_much_as_their_variance(decimals, most_m):
     std = np.sqrt(rounded.variance_m2[:, :2])
     assert (np.abs(error - np.median(error, axis=0)) < 2.5 * std).all()
     assert std.max() < most_m
+    assert (rounded.unclaimed is not None) == (decimals < 12)  # the stated variance is not that of the rounded fix
 
 
 def test_datum_is_the_median_of_the_first_fixes_also_at_the_date_line():

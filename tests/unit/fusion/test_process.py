@@ -135,3 +135,4 @@ def test_late_fixes_are_seen_and_their_variance_raised_while_driving():
     assert (raised.variance_m2[speed > 0.7, 0] > 0.1**2).mean() > 0.9
     assert (raised.variance_m2[speed < 0.01, 0] < 0.05**2).mean() > 0.9
     assert (raised.variance_m2[:, 2] == gnss.variance_m2[:, 2]).all()
+    assert not raised.has_claims

@@ -63,7 +63,7 @@ def test_each_tick_holds_the_mean_of_what_a_sensor_measures_around_it():
     m = drive.measure(drive.make_drive(20.0), 2)
     found = ticks_of(m, int(m.gnss.stamp_ns[0]), int(m.gnss.stamp_ns[-1]))
     noise = drive.estimate_noise(m)
-    white = np.array([fix.white_m2 / fix.claimed_m2 for fix in (noise.horizontal, noise.horizontal, noise.vertical)])
+    white = np.array([fix.white / fix.claimed_m2 for fix in (noise.horizontal, noise.horizontal, noise.vertical)])
     for kind, stamp_ns, values in (
         (state.WHEELS, m.wheels.stamp_ns, m.wheels.velocity_mps[:, :1]),
         (state.VISUAL, m.visual.stamp_ns, m.visual.velocity_mps),
@@ -92,7 +92,7 @@ def test_a_sensor_of_any_rate_carries_the_information_that_it_claims(hz):
     told = np.isfinite(found.inputs.value[:, state.FIX, 0])
     assert told.sum() == pytest.approx(min(hz, 20.0) * 28.8, rel=0.02)
     noise = drive.estimate_noise(slow)
-    white_m2 = noise.horizontal.white_m2 / noise.horizontal.claimed_m2
+    white_m2 = noise.horizontal.white / noise.horizontal.claimed_m2
     assert np.sum(1.0 / found.inputs.variance[told, state.FIX, 0]) == pytest.approx(stamp_ns.size / white_m2, rel=0.02)
 
 
@@ -103,7 +103,7 @@ def test_wheels_of_any_rate_carry_the_information_of_their_noise_density(hz):
     steady = np.column_stack((np.ones(stamp_ns.size), np.full((stamp_ns.size, 2), np.nan)))
     source = BodyVelocities(stamp_ns, steady, 1e-6 * steady, steady[:, 1], steady[:, 1])
     fitted = drive.estimate_noise(m)
-    odometry = replace(fitted.odometries[WHEELS], velocity_m2ps=density, velocity_data_share=1.0)
+    odometry = replace(fitted.odometries[WHEELS], white=density, white_data_share=1.0)
     noise = replace(fitted, odometries={**fitted.odometries, WHEELS: odometry})
     output_ns = np.arange(int(drive.ns(0.1)) // TICK_NS, int(drive.ns(19.5)) // TICK_NS) * TICK_NS
     found = build_ticks(

@@ -132,9 +132,9 @@ def test_the_deviation_of_a_shift_counts_in_whole_drives(moved):
 @pytest.mark.parametrize(
     ("shift_m", "rows", "limit_m", "reason"),
     [
-        ((-1.5, 0.8), 1200, 0.08, "the shift is known only to 0.1"),
-        ((-1.5, 0.8), 1200, 0.1, "the shift is known only to 0.1"),  # with the track's own deviation it is too much
-        ((3.9, 0.0), 3000, 0.1, "the ground does not determine the shift"),
+        ((-1.5, 0.8), 1200, 0.08, "the shift is known only to 0.09"),
+        ((-1.5, 0.8), 1200, 0.093, "the shift is known only to 0.09"),  # with the track's own deviation it is too much
+        ((3.9, 0.0), 3000, 0.1, "the shift may be beyond 4 m"),
     ],
 )
 def test_a_shift_that_is_not_known_well_enough_is_not_applied(tmp_path, shift_m, rows, limit_m, reason):
