@@ -19,10 +19,10 @@ from tcpipe.fusion.measurements import IMU, BodyVelocities, InertialMeasurements
 from tcpipe.fusion.signals import (
     Plane,
     compute_interval_means,
-    compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
     multiply_by_vector,
+    remove_spikes,
     solve_least_squares,
 )
 from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotation_vector
@@ -40,7 +40,6 @@ _SLOWEST_IMU_NS = 100_000_000  # slower units do not show turns
 _ALIGN_S = 10.0  # windows of the alignment
 _PITCH_KNOT_S = 240.0  # the same of pitch, whose error is an accelerometer's bias
 _ROUNDS = 8
-_SPIKE = 8.0  # times the median distance from the median of five: more than 5σ
 _ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1  # of what the alignment takes out
 _LEAST_SCALE = 0.2  # an odometry of less shows another motion
 _MOVES_M = 0.2  # shorter windows show no heading
@@ -198,14 +197,6 @@ def compute_forward_mps(source: BodyVelocities, attitude: Attitude, zero_ns: int
     means = compute_interval_means(stamp_s, speed[:, None], attitude.time_s - half, attitude.time_s + half)[:, 0]
     _, y, z = source.lever_arm_m
     return np.asarray(means + attitude.rate_radps[:, 2] * y - attitude.rate_radps[:, 1] * z)
-
-
-def remove_spikes(values: Floats, *, fill: Floats | float | None = None) -> Floats:
-    """Return a signal (N,) with samples far off the median of five around them replaced, by that median: what a filter's gate rejects."""
-    smooth = compute_median_of_five(values)
-    off = np.abs(values - smooth)
-    scatter = float(np.median(off[off > 0.0])) if (off > 0.0).any() else 0.0
-    return np.where(off > _SPIKE * scatter, smooth if fill is None else fill, values)
 
 
 def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:

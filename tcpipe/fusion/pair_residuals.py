@@ -31,7 +31,6 @@ from tcpipe.fusion.level_motion import (
     get_turn_rates,
     integrate_grid,
     make_free_track,
-    remove_spikes,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -41,6 +40,7 @@ from tcpipe.fusion.signals import (
     interpolate_signal,
     is_in_gap,
     multiply_by_vector,
+    remove_spikes,
     solve_least_squares,
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ Plane = NDArray[np.complex128]
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
 _OUTLIER_STDS = 5.0  # distance of an outlier from the line between its neighbours
+_SPIKE = 8.0  # distance of a spike over the median distance from the median of five: more than 5 σ
 MAX_ACCELERATION_MPS2 = 2.5
 """Acceleration of a robot that brakes hard; what fixes show beyond it is an outlier [m/s²]."""
 _MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long
@@ -116,6 +118,28 @@ def compute_median_of_five(values: Floats) -> Floats:
         return values
     padded = np.pad(values, 2, mode="edge")
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+
+
+def remove_spikes(values: Floats, *, fill: Floats | float | None = None) -> Floats:
+    """Return a signal (N,) with samples far off the median of five around them replaced, by that median: what a filter's gate rejects."""
+    smooth = compute_median_of_five(values)
+    off = np.abs(values - smooth)
+    scatter = float(np.median(off[off > 0.0])) if (off > 0.0).any() else 0.0
+    return np.where(off > _SPIKE * scatter, smooth if fill is None else fill, values)
+
+
+def compute_moving_mean(values: NDArray[Any], half: int, *, least: float = 1.0) -> NDArray[Any]:
+    """Return the mean of the known ones among the ``half`` rows on either side of each, and itself, shape (N,).
+
+    NaN where less than the share ``least`` of those rows are known.
+    """
+    known = np.isfinite(values)
+    rows = np.arange(values.size)
+    first, last = np.maximum(rows - half, 0), np.minimum(rows + half + 1, values.size)
+    sums, counts = (np.append(0.0, np.cumsum(each)) for each in (np.where(known, values, 0.0), known))
+    count = counts[last] - counts[first]
+    mean = (sums[last] - sums[first]) / np.maximum(count, 1.0)
+    return np.where(count >= least * (2 * half + 1), mean, np.nan)
 
 
 def bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:

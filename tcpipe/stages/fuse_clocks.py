@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from tcpipe.fusion.checks.clock_offsets import (
-    NEAR_S,
     find_clock_offsets,
     find_middle_ns,
     find_other_clocks,
     shift_sensors,
 )
+from tcpipe.fusion.checks.lags import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion
 from tcpipe.fusion.measurements import DOPPLER, GNSS, Measurements
 from tcpipe.logs.clocks import LOG_CLOCK

@@ -1,107 +1,168 @@
-"""The time offset of one signal against others, by least squares over the lag; and signals on the grid that both need.
+"""The time offset of one signal against another, and the factor between them, by their correlation at every lag.
 
-At every lag the target is fitted by the regressors and a constant; the lag that explains most of the target's variance is the offset,
-refined by a parabola. With one regressor this is the peak of the normalised cross-correlation. Its standard deviation is the larger of two:
-that of least squares, and that of the delete-a-group jackknife over contiguous groups of time (Miller 1974, Biometrika 61), which needs no
-model of the residuals.
+Signals are real, or complex for vectors in the plane, NaN where unknown: masked normalised cross-correlation by FFT (Padfield, CVPR 2010).
+The lag at which one signal explains most of the other's variance is the offset, refined by a parabola.
+
+The fine search, over a second, is by groups of time. Its standard deviation is the larger of two: that of least squares, and that of the
+delete-a-group jackknife (Miller 1974, Biometrika 61), which needs no model of the residuals. The coarse search, over minutes, is by speed
+and turn rate together; its best lag has the largest log-likelihood ratio of both. It is known only if it is far above noise, and if every
+other peak, and no lag, explain the same rows worse in several separate windows and hardly better in any: a straight shows no lag, repeated
+lanes show several.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
-from tcpipe.fusion.signals import (
-    compute_median_of_five,
-    compute_seconds,
-    integrate_signal,
-    is_covered,
-)
-
-GRID_S = 0.02
-"""Spacing of the grid [s]."""
-GRID_NS = round(GRID_S * 1e9)
-MAX_LAG_S = 1.2
-"""Largest lag that is looked for [s]."""
-
-_TARGET_ROWS = 5  # the target is taken at every fifth row: nothing smoothed over 0.1 s is lost
-_GROUPS = 20
-_FEWEST_GROUPS = 8
-_FEWEST_EVENTS = 4
-_MIN_GROUP_S = 2.0
-_ALIKE_ROWS = 2
-"""What is left is alike over this many rows: signals are smoothed over 0.1 to 0.2 s."""
-_CLEARLY = 10.83
-"""99.9 % of chi-squared with one degree of freedom: a rival peak must fit worse by this."""
-_TINY = 1e-12
+from tcpipe.fusion.checks.motions import GRID_S
+from tcpipe.fusion.signals import Plane, compute_moving_mean
 
 Floats = NDArray[np.float64]
+
+MAX_LAG_S = 1.2
+"""Largest lag of the fine search [s]."""
+_STEPS = round(MAX_LAG_S / GRID_S)
+_GROUPS, _MIN_GROUPS, _MIN_GROUP_S, _MIN_INFORMATIVE_GROUPS = 20, 8, 2.0, 4
+"""Most and fewest groups of the jackknife, their least length, and how many of them need values."""
+_INDEPENDENT = 10
+"""Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s, those of the coarse search over 1 s, which is 5 rows."""
+_MIN_CHI_SQUARED = 10.83
+"""By how much a rival peak must fit worse [1]: 99.9 % of χ² with one degree of freedom."""
+_TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """How much later the target's stamps are than the regressors' [s], its standard deviation, and the variance explained (0 to 1)."""
+    """How much later the target's stamps are than the regressor's [s], its standard deviation, the variance explained (0 to 1).
+
+    The target is ``factor`` times the regressor; that of vectors in the plane is complex, its angle turns the regressor into the target.
+    """
 
     offset_s: float
     std_s: float
     explained: float
+    factor: complex = 1.0
 
 
-def make_grid_ns(first_ns: int, last_ns: int) -> NDArray[np.int64]:
-    """Return a grid's stamps [ns] from first to last."""
-    return np.arange(first_ns, last_ns + 1, GRID_NS, dtype=np.int64)
+class Products:
+    """Sums of products of a target and a regressor by group of time and lag."""
+
+    def __init__(self, sums: Plane) -> None:
+        """Take the sums of 1, x, y, |x|², |y|² and conj(x) y, shape (6, G, L), of regressor x and target y where both are known."""
+        self.rows = sums[0].real
+        x, y, xx, yy, xy = sums[1:]
+        count = np.maximum(self.rows, 1.0)
+        self.target = yy.real - np.abs(y) ** 2 / count
+        self.regressor = xx.real - np.abs(x) ** 2 / count
+        self.product = xy - np.conj(x) * y / count
+
+    @property
+    def explained(self) -> Floats:
+        """Share of the target's variance that the regressor explains, shape (G, L); 0 where one of them does not vary."""
+        varies = (self.target > _TINY) & (self.regressor > _TINY)
+        size = np.where(varies, self.target * self.regressor, 1.0)
+        return np.where(varies, np.minimum(np.abs(self.product) ** 2 / size, 1.0 - _TINY), 0.0)
 
 
-def compute_moving_mean(values: Floats, width_s: float) -> Floats:
-    """Return the centred running mean over ``width_s`` of (M, k) values, NaN where the window holds one or leaves the grid."""
-    half = round(width_s / GRID_S / 2)
-    known = np.isfinite(values.sum(1))
-    filled = np.where(known[:, None], values, 0.0)
-    sums = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(filled, axis=0)))
-    counts = np.concatenate(([0], np.cumsum(known)))
-    width = 2 * half + 1
-    mean = np.full_like(values, np.nan)
-    if values.shape[0] >= width:
-        whole = counts[width:] - counts[:-width] == width
-        mean[half : values.shape[0] - half] = np.where(whole[:, None], (sums[width:] - sums[:-width]) / width, np.nan)
-    return mean
+def sum_products(target: NDArray[Any], regressor: NDArray[Any], most: int, groups: int = 1) -> Plane:
+    """Return the sums for `Products` of signals (M,) at lags of up to ``most`` rows, by groups of time of equal length."""
+    length = target.size // groups
+    y = target[: groups * length].reshape(groups, length)
+    padded = np.pad(regressor, most, constant_values=np.nan)
+    x = np.lib.stride_tricks.sliding_window_view(padded, length + 2 * most)[: groups * length : length]
+    size = 1 << (length + 2 * most - 1).bit_length()
+    known = [np.isfinite(each) for each in (x, y)]
+    x, y = (np.where(where, each, 0.0) for where, each in zip(known, (x, y), strict=True))
+    of_x, of_y = (np.fft.fft([where, each, np.abs(each) ** 2], size) for where, each in zip(known, (x, y), strict=True))
+
+    def multiply(k: int, j: int) -> Plane:
+        """Return the sums of the k-th power of y(t), conjugate, and the j-th of x(t - lag)."""
+        return np.fft.ifft(np.conj(of_y[k]) * of_x[j])[:, 2 * most :: -1]
+
+    sums = (
+        multiply(0, 0),
+        multiply(0, 1),
+        multiply(1, 0).conj(),
+        multiply(0, 2),
+        multiply(2, 0),
+        multiply(1, 1).conj(),
+    )
+    return np.stack((np.rint(sums[0].real), *sums[1:]))
 
 
-def find_lag(target: Floats, regressors: Floats) -> Lag | None:
-    """Return how late the target's stamps are against the regressors', or None where that is unknown.
+# Clocks that are nearly the same
 
-    ``target``, shape (M,), and ``regressors``, shape (M, k), are on a grid of `GRID_S`, NaN where unknown. The lag is unknown where few
-    values are, where the best lag is at the end of the search or another is as good, or where a constant explains the target.
+
+def find_lag(target: NDArray[Any], regressor: NDArray[Any]) -> Lag | None:
+    """Return how late the target's stamps are against the regressor's, or None where that is unknown.
+
+    Signals, shape (M,), are on a grid of `GRID_S`. The lag is unknown where few values are, where the best lag is at the end of the search
+    or another is as good, or where a constant explains the target.
     """
-    products = compute_lag_products(target, regressors)
-    return None if products is None else estimate_lag([products])
+    sums = compute_lag_sums(target, regressor)
+    return None if sums is None else estimate_lag([sums])
 
 
-def estimate_lag(windows: Sequence[Floats]) -> Lag | None:
-    """Return the lag of several windows of time together; ``windows`` are of `compute_lag_products`, of the same signals."""
-    products = np.concatenate(windows, axis=1)
-    together = -(-products.shape[1] // (2 * _GROUPS))  # fewer, longer groups
-    products = np.add.reduceat(products, np.arange(0, products.shape[1], together), axis=1)
-    products = products[:, (products[:, :, -2, -2] > 0).all(axis=0)]
-    groups = products.shape[1]
-    if groups < _FEWEST_EVENTS:
+def compute_lag_sums(target: NDArray[Any], regressor: NDArray[Any]) -> Plane | None:
+    """Return what `estimate_lag` needs of a window, shape (6, G, L); parameters are `find_lag`'s. None where the window is too short."""
+    groups = min(_GROUPS, int((target.size - 2 * _STEPS) * GRID_S / _MIN_GROUP_S))
+    return None if groups < _MIN_GROUPS else sum_products(target, regressor, _STEPS, groups)
+
+
+def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
+    """Return the lag of several windows of time together; ``windows`` are of `compute_lag_sums`, of the same signals."""
+    sums = np.concatenate(windows, axis=1)
+    together = -(-sums.shape[1] // (2 * _GROUPS))  # fewer, longer groups
+    sums = np.add.reduceat(sums, np.arange(0, sums.shape[1], together), axis=1)
+    sums = sums[:, (sums[0].real > 0.0).all(axis=1)]
+    groups = sums.shape[1]
+    if groups < _MIN_INFORMATIVE_GROUPS:
         return None
-    whole = products.sum(1)
-    explained = _compute_explained_variance(whole)
-    offset_s = _find_peak(explained)
-    left_out = [_find_peak(_compute_explained_variance(whole - products[:, g])) for g in range(groups)]
-    if not np.isfinite([offset_s, *left_out]).all():
+    total = sums.sum(axis=1, keepdims=True)
+    whole, left_out = Products(total), Products(total - sums)
+    rows, explained = whole.rows[0], whole.explained[0]
+    if rows.min() < 0.5 * rows.max() or rows.max() * GRID_S < _MIN_GROUP_S:
         return None
+    best, independent = int(np.argmax(explained)), float(rows.max()) / _INDEPENDENT
+    offsets_s = [_find_peak_s(each) for each in (explained, *left_out.explained)]
+    if not np.isfinite(offsets_s).all() or _has_rival(explained, best, independent):
+        return None
+    jackknife_s = float(np.sqrt((groups - 1) * np.var(offsets_s[1:])))
+    std_s = max(jackknife_s, _compute_peak_std_s(explained, best, independent))
+    factor = complex(whole.product[0, best] / whole.regressor[0, best])
+    return Lag(offsets_s[0], std_s, float(explained[best]), factor)
+
+
+def find_turn(target: Plane, regressor: Plane, late_s: float) -> tuple[float, float, float] | None:
+    """Return by what angle a vector (M,) is turned against another, its standard deviation [rad], and the coherence (0 to 1)."""
+    sums = compute_lag_sums(target, regressor)
+    if sums is None:
+        return None
+    at = _STEPS + round(late_s / GRID_S)
+    total = sums.sum(axis=1, keepdims=True)
+    whole, left_out = Products(total), Products(total - sums)
+    angle = float(np.angle(whole.product[0, at]))
+    off = np.angle(left_out.product[:, at] * np.exp(-1j * angle))
+    return angle, float(np.sqrt((len(off) - 1) * np.mean(off**2))), float(np.sqrt(whole.explained[0, at]))
+
+
+def _find_peak_s(explained: Floats) -> float:
+    """Return the lag of the maximum [s], by a parabola through its neighbours; NaN at the end of the search and without one."""
     best = int(np.argmax(explained))
-    independent = float(whole[best, -2, -2]) / _ALIKE_ROWS
-    if _has_rival(explained, best, independent):
-        return None
-    jackknife_s = float(np.sqrt((groups - 1) / groups * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
-    return Lag(offset_s, max(jackknife_s, _compute_peak_std_s(explained, best, independent)), float(explained[best]))
+    if best in {0, explained.size - 1}:
+        return float("nan")
+    return (best - explained.size // 2 + _refine_peak(explained, best)) * GRID_S
+
+
+def _refine_peak(values: Floats, best: int) -> float:
+    """Return how many rows the top of the parabola through a maximum and its neighbours is later."""
+    before, at, after = values[best - 1 : best + 2].tolist()
+    return float(0.5 * (after - before) / max(2.0 * at - before - after, _TINY))
 
 
 def _compute_peak_std_s(explained: Floats, best: int, independent: float) -> float:
@@ -112,189 +173,99 @@ def _compute_peak_std_s(explained: Floats, best: int, independent: float) -> flo
 
 
 def _has_rival(explained: Floats, best: int, independent: float) -> bool:
-    """Whether another peak is about as high: a motion that repeats itself shows no lag."""
-    inner = explained[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= explained[:-2]) & (inner >= explained[2:]))
+    """Return whether another peak is about as high: a motion that repeats itself shows no lag."""
+    peaks = _find_peaks(explained)
     others = explained[peaks[np.abs(peaks - best) > 1]]
-    worse = independent * np.log(np.maximum(1.0 - others, _TINY) / max(1.0 - explained[best], _TINY))
-    return bool((worse < _CLEARLY).any())
+    worse = independent * np.log((1.0 - others) / (1.0 - explained[best]))
+    return bool((worse < _MIN_CHI_SQUARED).any())
 
 
-def compute_lag_products(target: Floats, regressors: Floats) -> Floats | None:
-    """Return what `estimate_lag` needs of a window: sums of products of (regressors, 1, target) by lag and group of time.
+def _find_peaks(values: Floats) -> NDArray[np.int64]:
+    """Return the rows of local maxima."""
+    inner = values[1:-1]
+    return 1 + np.flatnonzero((inner >= values[:-2]) & (inner >= values[2:]))
 
-    Shape (L, G, k + 2, k + 2); parameters are `find_lag`'s. None where the window is too short.
+
+# Clocks that are seconds to minutes apart
+
+COARSE_S = 0.2
+"""Spacing of the rows of the coarse search [s]."""
+NEAR_S = MAX_LAG_S - COARSE_S
+"""Largest lag that the fine search surely finds [s]."""
+_MOST = 1500
+"""Largest lag that is searched [rows], 5 min."""
+_SMOOTH, _SLOW = 2, 75
+"""Half the rows over which signals are averaged, and about whose mean they are compared: 1 s and 30 s in all."""
+_MANOEUVRES = (0.15, 0.1)
+"""Least size of a signal that varies [m/s], [rad/s]."""
+_MIN_ROWS = 450
+"""Rows of the least overlap, 90 s."""
+_MIN_SCORE, _MIN_EXPLAINED = 18.0, 0.16
+"""Least log-likelihood ratio of the best lag, 6 σ: noise reaches 4 σ in 3,000 lags; and least share explained of one signal."""
+_WINDOW, _MIN_WINDOWS = 50, 4
+"""Rows in which two lags are compared, 10 s, and windows that have to prefer the best lag."""
+_APART, _PEAKS = 15, 25
+"""Rows between separate peaks, 3 s, and most peaks that are compared with the best."""
+
+
+def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
+    """Return speed and turn rate for `find_coarse_lag`, shape (2, N): rows in whole windows, averaged, less the mean around each.
+
+    NaN throughout if a signal does not vary.
     """
-    steps = round(MAX_LAG_S / GRID_S)
-    rows = np.arange(steps, target.size - steps, _TARGET_ROWS)
-    groups = min(_GROUPS, int(rows.size * _TARGET_ROWS * GRID_S / _MIN_GROUP_S))
-    if groups < _FEWEST_GROUPS:
+    width, prepared = round(COARSE_S / GRID_S), []
+    for values, least in zip((speed_mps, turn_radps), _MANOEUVRES, strict=True):
+        rows = values[: values.size // (width * _WINDOW) * width * _WINDOW].reshape(-1, width).mean(1)
+        smooth = np.where(np.isfinite(rows), compute_moving_mean(rows, _SMOOTH, least=0.0), np.nan)
+        quick = smooth - compute_moving_mean(smooth, _SLOW, least=0.0)
+        varies = (np.abs(quick) > least).sum() > 2 * _SMOOTH + 1
+        prepared.append(quick if varies else np.full(quick.size, np.nan))
+    return np.stack(prepared)
+
+
+def find_coarse_lag(late: Floats, against: Floats) -> float | None:
+    """Return how much later the stamps of one sensor are than another's [s], None where this is unknown; signals of shape (2, N)."""
+    if late.shape[1] < _MIN_ROWS:
         return None
-    grouped = rows[: rows.size // groups * groups].reshape(groups, -1)
-    known = np.isfinite(target[grouped])
-    # Only rows in which the target is known; a group that has fewer than the fullest goes on with unknown ones, which count 0.
-    fullest = int(known.sum(1).max())
-    samples = np.take_along_axis(grouped, np.argsort(~known, axis=1, kind="stable")[:, :fullest], axis=1)
-    columns = np.ones((*samples.shape, regressors.shape[1] + 2))
-    found = np.empty((2 * steps + 1, groups, columns.shape[2], columns.shape[2]))
-    for i, lag in enumerate(range(-steps, steps + 1)):
-        # Stamps that are late by the lag: what happened `lag` rows earlier.
-        columns[...] = 1.0
-        columns[:, :, :-2], columns[:, :, -1] = regressors[samples - lag], target[samples]
-        columns[~np.isfinite(columns).all(2)] = 0.0
-        found[i] = np.matmul(columns.transpose(0, 2, 1), columns)
-    return found
-
-
-def _compute_explained_variance(products: Floats) -> Floats:
-    """Return the share of the target's variance that the regressors explain at each lag, shape (L,)."""
-    k = products.shape[1] - 2
-    counts = products[:, k, k]
-    if (counts < 0.5 * counts.max()).any() or counts.max() < 10 * (k + 2):
-        return np.full(counts.size, np.nan)
-    # Everything about its mean: the constant is fitted.
-    about_mean = products - products[:, :, k : k + 1] * products[:, k : k + 1, :] / counts[:, None, None]
-    inner, cross, total = about_mean[:, :k, :k], about_mean[:, :k, -1], about_mean[:, -1, -1]
-    scale = np.sqrt(np.maximum(np.diagonal(inner, axis1=1, axis2=2), _TINY))
-    inner = inner / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(k)
-    cross = cross / scale
-    fitted = np.linalg.solve(inner, cross[:, :, None])[:, :, 0]
-    return np.where(total > _TINY, np.sum(fitted * cross, axis=1) / np.maximum(total, _TINY), np.nan)
-
-
-def _find_peak(explained: Floats) -> float:
-    """Return the lag of the maximum [s], by a parabola through its neighbours; NaN at the end of the search and without one."""
-    if not np.isfinite(explained).all():
-        return float("nan")
-    best = int(np.argmax(explained))
-    if best in {0, explained.size - 1}:
-        return float("nan")
-    before, at, after = explained[best - 1 : best + 2]
-    curvature = before - 2 * at + after
-    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return float((best - explained.size // 2 + shift) * GRID_S)
-
-
-Ints = NDArray[np.int64]
-
-_LONGEST_NS, _STEP_NS, _PLACES_NS = 1800 * 10**9, 300 * 10**9, 10 * 10**9
-
-
-def iterate_windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
-    """Yield grids [ns] of about ``length_ns`` that follow each other over the time of a set, wherever it has measurements."""
-    span = find_span_ns(m)
-    if span is None:
-        return
-    count = max(1, round((span[1] - span[0]) / length_ns))
-    edges = np.linspace(*span, count + 1).astype(np.int64)
-    stamps = [sensor.stamp_ns for sensor in m.sensors().values()]
-    heard = np.unique(np.concatenate([np.searchsorted(edges, stamp, side="right") - 1 for stamp in stamps]))
-    for window in np.unique(np.clip(np.concatenate((heard - 1, heard, heard + 1)), 0, count - 1)):
-        yield make_grid_ns(int(edges[window]), int(edges[window + 1]))
-
-
-def find_span_ns(m: Measurements) -> tuple[int, int] | None:
-    """Return first and last stamp of a set's measurements; None where no sensor has two."""
-    stamps = [sensor.stamp_ns for sensor in m.sensors().values() if sensor.stamp_ns.size > 1]
-    return (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps)) if stamps else None
-
-
-def find_liveliest_window_ns(m: Measurements) -> Ints | None:
-    """Return the grid [ns] of the half hour in which the robot drives most; None without measurements."""
-    span = find_span_ns(m)
-    if span is None:
+    pairs = [Products(sum_products(y, x, _MOST)) for y, x in zip(late, against, strict=True)]
+    # A short overlap, and one without motion, show nothing.
+    sizes = np.array([[pair.target[0], pair.regressor[0]] for pair in pairs])
+    varies = (sizes > 0.2 * np.median(sizes, axis=2, keepdims=True) + 1e-9).all(1)
+    rows = np.array([pair.rows[0] for pair in pairs])
+    known = varies & (rows >= _MIN_ROWS) & np.array([pair.product[0].real > 0.0 for pair in pairs])
+    explained = np.where(known, [pair.explained[0] for pair in pairs], 0.0)
+    log_ratio = -0.5 * np.log(1.0 - explained)
+    score, height = (rows * log_ratio).sum(0) / _INDEPENDENT, log_ratio.sum(0)
+    best = int(np.argmax(score))
+    if best in {0, 2 * _MOST} or score[best] < _MIN_SCORE or explained[:, best].max() < _MIN_EXPLAINED:
         return None
-    first_ns, last_ns = span
-    begin = np.arange(first_ns, max(last_ns - _LONGEST_NS, first_ns) + 1, _STEP_NS, dtype=np.int64)
-    driven_m = np.diff(compute_driven_m(m, np.stack((begin, begin + _LONGEST_NS))), axis=0)
-    best = int(begin[np.argmax(driven_m)])
-    return make_grid_ns(best, min(last_ns, best + _LONGEST_NS))
+    if abs(best - _MOST) * COARSE_S > NEAR_S:
+        peaks = _find_peaks(height)
+        peaks = peaks[(np.abs(peaks - best) > _APART) & (height[peaks] > 0.0)]
+        peaks = np.append(peaks[np.argsort(-height[peaks], kind="stable")][:_PEAKS], _MOST)
+        if any(_is_rival(late, against, best - _MOST, int(peak) - _MOST) for peak in peaks if height[peak] > 0.0):
+            return None
+    return (best - _MOST + _refine_peak(score, best)) * COARSE_S
 
 
-def compute_driven_m(m: Measurements, at_ns: Ints) -> Floats:
-    """Return the distance driven before each time [m], by the first sensor that measures it."""
-    source = m.first_odometry
-    if source is not None:
-        stamp_ns, speed_mps = source.stamp_ns, np.nan_to_num(np.abs(source.velocity_mps[:, 0]))
-        steps_m = speed_mps[1:] * np.diff(compute_seconds(stamp_ns, int(stamp_ns[0])))
-    elif m.gnss is not None:
-        stamp_ns = np.arange(m.gnss.stamp_ns[0], m.gnss.stamp_ns[-1] + 1, _PLACES_NS, dtype=np.int64)
-        places = [np.interp(stamp_ns, m.gnss.stamp_ns, axis) for axis in m.gnss.position_enu_m[:, :2].T]
-        steps_m = np.hypot(*np.diff(places, axis=1))
-    else:
-        return np.zeros(at_ns.shape)
-    driven_m: Floats = np.interp(at_ns, stamp_ns, np.concatenate(([0.0], np.cumsum(steps_m))))
-    return driven_m
+def _is_rival(late: Floats, against: Floats, best: int, other: int) -> bool:
+    """Return whether a lag [rows] explains the same rows about as well as the best: few windows prefer the best, or some the other."""
+    residuals, of_other = (_compute_residuals(late, against, lag) for lag in (best, other))
+    noise = np.nansum(residuals, axis=1) / np.maximum(np.isfinite(residuals).sum(1), 1)
+    worse = ((of_other - residuals) / np.maximum(noise, 1e-12)[:, None]).reshape(2, -1, _WINDOW)
+    clear = 0.5 * np.maximum(np.isfinite(worse).sum((0, 2)), _WINDOW)
+    total = np.nansum(worse, axis=(0, 2))
+    return bool((total > clear).sum() - 3 * (total < -clear).sum() < _MIN_WINDOWS)
 
 
-FIXES_S = 0.5
-"""A velocity is made of fixes averaged over, and taken apart by, this long [s]."""
-
-_MAX_GAP_NS = 500_000_000
-_STRAY_M = 0.3
-_STRAY = 6.0
-_COURSE_MPS = 0.3
-
-
-def resample_signal(stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[np.int64]) -> Floats:
-    """Return the means of the piecewise-linear signal (N, k) over each grid cell, shape (M, k); NaN outside and in gaps.
-
-    A gap is longer than half a second and than three periods.
-    """
-    edges_s: Floats = (np.arange(at_ns.size + 1, dtype=np.float64) - 0.5) * GRID_S
-    means = np.diff(integrate_signal(compute_seconds(stamp_ns, int(at_ns[0])), values, edges_s), axis=0) / GRID_S
-    half = GRID_NS // 2
-    means[~is_covered(stamp_ns, at_ns - half, at_ns + half, least_ns=_MAX_GAP_NS)] = np.nan
-    return means
-
-
-def resample_twist(source: BodyVelocities, at_ns: NDArray[np.int64]) -> Floats:
-    """Return forward velocity and yaw rate, shape (M, 2), single wild samples bridged; the yaw rate 0 where the source gives none."""
-    forward, yaw_rate = source.velocity_mps[:, 0], source.yaw_rate_radps
-    if not np.isfinite(yaw_rate).any():
-        yaw_rate = np.zeros_like(forward)
-    known = np.isfinite(forward + yaw_rate)
-    for values in (forward, yaw_rate):
-        off = np.abs(values - compute_median_of_five(values))
-        known &= ~(off > _STRAY * max(float(np.nanpercentile(off, 90)), 1e-9))
-    if known.sum() < 2:
-        return np.full((at_ns.size, 2), np.nan)
-    return resample_signal(source.stamp_ns[known], np.column_stack((forward, yaw_rate))[known], at_ns)
-
-
-def resample_fixes(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
-    """Return the antenna's places [m], east and i times north, averaged over half a second, shape (M,); wild fixes are bridged."""
-    place = gnss.position_enu_m[:, :2]
-    wild = np.zeros(place.shape[0], np.bool_)
-    for axis in place.T:
-        off = np.abs(axis - compute_median_of_five(axis))
-        wild |= off > _STRAY_M + _STRAY * float(np.median(off))
-    if (~wild).sum() < 2:
-        return np.full(at_ns.size, np.nan + 0j)
-    smooth = compute_moving_mean(resample_signal(gnss.stamp_ns[~wild], place[~wild], at_ns), FIXES_S)
-    return smooth[:, 0] + 1j * smooth[:, 1]
-
-
-def compute_fix_velocity(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
-    """Return the antenna's velocity [m/s], east and i times north, shape (M,); wild fixes are bridged, NaN in gaps."""
-    velocity = np.full(at_ns.size, np.nan + 0j)
-    half = round(FIXES_S / 2 / GRID_S)
-    if at_ns.size > 2 * half:
-        place = resample_fixes(gnss, at_ns)
-        velocity[half:-half] = (place[2 * half :] - place[: -2 * half]) / (2 * half * GRID_S)
-    return velocity
-
-
-def compute_course_rate(velocity_mps: NDArray[np.complex128]) -> Floats:
-    """Return how fast the direction of travel turns [rad/s], shape (M,), NaN below 0.3 m/s.
-
-    An antenna ahead of the turning point by l leads the body's course by l / v: good for a sign, not for a clock.
-    """
-    half = round(FIXES_S / 2 / GRID_S)
-    rate = np.full(velocity_mps.size, np.nan)
-    if velocity_mps.size <= 2 * half:
-        return rate
-    quick = np.abs(velocity_mps) > _COURSE_MPS
-    turned = np.angle(velocity_mps[2 * half :] * np.conj(velocity_mps[: -2 * half]))
-    rate[half:-half] = np.where(quick[2 * half :] & quick[: -2 * half], turned / (2 * half * GRID_S), np.nan)
-    return rate
+def _compute_residuals(late: Floats, against: Floats, lag: int) -> Floats:
+    """Return the squares of what the other signals, ``lag`` rows later, leave of the late ones, shape (2, N); NaN where unknown."""
+    moved, size = np.full_like(late, np.nan), late.shape[1]
+    moved[:, max(lag, 0) : max(size + lag, 0)] = against[:, max(-lag, 0) : max(size - lag, 0)]
+    known = np.isfinite(moved) & np.isfinite(late)
+    counts = np.maximum(known.sum(1, keepdims=True), 1)
+    x, y = (
+        np.where(known, each - np.sum(each, axis=1, where=known, keepdims=True) / counts, 0.0) for each in (moved, late)
+    )
+    slope = np.sum(x * y, axis=1, keepdims=True) / np.maximum(np.sum(x * x, axis=1, keepdims=True), 1e-12)
+    return np.where(known, (y - np.maximum(slope, 0.0) * x) ** 2, np.nan)

@@ -10,7 +10,7 @@ as a confirmation. A lone odometry whose path is that of the fixes, but far long
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Literal
@@ -18,26 +18,20 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.lags import (
+from tcpipe.fusion.checks.lags import Lag, find_lag, find_turn
+from tcpipe.fusion.checks.motions import (
     GRID_S,
-    Floats,
+    average,
+    compute_acceleration,
     compute_course_rate,
     compute_fix_velocity,
-    compute_moving_mean,
+    dead_reckon,
     find_liveliest_window_ns,
     resample_fixes,
-    resample_signal,
+    resample_imu,
     resample_twist,
 )
-from tcpipe.fusion.checks.mounting import (
-    YawAxis,
-    compute_levelling_rotation,
-    find_forward_yaw_rad,
-    find_nearest_mounting,
-    find_up_axis,
-    find_yaw_axis,
-    rotate_about_z,
-)
+from tcpipe.fusion.checks.mounting import compute_levelling_rotation, find_nearest_mounting, find_up_axis
 from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
@@ -45,15 +39,20 @@ from tcpipe.fusion.measurements import (
     PAUSE_NS,
     VISUAL,
     WHEELS,
-    InertialMeasurements,
     Measurements,
     Positions,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, integrate_signal, is_covered
+from tcpipe.fusion.signals import (
+    Plane,
+    compute_median_period_ns,
+    compute_seconds,
+    hold_last,
+    integrate_signal,
+    is_covered,
+)
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 
-Path = NDArray[np.complex128]
-"""Places on the grid [m], east and i times north, NaN where unknown, shape (M,)."""
-
+Floats = NDArray[np.float64]
 COMMAND = "command"
 """The command among the sensors; it is never excluded."""
 FORWARD = np.diag([-1.0, -1.0, 1.0])
@@ -122,42 +121,57 @@ def check_sensors(
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     wanted = None if command is None else hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
     paths = {} if m.gnss is None else {GNSS: resample_fixes(m.gnss, at_ns)}
-    paths |= {role: _dead_reckon(twist) for role, twist in twists.items()}
+    paths |= {role: dead_reckon(twist) for role, twist in twists.items()}
     noise_m2 = _compute_noise_m2(m.gnss)
+    moving = {role for role, path in paths.items() if compare_paths(path, path, _SHORT_S, noise_m2)}
+    for role, quantity in _list_constants(m):
+        if moving - {role}:
+            found.setdefault(role, _make_frozen_exclusion(role, quantity, m.sensors()[role].stamp_ns.size))
     # 1. Turns and accelerations show units and mounting of the IMU, and signs of yaw rates.
-    axes: dict[str, YawAxis] = {}
-    looks: dict[str, float] = {}
-    if m.imu is not None:
-        drives = any(compare_paths(path, path, _SHORT_S, noise_m2) for path in paths.values())
-        values = {"acceleration": m.imu.specific_force_mps2, "angular_velocity": m.imu.angular_velocity_radps}
-        if drives and (frozen := [quantity for quantity, each in values.items() if _is_constant(each)]):
-            found[IMU] = _make_frozen_exclusion(IMU, frozen[0], len(m.imu.stamp_ns))
-        axes, looks = _check_imu(found, m.imu, m.gnss, twists, at_ns, felt=felt, is_stated=stated.get(IMU, False))
-    # 2. Paths show what is frozen, in another unit, or of another drive; yaw rates are the gyroscope's where it confirms them.
-    if m.imu is not None and IMU not in found:
-        rate = resample_signal(m.imu.stamp_ns, m.imu.angular_velocity_radps, at_ns)[:, 2]
-        for role in (role for role in twists if role in axes and axes[role].axis[2] > _SAME_WAY):
-            twists[role][:, 1] = np.where(np.isfinite(rate), rate, twists[role][:, 1])
-            paths[role] = _dead_reckon(twists[role])
+    trust = {COMMAND: 1.0, IMU: float(stated.get(IMU, False)), WHEELS: 0.5, VISUAL: 0.25}
+    turn, turns, yaws_rad = _check_imu(found, m, twists, at_ns, felt=felt, trust=trust)
+    # 2. Paths show another unit or another drive; yaw rates are the gyroscope's where it confirms them.
+    for role in twists if IMU not in found else ():
+        if role in turns and turns[role].factor.real > 0.0:
+            twists[role][:, 1] = np.where(np.isfinite(turn), turn, twists[role][:, 1])
+            paths[role] = dead_reckon(twists[role])
     if wanted is not None and twists:
-        paths[COMMAND] = _dead_reckon(np.column_stack((wanted, next(iter(twists.values()))[:, 1])))
-    scales = _check_distances(found, m, paths, noise_m2, axes)
-    _check_shapes(found, paths, noise_m2, axes)
+        paths[COMMAND] = dead_reckon(np.column_stack((wanted, next(iter(twists.values()))[:, 1])))
+    scales = _check_distances(found, m, paths, noise_m2, turns)
+    _check_shapes(found, paths, noise_m2, turns)
     # 3. Directions of travel show what looks backwards.
-    forward = {role: twist[:, 0] for role, twist in twists.items()}
-    _check_directions(found, forward, wanted, looks, is_stated=stated.get(IMU, False))
+    forward = {role: twist[:, 0] for role, twist in twists.items()} | ({} if wanted is None else {COMMAND: wanted})
+    _check_directions(found, forward, yaws_rad, trust)
     return found, scales
 
 
-# Of two that differ
+def _list_constants(m: Measurements) -> Iterator[tuple[str, str]]:
+    """Yield the sensors of which a quantity is the same to the last digit throughout, and the quantity."""
+    values = [(role, "velocity", source.velocity_mps) for role, source in m.odometries().items()]
+    values += [] if m.gnss is None else [(GNSS, "position", m.gnss.position_enu_m)]
+    if m.imu is not None:
+        values += [
+            (IMU, "acceleration", m.imu.specific_force_mps2),
+            (IMU, "angular_velocity", m.imu.angular_velocity_radps),
+        ]
+    for role, quantity, each in values:
+        if len(each) >= _MIN_VALUES and np.array_equal(each, np.broadcast_to(each[0], each.shape), equal_nan=True):
+            yield role, quantity
+
+
+def _make_frozen_exclusion(role: str, quantity: str, messages: int) -> SensorExclusion:
+    return SensorExclusion(role, "frozen", {"quantity": quantity}, {"message_count": messages})
 
 
 def _find_outvoted(
-    apart: Iterable[tuple[str, str]], count_votes: Callable[[str], float]
+    same: Mapping[tuple[str, str], bool], trust: Mapping[str, float]
 ) -> Iterator[tuple[str, str, float]]:
     """Yield of each pair that differs the sensor that fewer confirm, the other, and by how many; both where it is a tie."""
-    for a, b in apart:
-        lead = count_votes(b) - count_votes(a)
+    for a, b in (pair for pair, is_same in same.items() if not is_same):
+        lead = sum(
+            sign * (trust.get(name, 0.0) + sum(is_same and name in pair for pair, is_same in same.items()))
+            for name, sign in ((b, 1), (a, -1))
+        )
         if lead >= 0:
             yield a, b, lead
         if lead <= 0:
@@ -175,31 +189,29 @@ def make_fix_exclusion(
 
 # Paths
 
-_SHORT_S, _LONG_S = 10.0, 20.0  # windows of distances and of shapes
-_LENGTHENED = (1, 3, 9)  # windows, where the noise of fixes hides what is driven in shorter ones
-_FAR_M = 1.0
-_FEWEST_WINDOWS = 3
-_FACTOR = 2.0  # between distances that agree
-_STILL = 20.0  # ratio of distances from which on the shorter one is no motion
-_UNLIKE = 0.3  # share of the size of a path that slip may bend, and of windows that may be unlike
-_BEND_M = 0.3  # a path that bends less is its own mirror image
-_CLEARLY = 3.0  # ratio of misfits that decides between a path and its mirror image
-_MOST = 5.0  # largest scale of an odometry that is taken out
+_SHORT_S, _LONG_S = 10.0, 20.0
+"""Windows of distances and of shapes [s]."""
+_LENGTHENED = (1, 3, 9)
+"""Factors of the windows' length, where the noise of fixes hides what is driven in shorter ones."""
+_FAR_M, _BEND_M = 1.0, 0.3
+"""Size of a path that moves, and size by which a path bends that differs from its mirror image [m]."""
+_MIN_MOVING_WINDOWS = 3
+"""Windows that show how far or along which path a robot drives."""
+_MAX_RATIO, _STILL_RATIO, _MAX_SCALE = 2.0, 20.0, 5.0
+"""Ratios of distances: that agree; from which on the shorter one is no motion; of an odometry whose scale is taken out."""
+_MAX_MISFIT = 0.3
+"""Share of the size of a path that slip may bend, and of windows that may be unlike."""
+_MIRROR_RATIO = 3.0
+"""Ratio of misfits that decides between a path and its mirror image."""
 _UNITS = {"km/h": (3.2, 4.0), "radians": (1 / 75, 1 / 30)}
+"""Ratios of distances by which a unit is named."""
 _NODE = round(0.5 / GRID_S)
+"""Rows of the grid between the places that are compared."""
 
 
 def _compute_noise_m2(gnss: Positions | None) -> float:
     """Return the mean square that the noise of fixes adds to a path [m²]."""
     return 0.0 if gnss is None else 2.0 * float(np.median(gnss.variance_m2[:, :2]))
-
-
-def _dead_reckon(twist: Floats) -> Path:
-    """Return the path that a twist (M, 2) adds up to."""
-    known = np.isfinite(twist.sum(1))
-    forward, yaw_rate = np.where(known[:, None], twist, 0.0).T
-    place = np.cumsum(forward * np.exp(1j * np.cumsum(yaw_rate) * GRID_S)) * GRID_S
-    return np.where(known, place, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,8 +220,8 @@ class Pair:
 
     a_m2: Floats
     b_m2: Floats
-    product: Path
-    mirrored: Path
+    product: Plane
+    mirrored: Plane
 
     @property
     def ratio(self) -> float:
@@ -225,88 +237,75 @@ class Pair:
         """Return how many times as far as a b goes, whatever the noise of a."""
         return float(np.median(self.b_m2 / np.maximum(np.abs(self.product), 1e-9)))
 
-    def has_same_shape(self, noise_m2: float) -> bool:
-        """Return whether the paths have the same shape in most windows."""
-        return bool(np.mean(self.compute_misfits_m2()[0] < noise_m2 + _UNLIKE**2 * self.a_m2) > 1.0 - _UNLIKE)
+    def find_shape(self, noise_m2: float) -> Literal["alike", "mirrored", "unlike"] | None:
+        """Return how path b lies to path a, which has noise; None where it bends too little.
+
+        Unlike is what fits neither way, by more than the noise, what slip bends, and a metre.
+        """
+        misfits = np.array(self.compute_misfits_m2())
+        bound = _FAR_M**2 + 18.0 * noise_m2 + _MAX_MISFIT**2 * self.a_m2
+        if (np.mean(misfits > bound, axis=1) > _MAX_MISFIT).all():
+            return "unlike"
+        plain, mirrored = misfits.mean(1)
+        if max(plain, mirrored) < max(_BEND_M**2 + 18.0 * noise_m2, _MIRROR_RATIO * min(plain, mirrored)):
+            return None
+        return "alike" if plain < mirrored else "mirrored"
 
 
-def compare_paths(a: Path, b: Path, shortest_s: float, noise_m2: float) -> Pair | None:
+def compare_paths(a: Plane, b: Plane, shortest_s: float, noise_m2: float) -> Pair | None:
     """Return two paths in windows in which one goes far, as short as the noise of fixes allows; None where there are hardly any."""
-    a, b = a[::_NODE], b[::_NODE]
+    both = np.stack((a, b))[:, ::_NODE]
     for times in _LENGTHENED:
         size = round(times * shortest_s / GRID_S / _NODE)
-        if a.size < size:
+        if both.shape[1] < size:
             return None
-        rows = np.lib.stride_tricks.sliding_window_view(np.stack((a, b)), size, axis=1)[:, :: max(size // 2, 1)]
+        rows = np.lib.stride_tricks.sliding_window_view(both, size, axis=1)[:, :: max(size // 2, 1)]
         rows = rows[:, np.isfinite(rows.sum((0, 2)))]
         a_rows, b_rows = rows - rows.mean(2, keepdims=True)
         a_m2, b_m2 = (np.mean(np.abs(each) ** 2, axis=1) for each in (a_rows, b_rows))
         far = np.maximum(a_m2, b_m2) > _FAR_M**2 + 2.0 * noise_m2
-        if far.sum() >= _FEWEST_WINDOWS:
-            product = np.mean(b_rows * np.conj(a_rows), axis=1), np.mean(b_rows * a_rows, axis=1)
-            return Pair(a_m2[far], b_m2[far], product[0][far], product[1][far])
+        if far.sum() >= _MIN_MOVING_WINDOWS:
+            product, mirrored = (np.mean(b_rows * each, axis=1)[far] for each in (np.conj(a_rows), a_rows))
+            return Pair(a_m2[far], b_m2[far], product, mirrored)
     return None
 
 
 def _check_distances(
-    found: Exclusions, m: Measurements, paths: Mapping[str, Path], noise_m2: float, turning: Collection[str]
+    found: Exclusions, m: Measurements, paths: Mapping[str, Plane], noise_m2: float, turning: Collection[str]
 ) -> dict[str, float]:
-    """Exclude what is frozen, or goes more than twice as far as the rest; return the scale of a lone odometry where that is its error.
+    """Exclude what goes more than twice as far as the rest; return the scale of a lone odometry where that is its error.
 
     The gyroscope confirms the yaw rate of ``turning`` sensors.
     """
     pairs = {
         (a, b): pair
-        for a, b in combinations(paths, 2)
+        for a, b in combinations((role for role in paths if role not in found), 2)
         if (pair := compare_paths(paths[a], paths[b], _SHORT_S, noise_m2))
     }
-    values = {role: source.velocity_mps for role, source in m.odometries().items()}
-    values |= {} if m.gnss is None else {GNSS: m.gnss.position_enu_m}
-    for role, of_role in values.items():
-        if _is_constant(of_role) and any(role in names and _has_unequal_lengths(pair) for names, pair in pairs.items()):
-            found[role] = _make_frozen_exclusion(role, "velocity" if role != GNSS else "position", len(of_role))
-    ratios = {names: pair.ratio for names, pair in pairs.items() if not found.keys() & set(names)}
-    agreeing = [names for names, ratio in ratios.items() if 1 / _FACTOR <= ratio <= _FACTOR]
+    same = {names: 1 / _MAX_RATIO <= pair.ratio <= _MAX_RATIO for names, pair in pairs.items()}
     scales = {}
-    for names, ratio in ratios.items():
-        if names in agreeing or COMMAND in names:  # a robot may be slower than it is told
-            continue
+    for names in [names for names, is_same in same.items() if not is_same and COMMAND not in names]:
+        # A robot may be slower than it is told.
+        ratio, of_pair = pairs[names].ratio, {names: False}
+        trust: dict[str, float] = {}
         fast = names[1] if ratio > 1.0 else names[0]
-        is_still = not 1 / _STILL < ratio < _STILL
-        # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
-        votes = {
-            name: sum(name in pair and not (is_still and name == fast and COMMAND in pair) for pair in agreeing)
-            for name in names
-        }
-        votes[fast] += is_still and fast in turning
-        if is_still and fast == WHEELS and not votes[fast]:
-            continue  # the wheels turn, the robot stands: stuck
-        if GNSS in names and pairs[names].has_same_shape(noise_m2) and 1 / _MOST < ratio < _MOST:
-            odometry = names[1]
-            if votes[odometry] <= votes[GNSS] and len(m.odometries()) == 1:
-                scales[odometry] = pairs[names].find_scale()
-                continue
-        for role, other, lead in _find_outvoted([names], votes.__getitem__):
+        of_pair |= {each: is_same for each, is_same in same.items() if is_same}
+        if not 1 / _STILL_RATIO < ratio < _STILL_RATIO:
+            # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
+            of_pair = {each: is_same for each, is_same in of_pair.items() if not {fast, COMMAND} <= {*each}}
+            trust = {fast: float(fast in turning)}
+            if fast == WHEELS and not trust[fast] and not any(fast in each for each in of_pair if each != names):
+                continue  # the wheels turn, the robot stands: stuck
+        losers = [*_find_outvoted(of_pair, trust)]
+        is_alike = GNSS in names and pairs[names].find_shape(noise_m2) in {"alike", None}
+        is_alone = len(m.odometries()) == 1 and names[1] in {role for role, _, _ in losers}
+        if is_alike and is_alone and 1 / _MAX_SCALE < ratio < _MAX_SCALE:
+            scales[names[1]] = pairs[names].find_scale()
+            continue
+        for role, other, lead in losers:
             times = ratio if role == names[1] else 1 / ratio
             found.setdefault(role, _make_distance_exclusion(role, other, times, is_tie=lead == 0))
     return scales
-
-
-def _is_constant(values: Floats) -> bool:
-    """Return whether all rows of (N, k) are the same to the last digit, and enough of them."""
-    return len(values) >= _FEWEST_VALUES and np.array_equal(
-        values, np.broadcast_to(values[0], values.shape), equal_nan=True
-    )
-
-
-def _has_unequal_lengths(pair: Pair) -> bool:
-    """Return whether one path is clearly longer than the other in some windows."""
-    sizes = np.sqrt((pair.a_m2, pair.b_m2))
-    return bool((np.abs(np.diff(sizes, axis=0)) > 0.5 * sizes.max(0)).sum() > 1)
-
-
-def _make_frozen_exclusion(role: str, quantity: str, messages: int) -> SensorExclusion:
-    return SensorExclusion(role, "frozen", {"quantity": quantity}, {"message_count": messages})
 
 
 def _make_distance_exclusion(role: str, other: str, ratio: float, *, is_tie: bool) -> SensorExclusion:
@@ -318,15 +317,16 @@ def _make_distance_exclusion(role: str, other: str, ratio: float, *, is_tie: boo
     return SensorExclusion(role, "distance-contradicted", names, {"distance_ratio": ratio})
 
 
-def _check_shapes(found: Exclusions, paths: Mapping[str, Path], noise_m2: float, turning: Collection[str]) -> None:
+def _check_shapes(found: Exclusions, paths: Mapping[str, Plane], noise_m2: float, turning: Collection[str]) -> None:
     """Exclude fixes whose path is not that of the odometries; one odometry that no gyroscope confirms is as doubtful as they are."""
     if GNSS not in paths or GNSS in found:
         return
-    shapes = {
-        role: _find_shape(compare_paths(paths[GNSS], path, _LONG_S, noise_m2), noise_m2)
+    pairs = {
+        role: compare_paths(paths[GNSS], path, _LONG_S, noise_m2)
         for role, path in paths.items()
         if role not in {GNSS, COMMAND, *found}
     }
+    shapes = {role: pair.find_shape(noise_m2) for role, pair in pairs.items() if pair is not None}
     against = [role for role, shape in shapes.items() if shape in {"mirrored", "unlike"}]
     if not against or "alike" in shapes.values():
         return
@@ -342,34 +342,22 @@ def _check_shapes(found: Exclusions, paths: Mapping[str, Path], noise_m2: float,
         found[against[0]] = SensorExclusion(against[0], "yaw-rate-sign", names, turned_by=YAW)
 
 
-def _find_shape(pair: Pair | None, noise_m2: float) -> Literal["alike", "mirrored", "unlike"] | None:
-    """Return how the path of fixes lies to an odometry's; None where it bends too little.
-
-    Unlike is what fits neither way, by more than the fixes' noise, what slip bends, and a metre.
-    """
-    if pair is None:
-        return None
-    misfits = np.array(pair.compute_misfits_m2())
-    bound = _FAR_M**2 + 18.0 * noise_m2 + _UNLIKE**2 * pair.a_m2
-    if (np.mean(misfits > bound, axis=1) > _UNLIKE).all():
-        return "unlike"
-    plain, mirrored = misfits.mean(1)
-    if max(plain, mirrored) < max(_BEND_M**2 + 18.0 * noise_m2, _CLEARLY * min(plain, mirrored)):
-        return None
-    return "alike" if plain < mirrored else "mirrored"
-
-
 # The IMU
 
 _TURN_SMOOTH_S = 0.1
-_SLOWEST_S = 0.11  # 10 Hz, with the jitter of its driver
-_FEWEST_VALUES = 20
+"""Time over which yaw rates are averaged [s]."""
+_SLOWEST_S = 0.11
+"""Longest period of an IMU that shows the motion between its samples [s]: 10 Hz, with the jitter of its driver."""
+_MIN_VALUES = 20
+"""Values that show that a sensor is frozen."""
 _IN_G, _IN_MPS2 = (0.8, 1.25), (8.0, 12.0)
-_IN_DEGREES = 1.0 / 15.0  # yaw rate [rad/s] by the gyroscope's rate; in radians 0.5 to 2
-_NO_ROBOT_TURNS_RADPS = 15.0
-_TILTED_RAD = np.radians(30.0)  # slopes average out; the steepest that is driven is 22.5 degrees
-_ASIDE_RAD, _BACKWARDS_RAD = np.radians(60.0), np.radians(120.0)
-_SAME_WAY = 0.5
+"""Median size of a specific force in g and in m/s²."""
+_IN_DEGREES, _MAX_YAW_RATE_RADPS = 1.0 / 15.0, 15.0
+"""Largest factor from a yaw rate in degrees to one in radians, 1/57 ideally; and a yaw rate that no robot reaches."""
+_TILTED_RAD, _ASIDE_RAD, _BACKWARDS_RAD = np.radians([30.0, 60.0, 120.0])
+"""Least tilt of a rotated IMU: slopes average out, and the steepest that is driven is 22.5°; yaws of one that looks aside and backwards."""
+_SAME_WAY, _COHERENT, _MAX_YAW_STD_RAD = 0.5, 0.3, 0.1
+"""Least agreement of two turns or directions, and of accelerations (0 to 1), and the largest σ of a yaw by accelerations."""
 
 
 def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
@@ -382,128 +370,122 @@ def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
 
 def _check_imu(
     found: Exclusions,
-    imu: InertialMeasurements,
-    gnss: Positions | None,
+    m: Measurements,
     twists: Mapping[str, Floats],
     at_ns: NDArray[np.int64],
     *,
     felt: float,
-    is_stated: bool,
-) -> tuple[dict[str, YawAxis], dict[str, float]]:
-    """Check units, tilt and signs; return the yaw axis by each sensor, and the yaw of the upright unit by each odometry [rad]."""
-    rate = compute_moving_mean(resample_signal(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _TURN_SMOOTH_S)
-    turns = {role: compute_moving_mean(twist, _TURN_SMOOTH_S)[:, 1] for role, twist in twists.items()}
-    if gnss is not None:
-        turns[GNSS] = compute_course_rate(compute_fix_velocity(gnss, at_ns))
-    axes = {role: axis for role, turn in turns.items() if (axis := find_yaw_axis(turn, rate)) is not None}
-    evidence = _find_other_units(axes, rate, felt)
-    if IMU in found:
-        return axes, {}
+    trust: Mapping[str, float],
+) -> tuple[Floats, dict[str, Lag], dict[str, float]]:
+    """Check units, tilt and signs; return the yaw rate, how other sensors' follow from it, and the unit's yaw by each odometry [rad]."""
+    if m.imu is None:
+        return np.empty(0), {}, {}
+    turn, force = resample_imu(m.imu, at_ns)
+    turns = _compare_turns(turn, m.gnss, twists, at_ns)
+    yaws_rad = _compare_accelerations(force, twists, turns)
+    if IMU not in found:
+        _check_units(found, turns, turn, felt)
+    if IMU not in found and _IN_MPS2[0] <= felt <= _IN_MPS2[1]:
+        _check_mounting(found, find_up_axis(m.imu.specific_force_mps2), yaws_rad)
+        if IMU not in found:
+            _check_yaw_signs(found, turns, trust)
+    return turn, turns, {} if IMU in found else yaws_rad
+
+
+def _compare_turns(
+    turn: Floats, gnss: Positions | None, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]
+) -> dict[str, Lag]:
+    """Return by sensor how its yaw rate follows from the gyroscope's."""
+    rates = {role: average(twist[:, 1], _TURN_SMOOTH_S) for role, twist in twists.items()}
+    rates |= {} if gnss is None else {GNSS: compute_course_rate(compute_fix_velocity(gnss, at_ns))}
+    lags = {role: find_lag(rate, average(turn, _TURN_SMOOTH_S)) for role, rate in rates.items()}
+    return {role: lag for role, lag in lags.items() if lag is not None and lag.explained > _SAME_WAY}
+
+
+def _compare_accelerations(force: Plane, twists: Mapping[str, Floats], turns: Mapping[str, Lag]) -> dict[str, float]:
+    """Return by odometry the yaw of the levelled IMU [rad] where accelerations show it."""
+    found = {}
+    for role, twist in twists.items():
+        turned = find_turn(compute_acceleration(twist), force, turns[role].offset_s if role in turns else 0.0)
+        if turned is not None and turned[1] < _MAX_YAW_STD_RAD and turned[2] > _COHERENT:
+            found[role] = turned[0]
+    return found
+
+
+def _check_units(found: Exclusions, turns: Mapping[str, Lag], turn: Floats, felt: float) -> None:
+    """Exclude an IMU that seems to be in other units: by how many times as fast as another sensor it turns, and the median force."""
+    evidence: dict[str, dict[str, float]] = {}
+    if turns:
+        scale = float(np.median([abs(lag.factor) for lag in turns.values()]))
+        evidence |= {"deg": {"turn_ratio": 1.0 / scale}} if scale < _IN_DEGREES else {}
+    elif (known := np.abs(turn[np.isfinite(turn)])).size and np.percentile(known, 99.5) > _MAX_YAW_RATE_RADPS:
+        evidence["deg"] = {"rate_max": float(known.max())}
+    evidence |= {"g": {"force_median": felt}} if _IN_G[0] <= felt <= _IN_G[1] else {}
     if evidence:
         units = "_".join(evidence)
         numbers = {name: value for of_unit in evidence.values() for name, value in of_unit.items()}
         found[IMU] = SensorExclusion(IMU, "imu-units", {"units": units}, numbers, units)
-        return axes, {}
-    if felt == 0.0:
+    elif felt == 0.0:
         found[IMU] = SensorExclusion(IMU, "imu-no-acceleration")
-    if not _IN_MPS2[0] <= felt <= _IN_MPS2[1]:
-        return axes, {}
-    up = find_up_axis(imu.specific_force_mps2)
-    level = compute_levelling_rotation(up)
-    force = resample_signal(imu.stamp_ns, imu.specific_force_mps2 @ level.T, at_ns)
-    looks: dict[str, float] = {}
-    for role, twist in twists.items():
-        yaw = find_forward_yaw_rad(twist, force, axes[role].late_s if role in axes else 0.0)
-        looks |= {} if yaw is None else {role: yaw}
-    yaw = next(iter(looks.values()), 0.0)
-    turned_by = find_nearest_mounting(rotate_about_z(yaw) @ level)
+
+
+def _check_mounting(found: Exclusions, up: Floats, yaws_rad: Mapping[str, float]) -> None:
+    """Exclude an IMU that gravity shows to be tilted, or accelerations to look aside."""
+    yaw_rad = next(iter(yaws_rad.values()), 0.0)
+    turn = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw_rad)) @ compute_levelling_rotation(up)
+    turned_by = find_nearest_mounting(turn)
     if up[2] < np.cos(_TILTED_RAD):
         names, numbers = {"evidence": "gravity"}, {"off_rad": float(np.arccos(up[2]))}
         found[IMU] = SensorExclusion(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
-        return axes, {}
-    signs = {role: bool(axis.axis[2] > 0) for role, axis in axes.items() if abs(axis.axis[2]) > _SAME_WAY}
-    _check_yaw_signs(found, signs, is_stated=is_stated)
-    if looks and all(_ASIDE_RAD < abs(each) <= _BACKWARDS_RAD for each in looks.values()):
-        found.setdefault(IMU, _make_yaw_exclusion(looks, turned_by))
-    return axes, {} if IMU in found else looks
+    elif yaws_rad and all(_ASIDE_RAD < abs(each) <= _BACKWARDS_RAD for each in yaws_rad.values()):
+        found[IMU] = _make_yaw_exclusion(yaws_rad, turned_by)
 
 
-def _find_other_units(axes: Mapping[str, YawAxis], rate: Floats, felt: float) -> dict[str, dict[str, float]]:
-    """Return the recipe's words for the units an IMU seems to be in where they are not SI, with what shows them.
-
-    That is how many times as fast as another sensor the gyroscope turns (degrees: 57), or its fastest rate, and the median force.
-    """
-    found: dict[str, dict[str, float]] = {}
-    if axes:
-        scale = float(np.median([axis.scale for axis in axes.values()]))
-        found |= {"deg": {"turn_ratio": 1.0 / scale}} if scale < _IN_DEGREES else {}
-    else:
-        known = np.linalg.norm(rate[np.isfinite(rate.sum(1))], axis=1)
-        if known.size and float(np.percentile(known, 99.5)) > _NO_ROBOT_TURNS_RADPS:
-            found["deg"] = {"rate_max": float(np.nanmax(np.abs(rate)))}
-    return found | ({"g": {"force_median": felt}} if _IN_G[0] <= felt <= _IN_G[1] else {})
-
-
-def _check_yaw_signs(found: Exclusions, signs: Mapping[str, bool], *, is_stated: bool) -> None:
-    """Check that gyroscope, odometries and fixes turn the same way, the IMU being upright by gravity."""
-
-    def count_votes(name: str) -> float:
-        return sum(signs.values()) + is_stated if name == IMU else sum(not sign for sign in signs.values()) - 0.5
-
-    against = [role for role, sign in signs.items() if not sign and role != GNSS]
-    for role, _, _ in _find_outvoted([(role, IMU) for role in against], count_votes):
-        if role == IMU:
-            found.setdefault(IMU, SensorExclusion(IMU, "imu-sign", {"reference": ", ".join(against)}))
-        else:
-            names = {"reference": ", ".join((IMU, *(other for other, sign in signs.items() if sign)))}
-            found.setdefault(role, SensorExclusion(role, "yaw-rate-sign", names, turned_by=YAW))
-
-
-def _make_yaw_exclusion(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
+def _make_yaw_exclusion(yaws_rad: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
     """Return the exclusion of an IMU that the accelerations of odometries show to be turned, by yaw [rad]."""
-    names, numbers = (
-        {"evidence": "acceleration", "reference": ", ".join(looks)},
-        {"off_rad": next(iter(looks.values()))},
-    )
+    names = {"evidence": "acceleration", "reference": ", ".join(yaws_rad)}
+    numbers = {"off_rad": next(iter(yaws_rad.values()))}
     return SensorExclusion(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
 
 
 # Directions
 
 _MOVING_MPS = 0.2
-_FEWEST_ROWS = 100
+"""Speed from which on a direction counts [m/s]."""
+_MIN_MOVING_ROWS = 100
+"""Rows of the grid that show how two directions agree, 2 s."""
+
+
+def _check_yaw_signs(found: Exclusions, turns: Mapping[str, Lag], trust: Mapping[str, float]) -> None:
+    """Check that gyroscope, odometries and fixes turn the same way, the IMU being upright by gravity."""
+    signs = {IMU: True} | {role: lag.factor.real > 0.0 for role, lag in turns.items()}
+    same = {(a, b): signs[a] == signs[b] for a, b in combinations(signs, 2)}
+    for role, other, _ in _find_outvoted(same, {IMU: trust[IMU]} | dict.fromkeys(turns, 0.5)):
+        reference = {"reference": ", ".join(each for each, sign in signs.items() if sign != signs[role])}
+        if role == IMU:
+            found.setdefault(IMU, SensorExclusion(IMU, "imu-sign", reference))
+        elif other == IMU and role != GNSS:
+            found.setdefault(role, SensorExclusion(role, "yaw-rate-sign", reference, turned_by=YAW))
 
 
 def _check_directions(
-    found: Exclusions,
-    forward: Mapping[str, Floats],
-    wanted: Floats | None,
-    looks: Mapping[str, float],
-    *,
-    is_stated: bool,
+    found: Exclusions, forward: Mapping[str, Floats], yaws_rad: Mapping[str, float], trust: Mapping[str, float]
 ) -> None:
     """Check that odometries, command and accelerations go forward at once."""
-    velocities = dict(forward) if wanted is None else {**forward, COMMAND: wanted}
-    same = {
-        (role, IMU): abs(yaw) < _ASIDE_RAD for role, yaw in looks.items() if not _ASIDE_RAD < abs(yaw) <= _BACKWARDS_RAD
-    }
-    for a, b in combinations(velocities, 2):
-        agreement = compute_agreement(velocities[a], velocities[b])
+    is_aside = {role: _ASIDE_RAD < abs(yaw) <= _BACKWARDS_RAD for role, yaw in yaws_rad.items()}
+    same = {(role, IMU): abs(yaw) < _ASIDE_RAD for role, yaw in yaws_rad.items() if not is_aside[role]}
+    for a, b in combinations(forward, 2):
+        agreement = compute_agreement(forward[a], forward[b])
         if agreement is not None and abs(agreement) > _SAME_WAY:
             same[a, b] = agreement > 0.0
-    trust = {COMMAND: 1.0, IMU: float(is_stated), WHEELS: 0.5, VISUAL: 0.25}
-
-    def count_votes(name: str) -> float:
-        return trust[name] + sum(name in pair for pair, is_same in same.items() if is_same)
-
     turned = set()
-    for role, other, lead in _find_outvoted([pair for pair, is_same in same.items() if not is_same], count_votes):
+    for role, other, lead in _find_outvoted(same, trust):
         if role == IMU:
-            backwards = {each: yaw for each, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}
+            backwards = {each: yaw for each, yaw in yaws_rad.items() if abs(yaw) > _BACKWARDS_RAD}
             found.setdefault(IMU, _make_yaw_exclusion(backwards, FORWARD))
         elif role != COMMAND and role not in turned:
             turned.add(role)
-            names = {"reference": other} | ({"suspect": other} if other in forward and lead < 1.0 else {})
+            names = {"reference": other} | ({"suspect": other} if other in {WHEELS, VISUAL} and lead < 1.0 else {})
             before = found[role].turned_by if role in found else None
             if role not in found or before is not None:  # and its yaw rate turns the other way
                 turn = FORWARD if before is None else FORWARD @ before
@@ -513,7 +495,7 @@ def _check_directions(
 def compute_agreement(velocity_mps: Floats, other_mps: Floats) -> float | None:
     """Return by how much two signed velocities go the same way, -1 to 1, or None where one of them hardly moves; shape (M,) each."""
     moving = (np.abs(velocity_mps) > _MOVING_MPS) & (np.abs(other_mps) > _MOVING_MPS)
-    if moving.sum() < _FEWEST_ROWS:
+    if moving.sum() < _MIN_MOVING_ROWS:
         return None
     return float(np.mean(np.sign(velocity_mps[moving] * other_mps[moving])))
 
@@ -538,7 +520,7 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     if pair is None or driven is None:
         return SensorExclusion(DOPPLER, "velocity-unverified")
 
-    def compute_misfit(product: Path) -> float:
+    def compute_misfit(product: Plane) -> float:
         misfit_m2 = np.maximum(pair.a_m2 + pair.b_m2 - 2.0 * product.real, 0.0)
         return float(np.median(np.sqrt(misfit_m2 / np.maximum(pair.a_m2, 1e-9))))
 

@@ -204,5 +204,5 @@ def test_a_receivers_velocity_has_no_say_in_whose_clock_is_right():
     found = solve_offsets(late)
     assert not found.offsets["gnss"].blamed
     assert found.offsets["gnss_velocity"].offset_s == pytest.approx(0.3)
-    alone = solve_offsets((pair("gnss_velocity", "gnss", 0.3, by="velocity east"),))
+    alone = solve_offsets((pair("gnss_velocity", "gnss", 0.3, by="velocity"),))
     assert (alone.reference, alone.offsets["gnss_velocity"].noted) == ("gnss", True)
