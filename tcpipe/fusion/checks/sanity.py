@@ -123,7 +123,7 @@ def check_sensors(
     paths = {} if m.gnss is None else {GNSS: resample_fixes(m.gnss, at_ns)}
     paths |= {role: dead_reckon(twist) for role, twist in twists.items()}
     noise_m2 = _compute_noise_m2(m.gnss)
-    moving = {role for role, path in paths.items() if compare_paths(path, path, _SHORT_S, noise_m2)}
+    moving = {role for role, path in paths.items() if compare_paths(path, path, noise_m2)}
     for role, quantity in _list_constants(m):
         if moving - {role}:
             found.setdefault(role, _make_frozen_exclusion(role, quantity, m.sensors()[role].stamp_ns.size))
@@ -132,13 +132,17 @@ def check_sensors(
     turn, turns, yaws_rad = _check_imu(found, m, twists, at_ns, felt=felt, trust=trust)
     # 2. Paths show another unit or another drive; yaw rates are the gyroscope's where it confirms them.
     for role in twists if IMU not in found else ():
-        if role in turns and turns[role].factor.real > 0.0:
+        if turn.size and (
+            not np.nan_to_num(twists[role][:, 1]).any() or (role in turns and turns[role].factor.real > 0.0)
+        ):
             twists[role][:, 1] = np.where(np.isfinite(turn), turn, twists[role][:, 1])
             paths[role] = dead_reckon(twists[role])
     if wanted is not None and twists:
         paths[COMMAND] = dead_reckon(np.column_stack((wanted, next(iter(twists.values()))[:, 1])))
-    scales = _check_distances(found, m, paths, noise_m2, turns)
-    _check_shapes(found, paths, noise_m2, turns)
+    pairs = {(a, b): compare_paths(paths[a], paths[b], noise_m2) for a, b in combinations(paths, 2)}
+    known = {names: pair for names, pair in pairs.items() if pair is not None}
+    scales = _check_distances(found, known, turns, is_alone=len(twists) == 1)
+    _check_shapes(found, known, turns)
     # 3. Directions of travel show what looks backwards.
     forward = {role: twist[:, 0] for role, twist in twists.items()} | ({} if wanted is None else {COMMAND: wanted})
     _check_directions(found, forward, yaws_rad, trust)
@@ -189,10 +193,8 @@ def make_fix_exclusion(
 
 # Paths
 
-_SHORT_S, _LONG_S = 10.0, 20.0
-"""Windows of distances and of shapes [s]."""
-_LENGTHENED = (1, 3, 9)
-"""Factors of the windows' length, where the noise of fixes hides what is driven in shorter ones."""
+_WINDOWS_S = (20.0, 60.0, 180.0)
+"""Windows of paths [s]: longer ones where the noise of fixes hides what is driven in shorter ones."""
 _FAR_M, _BEND_M = 1.0, 0.3
 """Size of a path that moves, and size by which a path bends that differs from its mirror image [m]."""
 _MIN_MOVING_WINDOWS = 3
@@ -222,88 +224,79 @@ class Pair:
     b_m2: Floats
     product: Plane
     mirrored: Plane
+    noise_m2: float
 
     @property
     def ratio(self) -> float:
         """How many times as far as a b goes."""
         return float(np.sqrt(np.median(self.b_m2)) / max(np.sqrt(np.median(self.a_m2)), 1e-3))
 
-    def compute_misfits_m2(self) -> tuple[Floats, Floats]:
-        """Return the mean square that is left of a when b, turned and scaled, is laid on it, and b's mirror image."""
-        size = np.maximum(self.b_m2, 1e-9)
-        return self.a_m2 - np.abs(self.product) ** 2 / size, self.a_m2 - np.abs(self.mirrored) ** 2 / size
-
     def find_scale(self) -> float:
         """Return how many times as far as a b goes, whatever the noise of a."""
         return float(np.median(self.b_m2 / np.maximum(np.abs(self.product), 1e-9)))
 
-    def find_shape(self, noise_m2: float) -> Literal["alike", "mirrored", "unlike"] | None:
-        """Return how path b lies to path a, which has noise; None where it bends too little.
+    def find_shape(self) -> Literal["alike", "mirrored", "unlike"] | None:
+        """Return how b lies to a when it, or its mirror image, is turned and scaled to fit; None where it bends too little.
 
         Unlike is what fits neither way, by more than the noise, what slip bends, and a metre.
         """
-        misfits = np.array(self.compute_misfits_m2())
-        bound = _FAR_M**2 + 18.0 * noise_m2 + _MAX_MISFIT**2 * self.a_m2
-        if (np.mean(misfits > bound, axis=1) > _MAX_MISFIT).all():
+        products_m4 = np.square(np.abs((self.product, self.mirrored)))
+        misfits_m2 = self.a_m2 - products_m4 / np.maximum(self.b_m2, 1e-9)
+        bound_m2 = _FAR_M**2 + 18.0 * self.noise_m2 + _MAX_MISFIT**2 * self.a_m2
+        if (np.mean(misfits_m2 > bound_m2, axis=1) > _MAX_MISFIT).all():
             return "unlike"
-        plain, mirrored = misfits.mean(1)
-        if max(plain, mirrored) < max(_BEND_M**2 + 18.0 * noise_m2, _MIRROR_RATIO * min(plain, mirrored)):
+        plain, mirrored = misfits_m2.mean(1)
+        if max(plain, mirrored) < max(_BEND_M**2 + 18.0 * self.noise_m2, _MIRROR_RATIO * min(plain, mirrored)):
             return None
         return "alike" if plain < mirrored else "mirrored"
 
 
-def compare_paths(a: Plane, b: Plane, shortest_s: float, noise_m2: float) -> Pair | None:
+def compare_paths(a: Plane, b: Plane, noise_m2: float) -> Pair | None:
     """Return two paths in windows in which one goes far, as short as the noise of fixes allows; None where there are hardly any."""
     both = np.stack((a, b))[:, ::_NODE]
-    for times in _LENGTHENED:
-        size = round(times * shortest_s / GRID_S / _NODE)
+    for window_s in _WINDOWS_S:
+        size = round(window_s / GRID_S / _NODE)
         if both.shape[1] < size:
             return None
-        rows = np.lib.stride_tricks.sliding_window_view(both, size, axis=1)[:, :: max(size // 2, 1)]
+        rows = np.lib.stride_tricks.sliding_window_view(both, size, axis=1)[:, :: size // 4]
         rows = rows[:, np.isfinite(rows.sum((0, 2)))]
         a_rows, b_rows = rows - rows.mean(2, keepdims=True)
         a_m2, b_m2 = (np.mean(np.abs(each) ** 2, axis=1) for each in (a_rows, b_rows))
         far = np.maximum(a_m2, b_m2) > _FAR_M**2 + 2.0 * noise_m2
         if far.sum() >= _MIN_MOVING_WINDOWS:
             product, mirrored = (np.mean(b_rows * each, axis=1)[far] for each in (np.conj(a_rows), a_rows))
-            return Pair(a_m2[far], b_m2[far], product, mirrored)
+            return Pair(a_m2[far], b_m2[far], product, mirrored, noise_m2)
     return None
 
 
 def _check_distances(
-    found: Exclusions, m: Measurements, paths: Mapping[str, Plane], noise_m2: float, turning: Collection[str]
+    found: Exclusions, pairs: Mapping[tuple[str, str], Pair], turning: Collection[str], *, is_alone: bool
 ) -> dict[str, float]:
-    """Exclude what goes more than twice as far as the rest; return the scale of a lone odometry where that is its error.
+    """Exclude what goes more than twice as far as the rest; return the scale of an odometry that is alone where that is its error.
 
     The gyroscope confirms the yaw rate of ``turning`` sensors.
     """
-    pairs = {
-        (a, b): pair
-        for a, b in combinations((role for role in paths if role not in found), 2)
-        if (pair := compare_paths(paths[a], paths[b], _SHORT_S, noise_m2))
-    }
-    same = {names: 1 / _MAX_RATIO <= pair.ratio <= _MAX_RATIO for names, pair in pairs.items()}
+    ratios = {names: pair.ratio for names, pair in pairs.items() if not found.keys() & {*names}}
+    same = {names: 1 / _MAX_RATIO <= ratio <= _MAX_RATIO for names, ratio in ratios.items()}
     scales = {}
     for names in [names for names, is_same in same.items() if not is_same and COMMAND not in names]:
         # A robot may be slower than it is told.
-        ratio, of_pair = pairs[names].ratio, {names: False}
-        trust: dict[str, float] = {}
-        fast = names[1] if ratio > 1.0 else names[0]
-        of_pair |= {each: is_same for each, is_same in same.items() if is_same}
+        ratio, of_pair = ratios[names], {each: is_same for each, is_same in same.items() if is_same or each == names}
+        fast, trust = names[1] if ratio > 1.0 else names[0], dict[str, float]()
         if not 1 / _STILL_RATIO < ratio < _STILL_RATIO:
             # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
-            of_pair = {each: is_same for each, is_same in of_pair.items() if not {fast, COMMAND} <= {*each}}
+            of_pair.pop((fast, COMMAND), None)
             trust = {fast: float(fast in turning)}
             if fast == WHEELS and not trust[fast] and not any(fast in each for each in of_pair if each != names):
                 continue  # the wheels turn, the robot stands: stuck
         losers = [*_find_outvoted(of_pair, trust)]
-        is_alike = GNSS in names and pairs[names].find_shape(noise_m2) in {"alike", None}
-        is_alone = len(m.odometries()) == 1 and names[1] in {role for role, _, _ in losers}
-        if is_alike and is_alone and 1 / _MAX_SCALE < ratio < _MAX_SCALE:
-            scales[names[1]] = pairs[names].find_scale()
+        odometry = names[1]
+        is_scale = is_alone and 1 / _MAX_SCALE < ratio < _MAX_SCALE and any(odometry == role for role, _, _ in losers)
+        if is_scale and GNSS in names and pairs[names].find_shape() not in {"mirrored", "unlike"}:
+            scales[odometry] = pairs[names].find_scale()
             continue
         for role, other, lead in losers:
-            times = ratio if role == names[1] else 1 / ratio
+            times = ratio if role == odometry else 1 / ratio
             found.setdefault(role, _make_distance_exclusion(role, other, times, is_tie=lead == 0))
     return scales
 
@@ -317,16 +310,10 @@ def _make_distance_exclusion(role: str, other: str, ratio: float, *, is_tie: boo
     return SensorExclusion(role, "distance-contradicted", names, {"distance_ratio": ratio})
 
 
-def _check_shapes(found: Exclusions, paths: Mapping[str, Plane], noise_m2: float, turning: Collection[str]) -> None:
+def _check_shapes(found: Exclusions, pairs: Mapping[tuple[str, str], Pair], turning: Collection[str]) -> None:
     """Exclude fixes whose path is not that of the odometries; one odometry that no gyroscope confirms is as doubtful as they are."""
-    if GNSS not in paths or GNSS in found:
-        return
-    pairs = {
-        role: compare_paths(paths[GNSS], path, _LONG_S, noise_m2)
-        for role, path in paths.items()
-        if role not in {GNSS, COMMAND, *found}
-    }
-    shapes = {role: pair.find_shape(noise_m2) for role, pair in pairs.items() if pair is not None}
+    odometries = {WHEELS, VISUAL} - found.keys() if GNSS not in found else set()
+    shapes = {role: pair.find_shape() for (a, role), pair in pairs.items() if a == GNSS and role in odometries}
     against = [role for role, shape in shapes.items() if shape in {"mirrored", "unlike"}]
     if not against or "alike" in shapes.values():
         return
@@ -516,7 +503,7 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     path = integrate_signal(stamp_s, velocity, at_s) @ np.array([1.0, 1j])
     path[~is_covered(stamp_ns, at_ns, at_ns, least_ns=_MAX_GAP_NS)] = np.nan
     fixes = np.full_like(path, np.nan) if m.gnss is None else resample_fixes(m.gnss, at_ns)
-    pair, driven = (compare_paths(fixes, each, _SHORT_S, _compute_noise_m2(m.gnss)) for each in (path, fixes))
+    pair, driven = (compare_paths(fixes, each, _compute_noise_m2(m.gnss)) for each in (path, fixes))
     if pair is None or driven is None:
         return SensorExclusion(DOPPLER, "velocity-unverified")
 
