@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
+from tcpipe.fusion.dead_reckoning import compute_course
 from tcpipe.fusion.densities import NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.filter_kernel import (
     ACCEPTED,
@@ -42,7 +43,7 @@ from tcpipe.fusion.hypotheses import (
     find_turn_jump,
     make_excursions,
 )
-from tcpipe.fusion.initial import compute_course, find_stationary_intervals
+from tcpipe.fusion.initial import find_stationary_intervals
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
     IMU,

@@ -26,13 +26,13 @@ from tcpipe.fusion.measurements import (
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
     Plane,
-    bridge_outliers,
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
     compute_slopes,
     estimate_white_noise,
     is_in_gap,
+    remove_wild_places,
 )
 from tcpipe.robust import estimate_robust_std
 
@@ -272,8 +272,8 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     else:
         values, variance, order = source.velocity_enu_mps, source.variance_m2ps2, 1
     zero_ns, std = int(source.stamp_ns[0]), float(np.sqrt(np.median(variance[:, :2])))
-    stamp_s, plane = compute_seconds(source.stamp_ns, zero_ns), values[:, :2] @ np.array([1.0, 1j])
-    plane = bridge_outliers(stamp_s, plane, std) if order == 2 else plane
+    stamp_s = compute_seconds(source.stamp_ns, zero_ns)
+    plane = remove_wild_places(values) if order == 2 else values[:, :2] @ np.array([1.0, 1j])
     shown_s, acceleration = _compute_accelerations(stamp_s, plane, std, order)
     lasts_s = max(_UNSEEN_LASTS_S, 1e-9 * compute_median_period_ns(source.stamp_ns))
     density = np.maximum(_UNSEEN_STEADY + lasts_s * np.square(np.minimum(acceleration, MAX_ACCELERATION_MPS2)), least)

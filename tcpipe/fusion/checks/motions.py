@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.mounting import compute_levelling_rotation, find_up_axis
+from tcpipe.fusion.dead_reckoning import DeadReckoning
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
     Plane,
@@ -17,6 +18,7 @@ from tcpipe.fusion.signals import (
     integrate_signal,
     is_covered,
     remove_spikes,
+    remove_wild_places,
 )
 
 GRID_S = 0.02
@@ -114,7 +116,7 @@ def resample_twist(source: BodyVelocities, at_ns: Ints) -> Floats:
 
 def resample_fixes(gnss: Positions, at_ns: Ints) -> Plane:
     """Return the antenna's places [m], east and i times north, averaged over half a second, shape (M,); wild fixes are bridged."""
-    places = np.apply_along_axis(remove_spikes, 0, gnss.position_enu_m[:, :2])
+    places = remove_wild_places(gnss.position_enu_m).view(np.float64).reshape(-1, 2)
     return average(resample_signal(gnss.stamp_ns, places, at_ns) @ np.array([1.0, 1j]), FIXES_S)
 
 
@@ -172,6 +174,6 @@ def find_quick_part(values: NDArray[Any]) -> NDArray[Any]:
 def dead_reckon(twist: Floats) -> Plane:
     """Return the path [m] of a twist (M, 2), from the origin along the real axis, shape (M,); NaN where the twist is unknown."""
     known = np.asarray(np.isfinite(twist).all(1))
-    forward, yaw_rate = np.where(known[:, None], twist, 0.0).T
-    place = np.cumsum(forward * np.exp(1j * np.cumsum(yaw_rate) * GRID_S)) * GRID_S
-    return np.where(known, place, np.nan)
+    forward_mps, yaw_rate_radps = np.where(known[:, None], twist, 0.0).T
+    at_s: Floats = GRID_S * np.arange(len(twist), dtype=np.float64)
+    return np.where(known, DeadReckoning(at_s, forward_mps, at_s, yaw_rate_radps).place(at_s), np.nan)

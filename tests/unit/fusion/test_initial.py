@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
-from tcpipe.fusion.initial import compute_course_rate, find_initial_state, find_stationary_intervals
+from tcpipe.fusion.dead_reckoning import compute_course_rate
+from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.geometry.rotation import rpy_from_quat
 
