@@ -87,9 +87,9 @@ def reckon_dead(m: Measurements, start_ns: int, bias_radps: float) -> DeadReckon
 
 _GRID_S = 0.5  # grid of the course
 _WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
-_CLEARLY = 3.0  # σ of fixes that a baseline needs
+_MIN_BASELINE_STD = 3.0  # σ of fixes that a baseline needs
 _MOVING_M = 0.3  # shorter baselines show no course
-_OFTEN = 0.3  # share of usable baselines before longer ones
+_MIN_MOVING_SHARE = 0.3  # share of usable baselines before longer ones
 _STEP_S = 1e-6  # step between two rates
 
 
@@ -102,7 +102,7 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     stamp_s = compute_seconds(gnss.stamp_ns, zero_ns)
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
     std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
-    least_m = max(_MOVING_M, _CLEARLY * std_m)
+    least_m = max(_MOVING_M, _MIN_BASELINE_STD * std_m)
     values = remove_wild_places(gnss.position_enu_m).view(np.float64).reshape(-1, 2)
     for window_s in _WINDOWS_S:
         rows = round(window_s / _GRID_S)
@@ -112,7 +112,7 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
         way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
         at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
         moving = np.abs(way) > least_m
-        if moving.mean() > _OFTEN:
+        if moving.mean() > _MIN_MOVING_SHARE:
             break
     if odometry is not None:
         odometry_s = compute_seconds(odometry.stamp_ns, zero_ns)

@@ -14,6 +14,8 @@ Plane = NDArray[np.complex128]
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
 _SPIKE = 8.0  # distance of a spike over the median distance from the median of five: more than 5 σ
+MAX_GAP_NS = 500_000_000
+"""Time between samples that no interpolation bridges [ns]: sensors of motion send at 2 Hz or more."""
 MAX_ACCELERATION_MPS2 = 2.5
 """Acceleration of a robot that brakes hard; what fixes show beyond it is an outlier [m/s²]."""
 _MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long

@@ -15,7 +15,9 @@ from tcpipe.fusion.checks.clock_offsets import (
 )
 from tcpipe.fusion.checks.lags import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion
+from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import DOPPLER, GNSS, Measurements
+from tcpipe.fusion.signals import MAX_GAP_NS
 from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
@@ -64,11 +66,6 @@ def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
         return {}
     offsets = find_other_clocks(sections[rank_sections(sections)[0]].measurements, always=True)
     return rename_role({role: offset.offset_s for role, offset in offsets.items()}, GNSS, find_fixes_role(streams))
-
-
-_FINE_S = 0.004
-_JUMP_NS = 500_000_000
-_DRIVES_MPS = 0.3
 
 
 def find_clocks(sections: Sequence[Section]) -> list[Section]:
@@ -144,7 +141,7 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
 def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Remedy, ...]:
     """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
     given_s = streams.report.facts.time_offset_s.get(role, 0.0)
-    correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
+    correction_s = round(given_s - offset.offset_s, 3)
     is_far = abs(offset.offset_s) > NEAR_S and role == GNSS and DOPPLER in streams.tables
     roles = (role, DOPPLER) if is_far else (role,)
     return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
@@ -171,13 +168,13 @@ def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding
         wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (wheels, fixes))
         speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in wheels])
         place_m = np.concatenate([each.position_enu_m[:, :2] for each in fixes])
-        for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > _JUMP_NS]:
+        for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > MAX_GAP_NS]:
             step_s = float(np.diff(ends_ns)[0]) * 1e-9
             at_s = float(ends_ns[1] - min(each[0] for each in stamps.values())) * 1e-9
             driven = np.interp(ends_ns, wheels_ns, speed_mps)
             moved_m = [np.diff(np.interp(ends_ns, fixes_ns, axis)) for axis in place_m.T]
             slowest_mps = float(np.abs(driven).min())
-            if slowest_mps > _DRIVES_MPS and np.linalg.norm(moved_m) < 0.5 * slowest_mps * step_s:
+            if slowest_mps > MIN_SPEED_MPS and np.linalg.norm(moved_m) < 0.5 * slowest_mps * step_s:
                 span_s, names = (at_s, at_s), {"topics": "all topics"}
                 finding = make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)
                 yield int(ends_ns[1]), finding

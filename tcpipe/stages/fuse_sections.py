@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import audit_trajectory
+from tcpipe.fusion.checks.clock_offsets import NOTED_S
 from tcpipe.fusion.checks.sanity import Command
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
@@ -244,10 +245,6 @@ def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
     return merge_findings(finding for place in rank_sections(sections) for finding in sections[place].excluded.values())
 
 
-_SAME_OFFSET_S = 0.1
-"""Time offsets of two sections that differ by less [s] are one: twice the offset that is noted."""
-
-
 def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings of several sections, those of one code and subject as one that has the first one's numbers.
 
@@ -257,7 +254,7 @@ def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
     for finding in findings:
         for place, first in enumerate(merged):
             off_s = finding.numbers.get("offset_s", 0.0) - first.numbers.get("offset_s", 0.0)
-            if (first.code, first.subject) == (finding.code, finding.subject) and abs(off_s) < _SAME_OFFSET_S:
+            if (first.code, first.subject) == (finding.code, finding.subject) and abs(off_s) < 2.0 * NOTED_S:
                 spans = [each.span_s for each in (first, finding) if each.span_s is not None]
                 span_s = (min(start for start, _ in spans), max(end for _, end in spans)) if spans else None
                 merged[place] = replace(first, span_s=span_s)

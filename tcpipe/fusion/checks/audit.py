@@ -26,26 +26,25 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.process import SCALE_STD
 from tcpipe.fusion.signals import (
+    MAX_GAP_NS,
     compute_interval_means,
     compute_median_period_ns,
     compute_seconds,
     is_covered,
 )
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
-from tcpipe.robust import estimate_robust_std
+from tcpipe.robust import MIN_SIGMAS, estimate_robust_std
 from tcpipe.tables.facts import Disagreement
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _WINDOW_S = 5.0  # about four chords; longer than odometry's gate
-_MAX_GAP_NS = 500_000_000
 _STANDS_MPS = 0.1  # slower is stationary; faster wheels are stuck
 _MOVES_M, _FEWEST = 0.5, 4  # windows that show a scale
 _SCALES = (0.5, 2.0)
 _ASTRAY_M = 1.0  # a larger difference in 5 s is divergence
-_SURELY = 4.0  # and by this many σ of the sensor
-_LITTLE = 0.1  # share of windows that may be astray
+_MAX_ASTRAY = 0.1  # share of windows that may be astray
 _LASTING_MPS = 0.02  # lasting odometry error (`preparation._VELOCITY_FLOOR_MPS`)
 
 
@@ -63,7 +62,7 @@ class Audit:
 
 def is_astray(windows: int, astray: int) -> bool:
     """Return whether the track contradicts every sensor in more than a few of the windows in which one measures the distance."""
-    return astray > max(1.0, _LITTLE * windows)
+    return astray > max(1.0, _MAX_ASTRAY * windows)
 
 
 def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
@@ -74,7 +73,7 @@ def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Tra
         return found, Audit()
     size_m, std_m = np.array([*compared.values()]).swapaxes(0, 1)
     is_known = np.isfinite(size_m)
-    is_far = is_known & (size_m > np.maximum(_ASTRAY_M, _SURELY * std_m))
+    is_far = is_known & (size_m > np.maximum(_ASTRAY_M, MIN_SIGMAS * std_m))
     astray = is_known.any(0) & (is_far | ~is_known).all(0)
     least = np.argmin(np.where(is_known, size_m, np.inf), axis=0)
     rows_m = np.zeros(found.stamp_ns.size)
@@ -133,7 +132,7 @@ def _compare_odometry(
     step_s = np.diff(at_s)[:, None]
     velocity = source.velocity_mps[:, : track.shape[1]]
     sensor_m = compute_interval_means(compute_seconds(source.stamp_ns, zero), velocity, at_s[:-1], at_s[1:]) * step_s
-    sensor_m[~is_covered(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], least_ns=_MAX_GAP_NS)] = np.nan
+    sensor_m[~is_covered(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], least_ns=MAX_GAP_NS)] = np.nan
     if role == WHEELS:  # that turn while the robot stands: it is stuck, and they are right
         sensor_m[(np.abs(track[:, :1]) < _STANDS_MPS * step_s) & (np.abs(sensor_m) > _STANDS_MPS * step_s)] = np.nan
     sensor_m, track = (np.stack([values[first:last].sum(0) for first, last in windows]) for values in (sensor_m, track))

@@ -32,6 +32,7 @@ from tcpipe.fusion.checks.lags import (
 from tcpipe.fusion.checks.motions import (
     FIXES_S,
     GRID_S,
+    SMOOTH_S,
     average,
     compute_acceleration,
     compute_course_rate,
@@ -54,14 +55,13 @@ from tcpipe.fusion.measurements import (
     select_measurements,
 )
 from tcpipe.fusion.signals import Plane, compute_moving_mean, compute_seconds
+from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
 
 ROLES = (IMU, WHEELS, VISUAL, GNSS)
 """In the order in which a clock is taken for the right one where as many agree with either: a gyroscope has the least to compute."""
 NOTED_S = 0.05
 """Least time offset that a person should act on [s]."""
-_MIN_SIGMAS = 4.0
-"""Standard deviations beyond which an offset, a drift or a contradiction is certain."""
 _MAX_STD_S, _MAX_STD_OF_LARGE_S, _MIN_SIGMAS_OF_LARGE = 0.02, 0.06, 10.0
 """Largest σ of an offset that is known [s], and of one that is many σ from 0: the mean of a clock that steps has a larger one."""
 _MIN_EXPLAINED = 0.25
@@ -74,8 +74,6 @@ _DRIFT_STD = 1e-3
 """Standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz."""
 _LIVELY, _NEAR_ROWS = 0.1, round(2.0 / GRID_S)
 """Yaw rate [rad/s] or change of speed [m/s] of a manoeuvre, and rows around one that are compared: 2 s."""
-_ODOMETRY_S = 0.1
-"""Time over which speeds and yaw rates are averaged [s]."""
 
 YAW_RATE, SPEED, ACCELERATION, VELOCITY = "yaw rate", "speed", "acceleration", "velocity"
 
@@ -178,13 +176,13 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
     if m.imu is not None:
         turn, force = resample_imu(m.imu, at_ns)
         for role, twist in twists.items():
-            turning = average(twist[:, 1], _ODOMETRY_S)
-            yield role, IMU, YAW_RATE, _select_near(turning, turning), average(turn, _ODOMETRY_S)
+            turning = average(twist[:, 1], SMOOTH_S)
+            yield role, IMU, YAW_RATE, _select_near(turning, turning), average(turn, SMOOTH_S)
             if m.imu.accelerometer_usable:
-                changes = find_quick_part(average(twist[:, 0], _ODOMETRY_S))
+                changes = find_quick_part(average(twist[:, 0], SMOOTH_S))
                 yield role, IMU, ACCELERATION, _select_near(changes, compute_acceleration(twist)), force
     if len(twists) == 2:
-        speeds = (find_quick_part(average(np.abs(twists[role][:, 0]), _ODOMETRY_S)) for role in (VISUAL, WHEELS))
+        speeds = (find_quick_part(average(np.abs(twists[role][:, 0]), SMOOTH_S)) for role in (VISUAL, WHEELS))
         target, seen = speeds
         yield VISUAL, WHEELS, SPEED, _select_near(seen, target), seen
     if m.gnss is not None:
@@ -257,8 +255,8 @@ def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) ->
     for role, (offset_s, rate), (std_s, rate_std) in zip(
         free, found.reshape(2, -1).T.tolist(), stds.reshape(2, -1).T.tolist(), strict=True
     ):
-        drifts = abs(rate) > max(_MIN_SIGMAS * np.sqrt(birge) * rate_std, NOTED_S / max(span_s, 1.0))
-        noted = bool(drifts or abs(offset_s) > max(NOTED_S, _MIN_SIGMAS * std_s))
+        drifts = abs(rate) > max(MIN_SIGMAS * np.sqrt(birge) * rate_std, NOTED_S / max(span_s, 1.0))
+        noted = bool(drifts or abs(offset_s) > max(NOTED_S, MIN_SIGMAS * std_s))
         offsets[role] = ClockOffset(offset_s, std_s, noted, drift_ppm=1e6 * rate if drifts else 0.0)
     return offsets
 
@@ -295,7 +293,7 @@ def _is_blamed(
     if role in agreeing:
         return False
     among = [p for p in pairs if {p.late, p.against} <= {role, *agreeing}]
-    if any(abs(_compute_misfit_s(p, offsets)) > max(_MIN_SIGMAS * _get_std_s(p), NOTED_S) for p in among):
+    if any(abs(_compute_misfit_s(p, offsets)) > max(MIN_SIGMAS * _get_std_s(p), NOTED_S) for p in among):
         return False
     kinds = ([p for p in among if (p.by == YAW_RATE) == turning] for turning in (True, False))
     return any(len(_find_connected(role, of_kind)) > 2 for of_kind in kinds)

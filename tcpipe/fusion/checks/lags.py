@@ -27,8 +27,8 @@ Floats = NDArray[np.float64]
 MAX_LAG_S = 1.2
 """Largest lag of the fine search [s]."""
 _STEPS = round(MAX_LAG_S / GRID_S)
-_GROUPS, _MIN_GROUPS, _MIN_GROUP_S, _MIN_INFORMATIVE_GROUPS = 20, 8, 2.0, 4
-"""Most and fewest groups of the jackknife, their least length, and how many of them need values."""
+_GROUPS, _MIN_GROUPS, _MIN_GROUP_S, _MIN_SPANS = 20, 8, 2.0, 4
+"""Most and fewest groups of the jackknife, their least length [s], and how many separate spans of time have to show a lag."""
 _INDEPENDENT = 10
 """Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s, those of the coarse search over 1 s, which is 5 rows."""
 _MIN_CHI_SQUARED = 10.83
@@ -121,7 +121,7 @@ def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
     sums = np.add.reduceat(sums, np.arange(0, sums.shape[1], together), axis=1)
     sums = sums[:, (sums[0].real > 0.0).all(axis=1)]
     groups = sums.shape[1]
-    if groups < _MIN_INFORMATIVE_GROUPS:
+    if groups < _MIN_SPANS:
         return None
     total = sums.sum(axis=1, keepdims=True)
     whole, left_out = Products(total), Products(total - sums)
@@ -202,8 +202,8 @@ _MIN_ROWS = 450
 """Rows of the least overlap, 90 s."""
 _MIN_SCORE, _MIN_EXPLAINED = 18.0, 0.16
 """Least log-likelihood ratio of the best lag, 6 σ: noise reaches 4 σ in 3,000 lags; and least share explained of one signal."""
-_WINDOW, _MIN_WINDOWS = 50, 4
-"""Rows in which two lags are compared, 10 s, and windows that have to prefer the best lag."""
+_WINDOW = 50
+"""Rows in which two lags are compared, 10 s."""
 _APART, _PEAKS = 15, 25
 """Rows between separate peaks, 3 s, and most peaks that are compared with the best."""
 
@@ -255,7 +255,7 @@ def _is_rival(late: Floats, against: Floats, best: int, other: int) -> bool:
     worse = ((of_other - residuals) / np.maximum(noise, 1e-12)[:, None]).reshape(2, -1, _WINDOW)
     clear = 0.5 * np.maximum(np.isfinite(worse).sum((0, 2)), _WINDOW)
     total = np.nansum(worse, axis=(0, 2))
-    return bool((total > clear).sum() - 3 * (total < -clear).sum() < _MIN_WINDOWS)
+    return bool((total > clear).sum() - 3 * (total < -clear).sum() < _MIN_SPANS)
 
 
 def _compute_residuals(late: Floats, against: Floats, lag: int) -> Floats:

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.mounting import compute_levelling_rotation, find_up_axis
-from tcpipe.fusion.dead_reckoning import DeadReckoning
+from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, DeadReckoning
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
+    MAX_GAP_NS,
     Plane,
     compute_moving_mean,
     compute_seconds,
@@ -28,11 +29,8 @@ FIXES_S = 0.5
 """A velocity is made of fixes averaged over, and taken apart by, this long [s]: their noise is below the motion."""
 
 _LONGEST_NS, _STEP_NS = 1800 * 10**9, 300 * 10**9  # the window that is judged, and from one candidate to the next
-_MAX_GAP_NS = 500_000_000  # odometries and receivers of 2 Hz and more are interpolated
-_ACCELERATION_S = 0.3  # speeds are averaged over this before they are differentiated
-_SLOW_S = 4.0  # slower changes are also slip and slopes
-COURSE_MPS = 0.3
-"""Speed above which the course over ground is known [m/s]."""
+SMOOTH_S, _ACCELERATION_S, _SLOW_S = 0.1, 0.3, 4.0
+"""Times over which speeds and yaw rates are averaged, and accelerations; slower changes are also slip and slopes [s]."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -101,7 +99,7 @@ def resample_signal(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
     edges_s: Floats = (np.arange(at_ns.size + 1, dtype=np.float64) - 0.5) * GRID_S
     means = np.diff(integrate_signal(compute_seconds(stamp_ns, int(at_ns[0])), values, edges_s), axis=0) / GRID_S
     half = GRID_NS // 2
-    means[~is_covered(stamp_ns, at_ns - half, at_ns + half, least_ns=_MAX_GAP_NS)] = np.nan
+    means[~is_covered(stamp_ns, at_ns - half, at_ns + half, least_ns=MAX_GAP_NS)] = np.nan
     return means
 
 
@@ -126,11 +124,11 @@ def compute_fix_velocity(gnss: Positions, at_ns: Ints) -> Plane:
 
 
 def compute_course_rate(velocity_mps: Plane) -> Floats:
-    """Return how fast the direction of travel turns [rad/s], shape (M,), NaN below 0.3 m/s.
+    """Return how fast the direction of travel turns [rad/s], shape (M,), NaN below 0.2 m/s.
 
     An antenna ahead of the turning point by l leads the body's course by l / v: good for a sign, not for a clock.
     """
-    quick = np.where(np.abs(velocity_mps) > COURSE_MPS, velocity_mps, np.nan)
+    quick = np.where(np.abs(velocity_mps) > MIN_SPEED_MPS, velocity_mps, np.nan)
     return _differentiate(quick, lambda later, earlier: np.angle(later * np.conj(earlier)))
 
 

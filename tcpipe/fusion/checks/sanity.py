@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.checks.lags import Lag, find_lag, find_turn
 from tcpipe.fusion.checks.motions import (
     GRID_S,
+    SMOOTH_S,
     average,
     compute_acceleration,
     compute_course_rate,
@@ -29,9 +30,11 @@ from tcpipe.fusion.checks.motions import (
     find_liveliest_window_ns,
     resample_fixes,
     resample_imu,
+    resample_signal,
     resample_twist,
 )
 from tcpipe.fusion.checks.mounting import compute_levelling_rotation, find_nearest_mounting, find_up_axis
+from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
@@ -42,14 +45,13 @@ from tcpipe.fusion.measurements import (
     Measurements,
     Positions,
 )
+from tcpipe.fusion.preparation import GRAVITY_BAND_MPS2
 from tcpipe.fusion.signals import (
     Plane,
     compute_median_period_ns,
-    compute_seconds,
     hold_last,
-    integrate_signal,
-    is_covered,
 )
+from tcpipe.fusion.state import GRAVITY_MPS2
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 
 Floats = NDArray[np.float64]
@@ -331,18 +333,14 @@ def _check_shapes(found: Exclusions, pairs: Mapping[tuple[str, str], Pair], turn
 
 # The IMU
 
-_TURN_SMOOTH_S = 0.1
-"""Time over which yaw rates are averaged [s]."""
 _SLOWEST_S = 0.11
 """Longest period of an IMU that shows the motion between its samples [s]: 10 Hz, with the jitter of its driver."""
 _MIN_VALUES = 20
 """Values that show that a sensor is frozen."""
-_IN_G, _IN_MPS2 = (0.8, 1.25), (8.0, 12.0)
-"""Median size of a specific force in g and in m/s²."""
 _IN_DEGREES, _MAX_YAW_RATE_RADPS = 1.0 / 15.0, 15.0
 """Largest factor from a yaw rate in degrees to one in radians, 1/57 ideally; and a yaw rate that no robot reaches."""
 _TILTED_RAD, _ASIDE_RAD, _BACKWARDS_RAD = np.radians([30.0, 60.0, 120.0])
-"""Least tilt of a rotated IMU: slopes average out, and the steepest that is driven is 22.5°; yaws of one that looks aside and backwards."""
+"""Least tilt of a rotated IMU: slopes average out, and the steepest that is driven is 22.5°; yaws that look aside and backwards."""
 _SAME_WAY, _COHERENT, _MAX_YAW_STD_RAD = 0.5, 0.3, 0.1
 """Least agreement of two turns or directions, and of accelerations (0 to 1), and the largest σ of a yaw by accelerations."""
 
@@ -372,7 +370,7 @@ def _check_imu(
     yaws_rad = _compare_accelerations(force, twists, turns)
     if IMU not in found:
         _check_units(found, turns, turn, felt)
-    if IMU not in found and _IN_MPS2[0] <= felt <= _IN_MPS2[1]:
+    if IMU not in found and m.imu.accelerometer_usable:
         _check_mounting(found, find_up_axis(m.imu.specific_force_mps2), yaws_rad)
         if IMU not in found:
             _check_yaw_signs(found, turns, trust)
@@ -383,9 +381,9 @@ def _compare_turns(
     turn: Floats, gnss: Positions | None, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]
 ) -> dict[str, Lag]:
     """Return by sensor how its yaw rate follows from the gyroscope's."""
-    rates = {role: average(twist[:, 1], _TURN_SMOOTH_S) for role, twist in twists.items()}
+    rates = {role: average(twist[:, 1], SMOOTH_S) for role, twist in twists.items()}
     rates |= {} if gnss is None else {GNSS: compute_course_rate(compute_fix_velocity(gnss, at_ns))}
-    lags = {role: find_lag(rate, average(turn, _TURN_SMOOTH_S)) for role, rate in rates.items()}
+    lags = {role: find_lag(rate, average(turn, SMOOTH_S)) for role, rate in rates.items()}
     return {role: lag for role, lag in lags.items() if lag is not None and lag.explained > _SAME_WAY}
 
 
@@ -407,7 +405,8 @@ def _check_units(found: Exclusions, turns: Mapping[str, Lag], turn: Floats, felt
         evidence |= {"deg": {"turn_ratio": 1.0 / scale}} if scale < _IN_DEGREES else {}
     elif (known := np.abs(turn[np.isfinite(turn)])).size and np.percentile(known, 99.5) > _MAX_YAW_RATE_RADPS:
         evidence["deg"] = {"rate_max": float(known.max())}
-    evidence |= {"g": {"force_median": felt}} if _IN_G[0] <= felt <= _IN_G[1] else {}
+    low, high = GRAVITY_BAND_MPS2
+    evidence |= {"g": {"force_median": felt}} if low <= felt * GRAVITY_MPS2 <= high else {}
     if evidence:
         units = "_".join(evidence)
         numbers = {name: value for of_unit in evidence.values() for name, value in of_unit.items()}
@@ -437,8 +436,6 @@ def _make_yaw_exclusion(yaws_rad: Mapping[str, float], turned_by: Floats) -> Sen
 
 # Directions
 
-_MOVING_MPS = 0.2
-"""Speed from which on a direction counts [m/s]."""
 _MIN_MOVING_ROWS = 100
 """Rows of the grid that show how two directions agree, 2 s."""
 
@@ -481,7 +478,7 @@ def _check_directions(
 
 def compute_agreement(velocity_mps: Floats, other_mps: Floats) -> float | None:
     """Return by how much two signed velocities go the same way, -1 to 1, or None where one of them hardly moves; shape (M,) each."""
-    moving = (np.abs(velocity_mps) > _MOVING_MPS) & (np.abs(other_mps) > _MOVING_MPS)
+    moving = (np.abs(velocity_mps) > MIN_SPEED_MPS) & (np.abs(other_mps) > MIN_SPEED_MPS)
     if moving.sum() < _MIN_MOVING_ROWS:
         return None
     return float(np.mean(np.sign(velocity_mps[moving] * other_mps[moving])))
@@ -489,8 +486,8 @@ def compute_agreement(velocity_mps: Floats, other_mps: Floats) -> float | None:
 
 # The receiver's own velocity, scales
 
-_OFF = 0.25  # allowed share of disagreement in the right frame
-_MAX_GAP_NS = 1_000_000_000
+_MAX_FRAME_MISFIT = 0.25
+"""Share of its size by which the path of a velocity in the right frame may differ from that of the fixes."""
 
 
 def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
@@ -498,10 +495,8 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     at_ns = find_liveliest_window_ns(m)
     if m.doppler is None or at_ns is None:
         return None
-    velocity, stamp_ns = m.doppler.velocity_enu_mps[:, :2], m.doppler.stamp_ns
-    at_s, stamp_s = (compute_seconds(each, int(at_ns[0])) for each in (at_ns, stamp_ns))
-    path = integrate_signal(stamp_s, velocity, at_s) @ np.array([1.0, 1j])
-    path[~is_covered(stamp_ns, at_ns, at_ns, least_ns=_MAX_GAP_NS)] = np.nan
+    velocity = resample_signal(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns) @ np.array([1.0, 1j])
+    path = np.where(np.isfinite(velocity), np.cumsum(np.nan_to_num(velocity)) * GRID_S, np.nan)
     fixes = np.full_like(path, np.nan) if m.gnss is None else resample_fixes(m.gnss, at_ns)
     pair, driven = (compare_paths(fixes, each, _compute_noise_m2(m.gnss)) for each in (path, fixes))
     if pair is None or driven is None:
@@ -511,12 +506,12 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
         misfit_m2 = np.maximum(pair.a_m2 + pair.b_m2 - 2.0 * product.real, 0.0)
         return float(np.median(np.sqrt(misfit_m2 / np.maximum(pair.a_m2, 1e-9))))
 
-    if compute_misfit(pair.product) <= _OFF:
+    if compute_misfit(pair.product) <= _MAX_FRAME_MISFIT:
         return None
     if pair.ratio < 0.1:
-        return _make_frozen_exclusion(DOPPLER, "velocity", stamp_ns.size)
-    is_ned = compute_misfit(-1j * pair.mirrored) <= _OFF
-    if is_ned or abs(pair.ratio - 1.0) <= _OFF:
+        return _make_frozen_exclusion(DOPPLER, "velocity", m.doppler.stamp_ns.size)
+    is_ned = compute_misfit(-1j * pair.mirrored) <= _MAX_FRAME_MISFIT
+    if is_ned or abs(pair.ratio - 1.0) <= _MAX_FRAME_MISFIT:
         return SensorExclusion(DOPPLER, "velocity-frame", {"frame": "north-east-down" if is_ned else "unknown"})
     return SensorExclusion(DOPPLER, "distance-contradicted", {"reference": GNSS}, {"distance_ratio": pair.ratio})
 
@@ -531,11 +526,12 @@ def rescale_odometries(m: Measurements, scales: Mapping[str, float]) -> Measurem
     return m.replace_sensors(rescaled)
 
 
-_SHORTEST_NS = 40_000_000_000  # shorter may be one place of slip
-_HELD_NS = 3_000_000_000  # a command this long is reached
-_STEP_MPS = 0.1  # smaller steps are jitter (`mask.command_step_mps`)
-_DRIVES_MPS = 0.3  # motors round slower commands
-_FASTER = 1.03  # of a command: no controller overshoots more
+_MIN_COMMANDED_NS = 40_000_000_000
+"""Time under constant commands that shows a ratio [ns]: less may be one place of slip."""
+_MAX_STEP_MPS = 0.1
+"""Largest change of a command that is jitter [m/s] (`mask.command_step_mps`)."""
+_MIN_COMMAND_RATIO = 1.03
+"""Ratio of speed to command that no controller overshoots to [1]."""
 
 
 def compute_command_ratio(m: Measurements, command: Command | None) -> float | None:
@@ -546,13 +542,13 @@ def compute_command_ratio(m: Measurements, command: Command | None) -> float | N
     wheels = m.wheels
     if wheels is None or m.gnss is not None or m.visual is not None or command is None or command.stamp_ns.size == 0:
         return None
-    commanded_mps = hold_last(command.stamp_ns, command.forward_velocity_mps, wheels.stamp_ns)
+    commands_mps = [
+        hold_last(command.stamp_ns, command.forward_velocity_mps, wheels.stamp_ns - ago_ns)
+        for ago_ns in range(0, 3_500_000_000, 500_000_000)
+    ]
     # A difference to an unknown command is NaN, which is a change.
-    changed = np.flatnonzero(~(np.abs(np.diff(commanded_mps, prepend=commanded_mps[0])) <= _STEP_MPS))
-    began = np.concatenate(([0], changed))[np.searchsorted(changed, np.arange(commanded_mps.size), "right")]
-    is_held = wheels.stamp_ns - wheels.stamp_ns[began] > _HELD_NS
-    rows = is_held & (np.abs(commanded_mps) > _DRIVES_MPS) & np.isfinite(commanded_mps)
-    if rows.sum() * compute_median_period_ns(wheels.stamp_ns) < _SHORTEST_NS:
+    rows = (np.ptp(commands_mps, axis=0) <= _MAX_STEP_MPS) & (np.abs(commands_mps[0]) > MIN_SPEED_MPS)
+    if rows.sum() * compute_median_period_ns(wheels.stamp_ns) < _MIN_COMMANDED_NS:
         return None
-    ratio = wheels.velocity_mps[rows, 0] / commanded_mps[rows]
-    return float(np.median(ratio)) if np.quantile(ratio, 0.25) > _FASTER else None
+    ratio = wheels.velocity_mps[rows, 0] / commands_mps[0][rows]
+    return float(np.median(ratio)) if np.quantile(ratio, 0.25) > _MIN_COMMAND_RATIO else None
