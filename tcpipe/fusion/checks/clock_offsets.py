@@ -68,8 +68,8 @@ _MIN_EXPLAINED = 0.25
 """Least share of a signal's variance that another one on the right clock explains: noise and slip are the rest."""
 _LEAST_STD_S, _LEAST_BY_FORCE_S, _COARSE_STD_S = 1e-3, 0.02, 0.1
 """Standard deviations of offsets [s]: at least; by an accelerometer, which slopes act on; by the coarse search."""
-_WINDOW_NS, _MIN_WINDOWS = 600_000_000_000, 3
-"""Time in which a clock does not drift [ns], and how many of these show a drift."""
+_WINDOW_NS, _MIN_WINDOWS = (40_000_000_000, 600_000_000_000), 3
+"""Least and most time in which a clock does not drift [ns], a quarter of the run in between, and how many of these show a drift."""
 _DRIFT_STD = 1e-3
 """Standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz."""
 _LIVELY, _NEAR_ROWS = 0.1, round(2.0 / GRID_S)
@@ -84,7 +84,7 @@ def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
     """Return the offsets between the stamps of a clock epoch's sensors."""
     middle_ns, span_s = find_middle_ns(m)
     evidence: dict[tuple[str, str, str], list[tuple[float, Plane]]] = {}
-    for at_ns in iterate_windows_ns(m, _WINDOW_NS):
+    for at_ns in iterate_windows_ns(m, round(np.clip(0.2e9 * span_s, *_WINDOW_NS))):
         inside = select_measurements(m, int(at_ns[0]), int(at_ns[-1]))
         at_s = float(compute_seconds((at_ns[0] + at_ns[-1]) // 2, middle_ns))
         for late, against, by, target, regressor in _iterate_signals(inside, at_ns):
@@ -154,11 +154,20 @@ def _compute_lateness(offset: ClockOffset, from_middle_s: Floats | float) -> Flo
 
 
 def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float, Plane]]) -> list[ClockPair]:
-    """Return two sensors compared: in each window if three determine the offset, else over the run."""
-    found = [(at_s, estimate_lag([sums])) for at_s, sums in windows] if len(windows) >= _MIN_WINDOWS else []
-    pairs = [pair for at_s, lag in found if lag and (pair := make_pair(late, against, by, lag, at_s)).determined]
-    if len(pairs) >= _MIN_WINDOWS:
-        return pairs
+    """Return two sensors compared: in each window if three show one offset and drift, else over the run."""
+    lags = [(at_s, lag) for at_s, sums in windows if (lag := estimate_lag([sums])) and lag.explained >= _MIN_EXPLAINED]
+    at_s, offset_s, std_s = np.reshape([(at_s, lag.offset_s, lag.std_s) for at_s, lag in lags], (-1, 3)).T
+    known = std_s <= _MAX_STD_OF_LARGE_S
+    if known.sum() >= _MIN_WINDOWS:
+        line = np.polyfit(at_s[known], offset_s[known], 1, w=1.0 / np.maximum(std_s[known], _LEAST_STD_S))
+        misfit_s = np.abs(offset_s - np.polyval(line, at_s))[known]
+        if (misfit_s <= np.maximum(MIN_SIGMAS * std_s[known], NOTED_S)).all():
+            return [
+                ClockPair(
+                    late, against, by, lag.offset_s, lag.std_s, lag.explained, determined=True, from_middle_s=at_s
+                )
+                for at_s, lag in (lags[k] for k in np.flatnonzero(known))
+            ]
     whole = estimate_lag([sums for _, sums in windows])
     return [make_pair(late, against, by, whole)] if whole and np.isfinite(whole.std_s) else []
 
