@@ -16,7 +16,7 @@ from tcpipe.fusion.checks.clock_offsets import (
 from tcpipe.fusion.checks.lags import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
-from tcpipe.fusion.measurements import DOPPLER, GNSS, Measurements
+from tcpipe.fusion.measurements import DOPPLER, GNSS
 from tcpipe.fusion.signals import MAX_GAP_NS
 from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
@@ -152,29 +152,23 @@ def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding
 
     Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
     """
-    epochs: dict[int, list[Measurements]] = {}
-    for section in sections:
-        epochs.setdefault(section.clock_epoch, []).append(section.measurements)
-    stamps = {
-        epoch: np.unique(np.concatenate([sensor.stamp_ns for m in of_epoch for sensor in m.sensors().values()]))
-        for epoch, of_epoch in epochs.items()
-        if any(m.sensors() for m in of_epoch)
-    }
-    for epoch, stamp_ns in stamps.items():
-        wheels = [m.first_odometry for m in epochs[epoch] if m.first_odometry is not None]
-        fixes = [m.gnss for m in epochs[epoch] if m.gnss is not None]
-        if not wheels or not fixes:
+    stamps = [sensor.stamp_ns for section in sections for sensor in section.measurements.sensors().values()]
+    for epoch in dict.fromkeys(section.clock_epoch for section in sections):
+        of_epoch = [section.measurements for section in sections if section.clock_epoch == epoch]
+        odometries = [m.first_odometry for m in of_epoch if m.first_odometry is not None]
+        fixes = [m.gnss for m in of_epoch if m.gnss is not None]
+        if not odometries or not fixes:
             continue
-        wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (wheels, fixes))
-        speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in wheels])
+        wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (odometries, fixes))
+        speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in odometries])
         place_m = np.concatenate([each.position_enu_m[:, :2] for each in fixes])
-        for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > MAX_GAP_NS]:
-            step_s = float(np.diff(ends_ns)[0]) * 1e-9
-            at_s = float(ends_ns[1] - min(each[0] for each in stamps.values())) * 1e-9
-            driven = np.interp(ends_ns, wheels_ns, speed_mps)
-            moved_m = [np.diff(np.interp(ends_ns, fixes_ns, axis)) for axis in place_m.T]
-            slowest_mps = float(np.abs(driven).min())
-            if slowest_mps > MIN_SPEED_MPS and np.linalg.norm(moved_m) < 0.5 * slowest_mps * step_s:
-                span_s, names = (at_s, at_s), {"topics": "all topics"}
-                finding = make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)
-                yield int(ends_ns[1]), finding
+        stamp_ns = np.unique(np.concatenate([sensor.stamp_ns for m in of_epoch for sensor in m.sensors().values()]))
+        ends_ns = np.stack((stamp_ns[:-1], stamp_ns[1:]))[:, np.diff(stamp_ns) > MAX_GAP_NS]
+        steps_s = np.diff(ends_ns, axis=0)[0] * 1e-9
+        slowest_mps = np.abs(np.interp(ends_ns, wheels_ns, speed_mps)).min(axis=0)
+        moved_m = np.hypot(*(np.diff(np.interp(ends_ns, fixes_ns, axis), axis=0)[0] for axis in place_m.T))
+        jumps = (slowest_mps > MIN_SPEED_MPS) & (moved_m < 0.5 * slowest_mps * steps_s)
+        for after_ns, step_s in zip(ends_ns[1, jumps].tolist(), steps_s[jumps].tolist(), strict=True):
+            at_s = (after_ns - min(int(each[0]) for each in stamps)) * 1e-9
+            span_s, names = (at_s, at_s), {"topics": "all topics"}
+            yield after_ns, make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)

@@ -204,8 +204,8 @@ _MIN_SCORE, _MIN_EXPLAINED = 18.0, 0.16
 """Least log-likelihood ratio of the best lag, 6 σ: noise reaches 4 σ in 3,000 lags; and least share explained of one signal."""
 _WINDOW = 50
 """Rows in which two lags are compared, 10 s."""
-_APART, _PEAKS = 15, 25
-"""Rows between separate peaks, 3 s, and most peaks that are compared with the best."""
+_APART, _MIN_RIVAL = 15, 0.25
+"""Rows between separate peaks, 3 s, and least log-likelihood ratio of a row at a rival peak over that at the best [1]."""
 
 
 def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
@@ -241,9 +241,8 @@ def find_coarse_lag(late: Floats, against: Floats) -> float | None:
         return None
     if abs(best - _MOST) * COARSE_S > NEAR_S:
         peaks = _find_peaks(height)
-        peaks = peaks[(np.abs(peaks - best) > _APART) & (height[peaks] > 0.0)]
-        peaks = np.append(peaks[np.argsort(-height[peaks], kind="stable")][:_PEAKS], _MOST)
-        if any(_is_rival(late, against, best - _MOST, int(peak) - _MOST) for peak in peaks if height[peak] > 0.0):
+        peaks = peaks[(np.abs(peaks - best) > _APART) & (height[peaks] > _MIN_RIVAL * height[best])]
+        if any(_is_rival(late, against, best - _MOST, peak - _MOST) for peak in (_MOST, *peaks.tolist())):
             return None
     return (best - _MOST + _refine_peak(score, best)) * COARSE_S
 
@@ -255,7 +254,7 @@ def _is_rival(late: Floats, against: Floats, best: int, other: int) -> bool:
     worse = ((of_other - residuals) / np.maximum(noise, 1e-12)[:, None]).reshape(2, -1, _WINDOW)
     clear = 0.5 * np.maximum(np.isfinite(worse).sum((0, 2)), _WINDOW)
     total = np.nansum(worse, axis=(0, 2))
-    return bool((total > clear).sum() - 3 * (total < -clear).sum() < _MIN_SPANS)
+    return bool((total > clear).sum() - 3 * (total < -clear).sum() < 2 * _MIN_SPANS)
 
 
 def _compute_residuals(late: Floats, against: Floats, lag: int) -> Floats:
