@@ -20,6 +20,7 @@ from tcpipe.fusion.signals import (
     Plane,
     compute_interval_means,
     compute_median_period_ns,
+    compute_moving_mean,
     compute_seconds,
     multiply_by_vector,
     remove_spikes,
@@ -140,12 +141,7 @@ def _mean_force(
 
 def average_grid(values: Floats, window_s: float) -> Floats:
     """Return the centred moving mean over a window, along the first axis; shorter at the ends."""
-    half = max(1, round(0.5 * window_s / STEP_S))
-    total = np.concatenate((np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)))
-    index = np.arange(len(values))
-    first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
-    count = (last - first).reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray((total[last] - total[first]) / count)
+    return compute_moving_mean(values, max(1, round(0.5 * window_s / STEP_S)), least=0.0)
 
 
 def _multiply_increments(turn_rad: Floats) -> Floats:

@@ -130,14 +130,15 @@ def remove_spikes(values: Floats, *, fill: float | None = None) -> Floats:
 
 
 def compute_moving_mean(values: NDArray[Any], half: int, *, least: float = 1.0) -> NDArray[Any]:
-    """Return the mean of the known ones among the ``half`` rows on either side of each, and itself, shape (N,).
+    """Return the mean of the known ones among the ``half`` rows on either side of each, and itself, shape (N, ...).
 
     NaN where less than the share ``least`` of those rows are known.
     """
     known = np.isfinite(values)
-    rows = np.arange(values.size)
-    first, last = np.maximum(rows - half, 0), np.minimum(rows + half + 1, values.size)
-    sums, counts = (np.append(0.0, np.cumsum(each)) for each in (np.where(known, values, 0.0), known))
+    rows = np.arange(len(values))
+    first, last = np.maximum(rows - half, 0), np.minimum(rows + half + 1, len(values))
+    before = np.zeros((1, *values.shape[1:]))
+    sums, counts = (np.concatenate((before, np.cumsum(each, axis=0))) for each in (np.where(known, values, 0.0), known))
     count = counts[last] - counts[first]
     mean = (sums[last] - sums[first]) / np.maximum(count, 1.0)
     return np.where(count >= least * (2 * half + 1), mean, np.nan)

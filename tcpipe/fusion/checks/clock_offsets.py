@@ -6,9 +6,9 @@ are compared only where the robot turns or changes its speed: on a straight ther
 and that leads the body. The course of the fixes is not compared with the gyroscope: an antenna that sits ahead of the turning point by l
 leads the body's course by l / v, 0.1 s for 10 cm.
 
-The pairs together, in windows of ten minutes, give each sensor's offset and drift from the clock that most of them share. A sensor is
-blamed only where two others agree against it and no pair contradicts; else two differ, and it is unknown which is wrong. Clocks that are up
-to five minutes apart are found first, by the coarse search.
+The pairs together, in windows of at most ten minutes, give each sensor's offset and drift from the clock that most of them share. A
+sensor is blamed only where two others agree against it and no pair contradicts; else two differ, and it is unknown which is wrong. Clocks
+that are up to five minutes apart are found first, by the coarse search.
 """
 
 from __future__ import annotations
@@ -69,9 +69,8 @@ _MIN_EXPLAINED = 0.25
 _LEAST_STD_S, _LEAST_BY_FORCE_S, _COARSE_STD_S = 1e-3, 0.02, 0.1
 """Standard deviations of offsets [s]: at least; by an accelerometer, which slopes act on; by the coarse search."""
 _WINDOW_NS, _MIN_WINDOWS = (40_000_000_000, 600_000_000_000), 3
-"""Least and most time in which a clock does not drift [ns], a quarter of the run in between, and how many of these show a drift."""
-_DRIFT_STD = 1e-3
-"""Standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz."""
+"""Least and most time in which a clock does not drift [ns], a fifth of the run in between, and how many of these show a drift."""
+_DRIFT_STD = 1e-3  # standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz
 _LIVELY, _NEAR_ROWS = 0.1, round(2.0 / GRID_S)
 """Yaw rate [rad/s] or change of speed [m/s] of a manoeuvre, and rows around one that are compared: 2 s."""
 
@@ -162,21 +161,19 @@ def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float,
         line = np.polyfit(at_s[known], offset_s[known], 1, w=1.0 / np.maximum(std_s[known], _LEAST_STD_S))
         misfit_s = np.abs(offset_s - np.polyval(line, at_s))[known]
         if (misfit_s <= np.maximum(MIN_SIGMAS * std_s[known], NOTED_S)).all():
-            return [
-                ClockPair(
-                    late, against, by, lag.offset_s, lag.std_s, lag.explained, determined=True, from_middle_s=at_s
-                )
-                for at_s, lag in (lags[k] for k in np.flatnonzero(known))
+            found = [
+                (at_s, make_pair(late, against, by, lag)) for at_s, lag in lags if lag.std_s <= _MAX_STD_OF_LARGE_S
             ]
+            return [replace(pair, determined=True, from_middle_s=at_s) for at_s, pair in found]
     whole = estimate_lag([sums for _, sums in windows])
     return [make_pair(late, against, by, whole)] if whole and np.isfinite(whole.std_s) else []
 
 
-def make_pair(late: str, against: str, by: str, lag: Lag, from_middle_s: float = 0.0) -> ClockPair:
+def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
     """Return two sensors compared; a lag is determined where its error is small or it is surely not zero."""
     is_large = lag.std_s <= _MAX_STD_OF_LARGE_S and abs(lag.offset_s) > _MIN_SIGMAS_OF_LARGE * lag.std_s
     determined = (lag.std_s <= _MAX_STD_S or is_large) and lag.explained >= _MIN_EXPLAINED
-    return ClockPair(late, against, by, lag.offset_s, lag.std_s, lag.explained, determined, from_middle_s)
+    return ClockPair(late, against, by, lag.offset_s, lag.std_s, lag.explained, determined)
 
 
 def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tuple[str, str, str, Any, Any]]:
@@ -191,8 +188,7 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
                 changes = find_quick_part(average(twist[:, 0], SMOOTH_S))
                 yield role, IMU, ACCELERATION, _select_near(changes, compute_acceleration(twist)), force
     if len(twists) == 2:
-        speeds = (find_quick_part(average(np.abs(twists[role][:, 0]), SMOOTH_S)) for role in (VISUAL, WHEELS))
-        target, seen = speeds
+        target, seen = (find_quick_part(average(np.abs(twists[role][:, 0]), SMOOTH_S)) for role in (VISUAL, WHEELS))
         yield VISUAL, WHEELS, SPEED, _select_near(seen, target), seen
     if m.gnss is not None:
         velocity = compute_fix_velocity(m.gnss, at_ns)
@@ -223,9 +219,7 @@ def solve_offsets(
 ) -> ClockFacts:
     """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined.
 
-    Clocks that are within ``near_s`` are one.
-
-    The receiver's velocity has no say: it has the clock of the fixes, and no label needs it.
+    Clocks within ``near_s`` are one. The receiver's velocity has no say: it has the clock of the fixes, and no label needs it.
     """
     known = [pair for pair in pairs if pair.determined]
     solved = {
@@ -233,7 +227,12 @@ def solve_offsets(
     }
     if not solved:
         return ClockFacts(clock_epoch, "", tuple(pairs), {})
-    agreeing = {role: {role, *_find_agreeing(offsets, near_s)} for role, offsets in solved.items()}
+    # Sensors near a reference agree with it, however certain: a reference clock with a large σ proves no offset.
+    agreeing = {
+        role: {role}
+        | {each for each, of in offsets.items() if abs(of.offset_s) <= near_s and not of.drift_ppm} - {DOPPLER}
+        for role, offsets in solved.items()
+    }
     reference = max(solved, key=lambda role: len(agreeing[role]))  # the first of equals
     offsets = {reference: ClockOffset(0.0, 0.0, noted=False)} | solved[reference]
     blamed = {role: role == DOPPLER or _is_blamed(role, agreeing[reference], offsets, known) for role in offsets}
@@ -284,12 +283,6 @@ def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
     for _ in ROLES:
         connected |= {each for p in pairs if connected & {p.late, p.against} for each in (p.late, p.against)}
     return connected
-
-
-def _find_agreeing(offsets: Mapping[str, ClockOffset], near_s: float) -> set[str]:
-    """Return the sensors near the reference, however certain: a reference clock with a large σ proves no offset."""
-    near = {role for role, offset in offsets.items() if abs(offset.offset_s) <= near_s and not offset.drift_ppm}
-    return near - {DOPPLER}
 
 
 def _is_blamed(

@@ -31,8 +31,7 @@ _GROUPS, _MIN_GROUPS, _MIN_GROUP_S, _MIN_SPANS = 20, 8, 2.0, 4
 """Most and fewest groups of the jackknife, their least length [s], and how many separate spans of time have to show a lag."""
 _INDEPENDENT = 10
 """Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s, those of the coarse search over 1 s, which is 5 rows."""
-_MIN_CHI_SQUARED = 10.83
-"""By how much a rival peak must fit worse [1]: 99.9 % of χ² with one degree of freedom."""
+_MIN_CHI_SQUARED = 10.83  # by how much a rival peak must fit worse [1]: 99.9 % of χ² with one degree of freedom
 _TINY = 1e-12
 
 
@@ -53,13 +52,13 @@ class Products:
     """Sums of products of a target and a regressor by group of time and lag."""
 
     def __init__(self, sums: Plane) -> None:
-        """Take the sums of 1, x, y, |x|², |y|² and conj(x) y, shape (6, G, L), of regressor x and target y where both are known."""
-        self.rows = sums[0].real
-        x, y, xx, yy, xy = sums[1:]
+        """Take the sums of `sum_products`, shape (6, G, L)."""
+        n, x, xx, y, yx, yy = sums
+        self.rows = np.rint(n.real)
         count = np.maximum(self.rows, 1.0)
         self.target = yy.real - np.abs(y) ** 2 / count
         self.regressor = xx.real - np.abs(x) ** 2 / count
-        self.product = xy - np.conj(x) * y / count
+        self.product = np.conj(yx - y * x / count)
 
     @property
     def explained(self) -> Floats:
@@ -70,29 +69,19 @@ class Products:
 
 
 def sum_products(target: NDArray[Any], regressor: NDArray[Any], most: int, groups: int = 1) -> Plane:
-    """Return the sums for `Products` of signals (M,) at lags of up to ``most`` rows, by groups of time of equal length."""
+    """Return sums over a target y and a regressor x, shape (M,), by groups of time of equal length and lags up to ``most`` rows.
+
+    They are of 1, x, |x|², conj(y), conj(y) x and |y|² where both are known, shape (6, G, L).
+    """
     length = target.size // groups
     y = target[: groups * length].reshape(groups, length)
     padded = np.pad(regressor, most, constant_values=np.nan)
     x = np.lib.stride_tricks.sliding_window_view(padded, length + 2 * most)[: groups * length : length]
     size = 1 << (length + 2 * most - 1).bit_length()
-    known = [np.isfinite(each) for each in (x, y)]
-    x, y = (np.where(where, each, 0.0) for where, each in zip(known, (x, y), strict=True))
-    of_x, of_y = (np.fft.fft([where, each, np.abs(each) ** 2], size) for where, each in zip(known, (x, y), strict=True))
-
-    def multiply(k: int, j: int) -> Plane:
-        """Return the sums of the k-th power of y(t), conjugate, and the j-th of x(t - lag)."""
-        return np.fft.ifft(np.conj(of_y[k]) * of_x[j])[:, 2 * most :: -1]
-
-    sums = (
-        multiply(0, 0),
-        multiply(0, 1),
-        multiply(1, 0).conj(),
-        multiply(0, 2),
-        multiply(2, 0),
-        multiply(1, 1).conj(),
-    )
-    return np.stack((np.rint(sums[0].real), *sums[1:]))
+    powers = ([known, np.where(known, each, 0.0)] for each in (y, x) for known in [np.isfinite(each)])
+    of_y, of_x = (np.fft.fft([known, each, np.abs(each) ** 2], size) for known, each in powers)
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))
+    return np.stack([np.fft.ifft(np.conj(of_y[k]) * of_x[j])[:, 2 * most :: -1] for k, j in pairs])
 
 
 # Clocks that are nearly the same
@@ -119,7 +108,7 @@ def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
     sums = np.concatenate(windows, axis=1)
     together = -(-sums.shape[1] // (2 * _GROUPS))  # fewer, longer groups
     sums = np.add.reduceat(sums, np.arange(0, sums.shape[1], together), axis=1)
-    sums = sums[:, (sums[0].real > 0.0).all(axis=1)]
+    sums = sums[:, (sums[0].real > 0.5).all(axis=1)]
     groups = sums.shape[1]
     if groups < _MIN_SPANS:
         return None
@@ -192,18 +181,14 @@ COARSE_S = 0.2
 """Spacing of the rows of the coarse search [s]."""
 NEAR_S = MAX_LAG_S - COARSE_S
 """Largest lag that the fine search surely finds [s]."""
-_MOST = 1500
-"""Largest lag that is searched [rows], 5 min."""
+_MOST = 1500  # largest lag that is searched [rows], 5 min
 _SMOOTH, _SLOW = 2, 75
 """Half the rows over which signals are averaged, and about whose mean they are compared: 1 s and 30 s in all."""
-_MANOEUVRES = (0.15, 0.1)
-"""Least size of a signal that varies [m/s], [rad/s]."""
-_MIN_ROWS = 450
-"""Rows of the least overlap, 90 s."""
+_MANOEUVRES = (0.15, 0.1)  # least size of a signal that varies [m/s], [rad/s]
+_MIN_ROWS = 450  # rows of the least overlap, 90 s
 _MIN_SCORE, _MIN_EXPLAINED = 18.0, 0.16
 """Least log-likelihood ratio of the best lag, 6 σ: noise reaches 4 σ in 3,000 lags; and least share explained of one signal."""
-_WINDOW = 50
-"""Rows in which two lags are compared, 10 s."""
+_WINDOW = 50  # rows in which two lags are compared, 10 s
 _APART, _MIN_RIVAL = 15, 0.25
 """Rows between separate peaks, 3 s, and least log-likelihood ratio of a row at a rival peak over that at the best [1]."""
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.mounting import compute_levelling_rotation, find_up_axis
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, DeadReckoning
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -21,6 +20,7 @@ from tcpipe.fusion.signals import (
     remove_spikes,
     remove_wild_places,
 )
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rotation_vector
 
 GRID_S = 0.02
 """Spacing of the grid [s]."""
@@ -31,6 +31,8 @@ FIXES_S = 0.5
 _LONGEST_NS, _STEP_NS = 1800 * 10**9, 300 * 10**9  # the window that is judged, and from one candidate to the next
 SMOOTH_S, _ACCELERATION_S, _SLOW_S = 0.1, 0.3, 4.0
 """Times over which speeds and yaw rates are averaged, and accelerations; slower changes are also slip and slopes [s]."""
+_MIN_STEADINESS = 0.4
+"""Least length of the mean direction of a force that shows up [1]: that of a unit whose gravity is removed changes."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -140,6 +142,24 @@ def _differentiate(
     changes = subtract(values[2 * half :], values[: -2 * half]) / (2 * half * GRID_S)
     rates: NDArray[Any] = np.pad(changes, half, constant_values=np.nan)[: values.size]
     return rates
+
+
+def find_up_axis(force: Floats) -> Floats:
+    """Return the mean direction of the specific force (N, 3), shape (3,); z where the force has no steady direction."""
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    mean: Floats = np.mean(np.divide(force, size, out=np.zeros_like(force), where=size > 0), axis=0)
+    length = np.linalg.norm(mean)
+    return mean / length if length > _MIN_STEADINESS else np.array([0.0, 0.0, 1.0])
+
+
+def compute_levelling_rotation(up: Floats) -> Floats:
+    """Return the smallest rotation, as a matrix (3, 3), that turns a unit vector to +z."""
+    cross = np.cross(up, [0.0, 0.0, 1.0])
+    size = float(np.linalg.norm(cross))
+    if size < 1e-9:
+        return np.eye(3) if up[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    matrix: Floats = matrix_from_quat(quat_from_rotation_vector(cross / size * np.arctan2(size, up[2])))
+    return matrix
 
 
 def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane]:

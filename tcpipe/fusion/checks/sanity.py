@@ -26,14 +26,15 @@ from tcpipe.fusion.checks.motions import (
     compute_acceleration,
     compute_course_rate,
     compute_fix_velocity,
+    compute_levelling_rotation,
     dead_reckon,
     find_liveliest_window_ns,
+    find_up_axis,
     resample_fixes,
     resample_imu,
     resample_signal,
     resample_twist,
 )
-from tcpipe.fusion.checks.mounting import compute_levelling_rotation, find_nearest_mounting, find_up_axis
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import (
     DOPPLER,
@@ -199,18 +200,13 @@ _WINDOWS_S = (20.0, 60.0, 180.0)
 """Windows of paths [s]: longer ones where the noise of fixes hides what is driven in shorter ones."""
 _FAR_M, _BEND_M = 1.0, 0.3
 """Size of a path that moves, and size by which a path bends that differs from its mirror image [m]."""
-_MIN_MOVING_WINDOWS = 3
-"""Windows that show how far or along which path a robot drives."""
+_MIN_MOVING_WINDOWS = 3  # windows that show how far or along which path a robot drives
 _MAX_RATIO, _STILL_RATIO, _MAX_SCALE = 2.0, 20.0, 5.0
 """Ratios of distances: that agree; from which on the shorter one is no motion; of an odometry whose scale is taken out."""
-_MAX_MISFIT = 0.3
-"""Share of the size of a path that slip may bend, and of windows that may be unlike."""
-_MIRROR_RATIO = 3.0
-"""Ratio of misfits that decides between a path and its mirror image."""
-_UNITS = {"km/h": (3.2, 4.0), "radians": (1 / 75, 1 / 30)}
-"""Ratios of distances by which a unit is named."""
-_NODE = round(0.5 / GRID_S)
-"""Rows of the grid between the places that are compared."""
+_MAX_MISFIT = 0.3  # share of the size of a path that slip may bend, and of windows that may be unlike
+_MIRROR_RATIO = 3.0  # ratio of misfits that decides between a path and its mirror image
+_UNITS = {"km/h": (3.2, 4.0), "radians": (1 / 75, 1 / 30)}  # ratios of distances by which a unit is named
+_NODE = round(0.5 / GRID_S)  # rows of the grid between the places that are compared
 
 
 def _compute_noise_m2(gnss: Positions | None) -> float:
@@ -335,12 +331,12 @@ def _check_shapes(found: Exclusions, pairs: Mapping[tuple[str, str], Pair], turn
 
 _SLOWEST_S = 0.11
 """Longest period of an IMU that shows the motion between its samples [s]: 10 Hz, with the jitter of its driver."""
-_MIN_VALUES = 20
-"""Values that show that a sensor is frozen."""
+_MIN_VALUES = 20  # values that show that a sensor is frozen
 _IN_DEGREES, _MAX_YAW_RATE_RADPS = 1.0 / 15.0, 15.0
 """Largest factor from a yaw rate in degrees to one in radians, 1/57 ideally; and a yaw rate that no robot reaches."""
 _TILTED_RAD, _ASIDE_RAD, _BACKWARDS_RAD = np.radians([30.0, 60.0, 120.0])
 """Least tilt of a rotated IMU: slopes average out, and the steepest that is driven is 22.5°; yaws that look aside and backwards."""
+_AXIS_ALIGNED_RAD = 0.25  # angle within which a mounting is taken as along the axes
 _SAME_WAY, _COHERENT, _MAX_YAW_STD_RAD = 0.5, 0.3, 0.1
 """Least agreement of two turns or directions, and of accelerations (0 to 1), and the largest σ of a yaw by accelerations."""
 
@@ -427,6 +423,17 @@ def _check_mounting(found: Exclusions, up: Floats, yaws_rad: Mapping[str, float]
         found[IMU] = _make_yaw_exclusion(yaws_rad, turned_by)
 
 
+def find_nearest_mounting(base_from_sensor: Floats) -> Floats:
+    """Return the rotation (3, 3) with axes along axes that is nearest, or the given one where none is near."""
+    largest = np.argmax(np.abs(base_from_sensor), axis=1)
+    aligned = np.zeros((3, 3))
+    aligned[np.arange(3), largest] = np.sign(base_from_sensor[np.arange(3), largest])
+    if abs(np.linalg.det(aligned) - 1.0) > 1e-9:
+        return base_from_sensor
+    angle = np.arccos(np.clip((np.trace(aligned.T @ base_from_sensor) - 1) / 2, -1.0, 1.0))
+    return aligned if angle < _AXIS_ALIGNED_RAD else base_from_sensor
+
+
 def _make_yaw_exclusion(yaws_rad: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
     """Return the exclusion of an IMU that the accelerations of odometries show to be turned, by yaw [rad]."""
     names = {"evidence": "acceleration", "reference": ", ".join(yaws_rad)}
@@ -436,8 +443,7 @@ def _make_yaw_exclusion(yaws_rad: Mapping[str, float], turned_by: Floats) -> Sen
 
 # Directions
 
-_MIN_MOVING_ROWS = 100
-"""Rows of the grid that show how two directions agree, 2 s."""
+_MIN_MOVING_ROWS = 100  # rows of the grid that show how two directions agree, 2 s
 
 
 def _check_yaw_signs(found: Exclusions, turns: Mapping[str, Lag], trust: Mapping[str, float]) -> None:
@@ -528,10 +534,8 @@ def rescale_odometries(m: Measurements, scales: Mapping[str, float]) -> Measurem
 
 _MIN_COMMANDED_NS = 40_000_000_000
 """Time under constant commands that shows a ratio [ns]: less may be one place of slip."""
-_MAX_STEP_MPS = 0.1
-"""Largest change of a command that is jitter [m/s] (`mask.command_step_mps`)."""
-_MIN_COMMAND_RATIO = 1.03
-"""Ratio of speed to command that no controller overshoots to [1]."""
+_MAX_STEP_MPS = 0.1  # largest change of a command that is jitter [m/s] (`mask.command_step_mps`)
+_MIN_COMMAND_RATIO = 1.03  # ratio of speed to command that no controller overshoots to [1]
 
 
 def compute_command_ratio(m: Measurements, command: Command | None) -> float | None:

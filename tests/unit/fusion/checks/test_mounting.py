@@ -5,8 +5,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.fusion.checks.lags import find_lag, find_turn
-from tcpipe.fusion.checks.motions import GRID_NS, GRID_S, average, compute_acceleration, resample_imu
-from tcpipe.fusion.checks.mounting import compute_levelling_rotation, find_nearest_mounting, find_up_axis
+from tcpipe.fusion.checks.motions import (
+    GRID_NS,
+    GRID_S,
+    average,
+    compute_acceleration,
+    compute_levelling_rotation,
+    find_up_axis,
+    resample_imu,
+)
+from tcpipe.fusion.checks.sanity import find_nearest_mounting
 from tcpipe.fusion.measurements import InertialMeasurements
 
 GRAVITY_MPS2 = 9.80665
