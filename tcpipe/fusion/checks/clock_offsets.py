@@ -180,7 +180,7 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
     """Yield what can be compared: whose stamps against whose, by what, target and regressor on the grid, shape (M,)."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:
-        turn, force = resample_imu(m.imu, at_ns)
+        turn, force, _ = resample_imu(m.imu, at_ns)
         for role, twist in twists.items():
             turning = average(twist[:, 1], SMOOTH_S)
             yield role, IMU, YAW_RATE, _select_near(turning, turning), average(turn, SMOOTH_S)

@@ -147,7 +147,8 @@ def _differentiate(
 def find_up_axis(force: Floats) -> Floats:
     """Return the mean direction of the specific force (N, 3), shape (3,); z where the force has no steady direction."""
     size = np.linalg.norm(force, axis=1, keepdims=True)
-    mean: Floats = np.mean(np.divide(force, size, out=np.zeros_like(force), where=size > 0), axis=0)
+    directions = np.divide(force, size, out=np.zeros_like(force), where=size > 0)
+    mean: Floats = directions.sum(axis=0) / max(len(force), 1)
     length = np.linalg.norm(mean)
     return mean / length if length > _MIN_STEADINESS else np.array([0.0, 0.0, 1.0])
 
@@ -162,14 +163,16 @@ def compute_levelling_rotation(up: Floats) -> Floats:
     return matrix
 
 
-def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane]:
-    """Return yaw rate and horizontal specific force (forward, i times left), levelled by the mean of the force, shape (M,) each."""
-    level = compute_levelling_rotation(find_up_axis(imu.specific_force_mps2))
-    rate, force = (
-        resample_signal(imu.stamp_ns, values @ level.T, at_ns)
-        for values in (imu.angular_velocity_radps, imu.specific_force_mps2)
-    )
-    return rate[:, 2], find_quick_part(average(force[:, :2] @ np.array([1.0, 1j]), _ACCELERATION_S))
+def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane, Floats]:
+    """Return yaw rate and quick horizontal specific force (forward, i times left), shape (M,) each, and the rotation (3, 3) that levels.
+
+    The unit is levelled by the mean direction of its force.
+    """
+    signals = (imu.angular_velocity_radps, imu.specific_force_mps2)
+    rate, force = (resample_signal(imu.stamp_ns, values, at_ns) for values in signals)
+    level = compute_levelling_rotation(find_up_axis(force[np.isfinite(force).all(1)]))
+    horizontal = average(force @ level[:2].T @ np.array([1.0, 1j]), _ACCELERATION_S)
+    return rate @ level[2], find_quick_part(horizontal), level
 
 
 def compute_acceleration(twist: Floats) -> Plane:

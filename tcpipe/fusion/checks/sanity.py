@@ -26,10 +26,8 @@ from tcpipe.fusion.checks.motions import (
     compute_acceleration,
     compute_course_rate,
     compute_fix_velocity,
-    compute_levelling_rotation,
     dead_reckon,
     find_liveliest_window_ns,
-    find_up_axis,
     resample_fixes,
     resample_imu,
     resample_signal,
@@ -361,13 +359,13 @@ def _check_imu(
     """Check units, tilt and signs; return the yaw rate, how other sensors' follow from it, and the unit's yaw by each odometry [rad]."""
     if m.imu is None:
         return np.empty(0), {}, {}
-    turn, force = resample_imu(m.imu, at_ns)
+    turn, force, level = resample_imu(m.imu, at_ns)
     turns = _compare_turns(turn, m.gnss, twists, at_ns)
     yaws_rad = _compare_accelerations(force, twists, turns)
     if IMU not in found:
         _check_units(found, turns, turn, felt)
     if IMU not in found and m.imu.accelerometer_usable:
-        _check_mounting(found, find_up_axis(m.imu.specific_force_mps2), yaws_rad)
+        _check_mounting(found, level, yaws_rad)
         if IMU not in found:
             _check_yaw_signs(found, turns, trust)
     return turn, turns, {} if IMU in found else yaws_rad
@@ -411,13 +409,13 @@ def _check_units(found: Exclusions, turns: Mapping[str, Lag], turn: Floats, felt
         found[IMU] = SensorExclusion(IMU, "imu-no-acceleration")
 
 
-def _check_mounting(found: Exclusions, up: Floats, yaws_rad: Mapping[str, float]) -> None:
-    """Exclude an IMU that gravity shows to be tilted, or accelerations to look aside."""
+def _check_mounting(found: Exclusions, level: Floats, yaws_rad: Mapping[str, float]) -> None:
+    """Exclude an IMU that the rotation by which gravity levels it shows to be tilted, or accelerations to look aside."""
     yaw_rad = next(iter(yaws_rad.values()), 0.0)
-    turn = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw_rad)) @ compute_levelling_rotation(up)
-    turned_by = find_nearest_mounting(turn)
-    if up[2] < np.cos(_TILTED_RAD):
-        names, numbers = {"evidence": "gravity"}, {"off_rad": float(np.arccos(up[2]))}
+    turned_by = find_nearest_mounting(matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw_rad)) @ level)
+    off_rad = float(np.arccos(np.clip(level[2, 2], -1.0, 1.0)))
+    if off_rad > _TILTED_RAD:
+        names, numbers = {"evidence": "gravity"}, {"off_rad": off_rad}
         found[IMU] = SensorExclusion(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
     elif yaws_rad and all(_ASIDE_RAD < abs(each) <= _BACKWARDS_RAD for each in yaws_rad.values()):
         found[IMU] = _make_yaw_exclusion(yaws_rad, turned_by)

@@ -37,7 +37,7 @@ def felt(base_from_sensor: Rotation, seed: int = 2) -> tuple[np.ndarray, np.ndar
 
 def levelled(rate: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     at_ns = np.arange(T.size, dtype=np.int64) * GRID_NS
-    return resample_imu(InertialMeasurements(at_ns, rate, force, np.full((T.size, 4), np.nan), 0.02, 0.5), at_ns)
+    return resample_imu(InertialMeasurements(at_ns, rate, force, np.full((T.size, 4), np.nan), 0.02, 0.5), at_ns)[:2]
 
 
 MOUNTINGS = [(0, 0, 0), (180, 0, 90), (90, 0, -90), (0, 35, 100), (-20, -60, 170)]
