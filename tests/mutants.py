@@ -95,6 +95,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
                 for name in (
                     "signals",
                     "attitude",
+                    "dead_reckoning",
                     "noise_curves",
                     "preparation",
                     "pose_increments",

@@ -32,7 +32,7 @@ _GROUPS, _MIN_GROUPS, _MIN_GROUP_S, _MIN_SPANS = 20, 8, 2.0, 4
 _INDEPENDENT = 10
 """Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s, those of the coarse search over 1 s, which is 5 rows."""
 _MIN_CHI_SQUARED = 10.83  # by how much a rival peak must fit worse [1]: 99.9 % of χ² with one degree of freedom
-_TINY = 1e-12
+_TINY = 1e-12  # least variance, and least share of it, that a division bears
 
 
 @dataclass(frozen=True, slots=True)
