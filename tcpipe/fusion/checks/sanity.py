@@ -1,8 +1,8 @@
 """Sensors that cannot be right: in another unit or frame, of the other sign, mounted otherwise, frozen, of another drive, or too slow.
 
 Sensors are compared in pairs. Paths, in windows: one is laid on the other by rotation and scale, and on its mirror image. Directions of
-travel: do both go forward at once? Turns: a yaw rate is a linear function of the gyroscope's three rates, whose coefficients show its
-unit, axis and sign. Accelerations: an odometry's against the level specific force show the yaw of the IMU, and gravity shows its tilt.
+travel: whether both go forward at once. Turns: the factor from the levelled gyroscope's yaw rate to another sensor's shows unit and sign.
+Accelerations: an odometry's against the level specific force show the yaw of the IMU, and gravity shows its tilt.
 
 Of two that differ, the one that fewer others confirm is excluded; both are, where that is a tie. A mounting that somebody stated counts
 as a confirmation. A lone odometry whose path is that of the fixes, but far longer or shorter, has another scale, which is taken out.
@@ -123,6 +123,8 @@ def check_sensors(
     wanted = None if command is None else hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
     paths = {} if m.gnss is None else {GNSS: resample_fixes(m.gnss, at_ns)}
     paths |= {role: dead_reckon(twist) for role, twist in twists.items()}
+    if wanted is not None and twists:
+        paths[COMMAND] = dead_reckon(np.column_stack((wanted, next(iter(twists.values()))[:, 1])))
     noise_m2 = _compute_noise_m2(m.gnss)
     moving = {role for role, path in paths.items() if compare_paths(path, path, noise_m2)}
     for role, quantity in _list_constants(m):
@@ -131,15 +133,12 @@ def check_sensors(
     # 1. Turns and accelerations show units and mounting of the IMU, and signs of yaw rates.
     trust = {COMMAND: 1.0, IMU: float(stated.get(IMU, False)), WHEELS: 0.5, VISUAL: 0.25}
     turn, turns, yaws_rad = _check_imu(found, m, twists, at_ns, felt=felt, trust=trust)
-    # 2. Paths show another unit or another drive; yaw rates are the gyroscope's where it confirms them.
-    for role in twists if IMU not in found else ():
-        if turn.size and (
-            not np.nan_to_num(twists[role][:, 1]).any() or (role in turns and turns[role].factor.real > 0.0)
-        ):
+    # 2. Paths show another unit or another drive; yaw rates are the gyroscope's where it confirms them, or there are none.
+    confirmed = {role for role, lag in turns.items() if lag.factor.real > 0.0}
+    for role in twists if turn.size and IMU not in found else ():
+        if role in confirmed or not np.nan_to_num(twists[role][:, 1]).any():
             twists[role][:, 1] = np.where(np.isfinite(turn), turn, twists[role][:, 1])
             paths[role] = dead_reckon(twists[role])
-    if wanted is not None and twists:
-        paths[COMMAND] = dead_reckon(np.column_stack((wanted, next(iter(twists.values()))[:, 1])))
     pairs = {(a, b): compare_paths(paths[a], paths[b], noise_m2) for a, b in combinations(paths, 2)}
     known = {names: pair for names, pair in pairs.items() if pair is not None}
     scales = _check_distances(found, known, turns, is_alone=len(twists) == 1)
@@ -275,12 +274,12 @@ def _check_distances(
     ratios = {names: pair.ratio for names, pair in pairs.items() if not found.keys() & {*names}}
     same = {names: 1 / _MAX_RATIO <= ratio <= _MAX_RATIO for names, ratio in ratios.items()}
     scales = {}
+    # A robot may be slower than its command.
     for names in [names for names, is_same in same.items() if not is_same and COMMAND not in names]:
-        # A robot may be slower than it is told.
         ratio, of_pair = ratios[names], {each: is_same for each, is_same in same.items() if is_same or each == names}
         fast, trust = names[1] if ratio > 1.0 else names[0], dict[str, float]()
         if not 1 / _STILL_RATIO < ratio < _STILL_RATIO:
-            # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
+            # A command does not show that a robot moves; a gyroscope that turns with the sensor does.
             of_pair.pop((fast, COMMAND), None)
             trust = {fast: float(fast in turning)}
             if fast == WHEELS and not trust[fast] and not any(fast in each for each in of_pair if each != names):
@@ -335,7 +334,7 @@ _IN_DEGREES, _MAX_YAW_RATE_RADPS = 1.0 / 15.0, 15.0
 _TILTED_RAD, _ASIDE_RAD, _BACKWARDS_RAD = np.radians([30.0, 60.0, 120.0])
 """Least tilt of a rotated IMU: slopes average out, and the steepest that is driven is 22.5°; yaws that look aside and backwards."""
 _AXIS_ALIGNED_RAD = 0.25  # angle within which a mounting is taken as along the axes
-_SAME_WAY, _COHERENT, _MAX_YAW_STD_RAD = 0.5, 0.3, 0.1
+_MIN_AGREEMENT, _MIN_COHERENCE, _MAX_YAW_STD_RAD = 0.5, 0.3, 0.1
 """Least agreement of two turns or directions, and of accelerations (0 to 1), and the largest σ of a yaw by accelerations."""
 
 
@@ -378,7 +377,7 @@ def _compare_turns(
     rates = {role: average(twist[:, 1], SMOOTH_S) for role, twist in twists.items()}
     rates |= {} if gnss is None else {GNSS: compute_course_rate(compute_fix_velocity(gnss, at_ns))}
     lags = {role: find_lag(rate, average(turn, SMOOTH_S)) for role, rate in rates.items()}
-    return {role: lag for role, lag in lags.items() if lag is not None and lag.explained > _SAME_WAY}
+    return {role: lag for role, lag in lags.items() if lag is not None and lag.explained > _MIN_AGREEMENT}
 
 
 def _compare_accelerations(force: Plane, twists: Mapping[str, Floats], turns: Mapping[str, Lag]) -> dict[str, float]:
@@ -386,7 +385,7 @@ def _compare_accelerations(force: Plane, twists: Mapping[str, Floats], turns: Ma
     found = {}
     for role, twist in twists.items():
         turned = find_turn(compute_acceleration(twist), force, turns[role].offset_s if role in turns else 0.0)
-        if turned is not None and turned[1] < _MAX_YAW_STD_RAD and turned[2] > _COHERENT:
+        if turned is not None and turned[1] < _MAX_YAW_STD_RAD and turned[2] > _MIN_COHERENCE:
             found[role] = turned[0]
     return found
 
@@ -464,7 +463,7 @@ def _check_directions(
     same = {(role, IMU): abs(yaw) < _ASIDE_RAD for role, yaw in yaws_rad.items() if not is_aside[role]}
     for a, b in combinations(forward, 2):
         agreement = compute_agreement(forward[a], forward[b])
-        if agreement is not None and abs(agreement) > _SAME_WAY:
+        if agreement is not None and abs(agreement) > _MIN_AGREEMENT:
             same[a, b] = agreement > 0.0
     turned = set()
     for role, other, lead in _find_outvoted(same, trust):
