@@ -123,6 +123,8 @@ def compute_median_of_five(values: Floats) -> Floats:
 
 def remove_spikes(values: Floats, *, fill: float | None = None) -> Floats:
     """Return a signal (N,) with samples far off the median of five around them, what a filter's gate rejects, interpolated or filled."""
+    if values.size < 5:
+        return values
     off = np.abs(values - compute_median_of_five(values))
     is_spike = off > _SPIKE * float(np.median(off[off > 0.0])) if (off > 0.0).any() else off > 0.0
     rows = np.arange(values.size)

@@ -39,8 +39,8 @@ Ints = NDArray[np.int64]
 
 
 def make_grid_ns(first_ns: int, last_ns: int) -> Ints:
-    """Return a grid's stamps [ns] from first to last."""
-    return np.arange(first_ns, last_ns + 1, GRID_NS, dtype=np.int64)
+    """Return a grid's stamps [ns] from first to last, two at least."""
+    return np.arange(first_ns, max(last_ns, first_ns + GRID_NS) + 1, GRID_NS, dtype=np.int64)
 
 
 def find_span_ns(m: Measurements) -> tuple[int, int] | None:
