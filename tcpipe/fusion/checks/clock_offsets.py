@@ -59,7 +59,7 @@ from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
 
 ROLES = (IMU, WHEELS, VISUAL, GNSS)
-"""In the order in which a clock is taken for the right one where as many agree with either: a gyroscope has the least to compute."""
+"""Sensors in the order in which their clocks are taken for the right one: a gyroscope has the least to compute."""
 NOTED_S = 0.05
 """Least time offset that a person should act on [s]."""
 _MAX_STD_S, _MAX_STD_OF_LARGE_S, _MIN_SIGMAS_OF_LARGE = 0.02, 0.06, 10.0
@@ -125,7 +125,7 @@ def find_coarse_offsets(m: Measurements) -> dict[str, ClockOffset]:
     Offsets that the fine search cannot find are noted. Returns {} if the pairs of sensors contradict each other.
     """
     pairs = [*_compare_roughly(m)]
-    found = solve_offsets(pairs, near_s=NEAR_S)
+    found = solve_offsets(pairs, near_s=NEAR_S, roles=(*ROLES[1:], IMU))  # an IMU alone makes no track
     offsets = {found.reference: ClockOffset(0.0, _COARSE_STD_S, noted=False)} | dict(found.offsets)
     if any(abs(_compute_misfit_s(pair, offsets)) > NEAR_S for pair in pairs if pair.late in offsets):
         return {}
@@ -215,15 +215,21 @@ def _compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float
 
 
 def solve_offsets(
-    pairs: Sequence[ClockPair], clock_epoch: int = 0, span_s: float = 0.0, *, near_s: float = NOTED_S
+    pairs: Sequence[ClockPair],
+    clock_epoch: int = 0,
+    span_s: float = 0.0,
+    *,
+    near_s: float = NOTED_S,
+    roles: Sequence[str] = ROLES,
 ) -> ClockFacts:
     """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined.
 
-    Clocks within ``near_s`` are one. The receiver's velocity has no say: it has the clock of the fixes, and no label needs it.
+    Clocks within ``near_s`` are one. Where as many agree with either of two, that of the first of ``roles`` is taken for the right one.
+    The receiver's velocity has no say: it has the clock of the fixes, and no label needs it.
     """
     known = [pair for pair in pairs if pair.determined]
     solved = {
-        role: _solve_against(role, known, span_s) for role in ROLES if any(role in {p.late, p.against} for p in known)
+        role: _solve_against(role, known, span_s) for role in roles if any(role in {p.late, p.against} for p in known)
     }
     if not solved:
         return ClockFacts(clock_epoch, "", tuple(pairs), {})

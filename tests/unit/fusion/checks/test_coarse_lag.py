@@ -86,6 +86,11 @@ def test_of_two_sensors_the_fixes_are_taken_for_the_late_one():
     assert [*find_far(measure(*wander(3), gnss=18.0, without=("imu",)))] == ["gnss"]
 
 
+def test_beside_fixes_or_wheels_alone_the_imu_is_taken_for_the_late_one():
+    for other in ("gnss", "wheels"):
+        assert [*find_far(measure(*wander(3), imu=18.0, without=(other,)))] == ["imu"]
+
+
 @pytest.mark.parametrize("late_s", [0.0, -0.9])
 def test_small_offsets_are_left_to_the_fine_search(late_s):
     drive = measure(*wander(4), gnss=late_s)
