@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Plane = NDArray[np.complex128]
+Signal = NDArray[Any]
+"""Real or complex values."""
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
 _SPIKE = 8.0  # distance of a spike over the median distance from the median of five: more than 5 σ
@@ -131,7 +133,7 @@ def remove_spikes(values: Floats, *, fill: float | None = None) -> Floats:
     return np.where(is_spike, np.interp(rows, rows[~is_spike], values[~is_spike]) if fill is None else fill, values)
 
 
-def compute_moving_mean(values: NDArray[Any], half: int, *, least: float = 1.0) -> NDArray[Any]:
+def compute_moving_mean(values: Signal, half: int, *, least: float = 1.0) -> Signal:
     """Return the mean of the known ones among the ``half`` rows on either side of each, and itself, shape (N, ...).
 
     NaN where less than the share ``least`` of those rows are known.

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +53,7 @@ from tcpipe.fusion.measurements import (
     Measurements,
     select_measurements,
 )
-from tcpipe.fusion.signals import Plane, compute_moving_mean, compute_seconds
+from tcpipe.fusion.signals import Plane, Signal, compute_moving_mean, compute_seconds
 from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
 
@@ -176,7 +175,7 @@ def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
     return ClockPair(late, against, by, lag.offset_s, lag.std_s, lag.explained, determined)
 
 
-def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tuple[str, str, str, Any, Any]]:
+def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tuple[str, str, str, Signal, Signal]]:
     """Yield what can be compared: whose stamps against whose, by what, target and regressor on the grid, shape (M,)."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:
@@ -201,7 +200,7 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
             yield DOPPLER, GNSS, VELOCITY, average(average(own, FIXES_S), FIXES_S), velocity
 
 
-def _select_near(lively: Floats, values: NDArray[Any]) -> NDArray[Any]:
+def _select_near(lively: Floats, values: Signal) -> Signal:
     """Return values near rows in which another signal is large, NaN elsewhere, shape (M,)."""
     is_near = compute_moving_mean(1.0 * (np.abs(lively) > _LIVELY), _NEAR_ROWS, least=0.0) > 0.0
     return np.where(is_near, values, np.nan)

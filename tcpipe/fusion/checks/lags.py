@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.motions import GRID_S
-from tcpipe.fusion.signals import Plane, compute_moving_mean
+from tcpipe.fusion.signals import Plane, Signal, compute_moving_mean
 
 Floats = NDArray[np.float64]
 
@@ -68,7 +67,7 @@ class Products:
         return np.where(varies, np.minimum(np.abs(self.product) ** 2 / size, 1.0 - _TINY), 0.0)
 
 
-def sum_products(target: NDArray[Any], regressor: NDArray[Any], most: int, groups: int = 1) -> Plane:
+def sum_products(target: Signal, regressor: Signal, most: int, groups: int = 1) -> Plane:
     """Return sums over a target y and a regressor x, shape (M,), by groups of time of equal length and lags up to ``most`` rows.
 
     They are of 1, x, |x|², conj(y), conj(y) x and |y|² where both are known, shape (6, G, L).
@@ -87,7 +86,7 @@ def sum_products(target: NDArray[Any], regressor: NDArray[Any], most: int, group
 # Clocks that are nearly the same
 
 
-def find_lag(target: NDArray[Any], regressor: NDArray[Any]) -> Lag | None:
+def find_lag(target: Signal, regressor: Signal) -> Lag | None:
     """Return how late the target's stamps are against the regressor's, or None where that is unknown.
 
     Signals, shape (M,), are on a grid of `GRID_S`. The lag is unknown where few values are, where the best lag is at the end of the search
@@ -97,7 +96,7 @@ def find_lag(target: NDArray[Any], regressor: NDArray[Any]) -> Lag | None:
     return None if sums is None else estimate_lag([sums])
 
 
-def compute_lag_sums(target: NDArray[Any], regressor: NDArray[Any]) -> Plane | None:
+def compute_lag_sums(target: Signal, regressor: Signal) -> Plane | None:
     """Return what `estimate_lag` needs of a window, shape (6, G, L); parameters are `find_lag`'s. None where the window is too short."""
     groups = min(_GROUPS, int((target.size - 2 * _STEPS) * GRID_S / _MIN_GROUP_S))
     return None if groups < _MIN_GROUPS else sum_products(target, regressor, _STEPS, groups)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Mea
 from tcpipe.fusion.signals import (
     MAX_GAP_NS,
     Plane,
+    Signal,
     compute_moving_mean,
     compute_seconds,
     integrate_signal,
@@ -134,13 +134,11 @@ def compute_course_rate(velocity_mps: Plane) -> Floats:
     return _differentiate(quick, lambda later, earlier: np.angle(later * np.conj(earlier)))
 
 
-def _differentiate(
-    values: NDArray[Any], subtract: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
-) -> NDArray[Any]:
+def _differentiate(values: Signal, subtract: Callable[[Signal, Signal], Signal]) -> Signal:
     """Return the rates of change over `FIXES_S` of values on the grid (M,), by their differences; NaN at the ends."""
     half = round(FIXES_S / 2 / GRID_S)
     changes = subtract(values[2 * half :], values[: -2 * half]) / (2 * half * GRID_S)
-    rates: NDArray[Any] = np.pad(changes, half, constant_values=np.nan)[: values.size]
+    rates: Signal = np.pad(changes, half, constant_values=np.nan)[: values.size]
     return rates
 
 
@@ -181,14 +179,14 @@ def compute_acceleration(twist: Floats) -> Plane:
     return find_quick_part(np.gradient(speed, GRID_S) + 1j * speed * average(twist[:, 1], _ACCELERATION_S))
 
 
-def average(values: NDArray[Any], width_s: float) -> NDArray[Any]:
+def average(values: Signal, width_s: float) -> Signal:
     """Return the running mean of a signal on the grid, NaN where any of the width is unknown."""
     return compute_moving_mean(values, round(width_s / GRID_S / 2))
 
 
-def find_quick_part(values: NDArray[Any]) -> NDArray[Any]:
+def find_quick_part(values: Signal) -> Signal:
     """Return values without their slow part, which slip and terrain change, and starts, stops and turns do not need."""
-    quick: NDArray[Any] = values - average(values, _SLOW_S)
+    quick: Signal = values - average(values, _SLOW_S)
     return quick
 
 
