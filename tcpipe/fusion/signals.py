@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Plane = NDArray[np.complex128]
 Signal = NDArray[Any]
-"""Real or complex values."""
+"""Samples of a signal: real, complex or whole numbers."""
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
 _SPIKE = 8.0  # distance of a spike over the median distance from the median of five: more than 5 σ

@@ -13,7 +13,7 @@ from tcpipe.fusion.checks.clock_offsets import (
     find_other_clocks,
     shift_sensors,
 )
-from tcpipe.fusion.checks.lags import NEAR_S
+from tcpipe.fusion.checks.motions import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import DOPPLER, GNSS

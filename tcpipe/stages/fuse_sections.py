@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +25,7 @@ from tcpipe.fusion.measurements import (
     cut_sections,
     make_track_stamps,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_covered
+from tcpipe.fusion.signals import Signal, compute_median_period_ns, compute_seconds, hold_last, is_covered
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, multiply, rpy_from_matrix
 from tcpipe.power.rails import compute_power_at
@@ -44,7 +43,7 @@ class Fused:
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
-    columns: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
+    columns: list[Mapping[str, Signal]] = field(default_factory=list)
     disagreements: list[Disagreement] = field(default_factory=list)
     windows: int = 0
     astray: int = 0
@@ -140,7 +139,7 @@ def assume_forward(
 
 def _make_columns(
     part: TrackSection, trajectory: Trajectory, section: Section, streams: Streams, config: FuseConfig
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Signal]:
     stamp_ns, gap_ns, power_gap_ns = trajectory.stamp_ns, int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
     return {
         "stamp_ns": stamp_ns,

@@ -1,10 +1,10 @@
 """Time offsets between the stamps of a run's sensors, by what they measure of the same motion.
 
 Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before fusion. Two signals of
-one motion are shifted against each other until one explains most of the other (`lags`): yaw rates, speeds, accelerations, velocities. They
-are compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller corrects,
-and that leads the body. The course of the fixes is not compared with the gyroscope: an antenna that sits ahead of the turning point by l
-leads the body's course by l / v, 0.1 s for 10 cm.
+one motion are shifted against each other until one explains most of the other (`motions`): yaw rates, speeds, accelerations, velocities.
+They are compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller
+corrects, and that leads the body. The course of the fixes is not compared with the gyroscope: an antenna that sits ahead of the turning
+point by l leads the body's course by l / v, 0.1 s for 10 cm.
 
 The pairs together, in windows of at most ten minutes, give each sensor's offset and drift from the clock that most of them share. A
 sensor is blamed only where two others agree against it and no pair contradicts; else two differ, and it is unknown which is wrong. Clocks
@@ -20,26 +20,24 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.lags import (
-    NEAR_S,
-    Lag,
-    compute_lag_sums,
-    estimate_lag,
-    find_coarse_lag,
-    prepare_coarse_signals,
-)
 from tcpipe.fusion.checks.motions import (
     FIXES_S,
     GRID_S,
+    NEAR_S,
     SMOOTH_S,
+    Lag,
     average,
     compute_acceleration,
     compute_course_rate,
     compute_fix_velocity,
+    compute_lag_sums,
+    estimate_lag,
+    find_coarse_lag,
     find_liveliest_window_ns,
     find_quick_part,
     find_span_ns,
     iterate_windows_ns,
+    prepare_coarse_signals,
     resample_imu,
     resample_signal,
     resample_twist,

@@ -18,16 +18,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.lags import Lag, find_lag, find_turn
 from tcpipe.fusion.checks.motions import (
     GRID_S,
     SMOOTH_S,
+    Lag,
     average,
     compute_acceleration,
     compute_course_rate,
     compute_fix_velocity,
     dead_reckon,
+    find_lag,
     find_liveliest_window_ns,
+    find_turn,
     resample_fixes,
     resample_imu,
     resample_signal,

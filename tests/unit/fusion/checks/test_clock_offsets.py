@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, make_pair, shift_stamps, solve_offsets
-from tcpipe.fusion.checks.lags import Lag
+from tcpipe.fusion.checks.motions import Lag
 from tcpipe.fusion.measurements import (
     BodyVelocities,
     InertialMeasurements,

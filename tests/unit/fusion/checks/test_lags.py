@@ -5,12 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.lags import find_lag, find_turn
 from tcpipe.fusion.checks.motions import (
     GRID_NS,
     GRID_S,
     average,
+    find_lag,
     find_liveliest_window_ns,
+    find_turn,
     iterate_windows_ns,
     make_grid_ns,
     resample_signal,

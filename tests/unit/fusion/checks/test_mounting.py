@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tcpipe.fusion.checks.lags import find_lag, find_turn
 from tcpipe.fusion.checks.motions import (
     GRID_NS,
     GRID_S,
     average,
     compute_acceleration,
     compute_levelling_rotation,
+    find_lag,
+    find_turn,
     find_up_axis,
     resample_imu,
 )
