@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 NORMAL_MEDIAN = 0.6744897501960817
 """Median of the absolute value of a normal variate of unit variance."""
+MIN_SIGMAS = 4.0
+"""Standard deviations beyond which a difference is certain: by chance once in 16,000 times."""
 MEDIAN_OF_SQUARES = NORMAL_MEDIAN**2
 """Median of its square."""
 

@@ -75,6 +75,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
                 f"tcpipe/fusion/{name}.py"
                 for name in (
                     "attitude",
+                    "dead_reckoning",
                     "densities",
                     "initial",
                     "level_motion",
@@ -94,6 +95,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
                 for name in (
                     "signals",
                     "attitude",
+                    "dead_reckoning",
                     "noise_curves",
                     "preparation",
                     "pose_increments",

@@ -25,10 +25,11 @@ from tcpipe.fusion.changes import (
     is_contradicted,
     join_events,
 )
+from tcpipe.fusion.dead_reckoning import compute_course
 from tcpipe.fusion.densities import PRIORS, NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.excursions import find_excursions
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, RESET, Memory, Model, Tests
-from tcpipe.fusion.initial import compute_course, find_stationary_intervals
+from tcpipe.fusion.initial import find_stationary_intervals
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
     IMU,

@@ -19,17 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
-from tcpipe.fusion.process import turn_sources
+from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, reckon_dead
+from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.signals import (
     Plane,
-    bridge_outliers,
     compute_interval_means,
-    compute_median_of_five,
     compute_seconds,
     compute_window_means,
-    integrate_signal,
-    is_covered,
+    remove_wild_places,
 )
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
@@ -38,7 +35,6 @@ Ints = NDArray[np.int64]
 
 _MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
 _MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°
-_MIN_SPEED_MPS = 0.2  # slower motion shows no course (ruling)
 _MAX_WINDOW_S, _WINDOW_STEP_S = 120.0, 2.0  # longest window of fixes that shows the yaw; from one window to the next
 _TILT_AGREES_RAD = 0.2  # agreement of IMU attitude and gravity
 _GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
@@ -102,58 +98,33 @@ def _read_orientation(imu: InertialMeasurements, start_ns: int, end_ns: int) -> 
 
 
 class _Path:
-    """The path drawn by odometry and gyroscope from the origin with yaw zero: a function of time, held outside the odometry.
-
-    Without odometry it goes straight on with the velocity that the first fixes show.
-    """
+    """The path by `DeadReckoning`; without odometry it goes straight on with the velocity that the first fixes show."""
 
     def __init__(self, measurements: Measurements, start_ns: int, bias: Floats) -> None:
-        self.start_ns = start_ns
-        self._yaw_s, self._yaw_rate = _collect_yaw_rate(measurements, start_ns, bias)
-        source, gnss = measurements.first_odometry, measurements.gnss
-        self.known = source is not None
+        gnss = measurements.gnss
+        self.start_ns, self.known = start_ns, measurements.first_odometry is not None
+        self.reckoned = reckon_dead(measurements, start_ns, float(bias[2]))
         self._lever = 0j if gnss is None else complex(*gnss.lever_arm_m[:2])
         self.first_fixes, self._straight, self._straight_std = slice(0, 10), 0j, 0.0
-        if source is None:
-            if gnss is not None:
-                self.first_fixes, self._straight, self._straight_std = _fit_first_velocity(gnss)
-            return
-        self._stamp_s = compute_seconds(source.stamp_ns, start_ns)
-        self._speed = source.velocity_mps[:, 0]
-        yaw = self.yaw(self._stamp_s)
-        self._velocity = self._speed[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
-
-    def yaw(self, at_s: Floats) -> Floats:
-        """Return the yaw turned since the start [rad]."""
-        return _integrate_since_start(self._yaw_s, self._yaw_rate, at_s)[:, 0]
+        if gnss is not None and not self.known:
+            self.first_fixes, self._straight, self._straight_std = _fit_first_velocity(gnss)
 
     def antenna(self, at_s: Floats, yaw: float = 0.0) -> Plane:
         """Return the antenna east + i north [m] for a yaw at the start [rad]."""
-        antenna = np.asarray(self._lever * np.exp(1j * self.yaw(at_s)), np.complex128)
-        if self.known:
-            antenna += _integrate_since_start(self._stamp_s, self._velocity, at_s) @ np.array([1.0, 1j])
-        placed: Plane = antenna * np.exp(1j * yaw) + self._straight * at_s
+        body = self.reckoned.place(at_s) + self._lever * np.exp(1j * self.reckoned.yaw(at_s))
+        placed: Plane = body * np.exp(1j * yaw) + self._straight * at_s
         return placed
 
     def length(self, until_s: float) -> float:
         """Return the distance driven since the start [m]."""
-        if not self.known:
-            return abs(self._straight) * max(until_s, 0.0)
-        return float(_integrate_since_start(self._stamp_s, np.abs(self._speed)[:, None], np.array([until_s]))[0, 0])
+        return self.reckoned.length(until_s) if self.known else abs(self._straight) * max(until_s, 0.0)
 
     def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
         """Return the velocity at the start and its standard deviation [m/s]."""
         if not self.known:
             return np.array([self._straight.real, self._straight.imag, 0.0]), self._straight_std
-        speed = float(np.median(self._speed[:5]))
+        speed = float(np.median(self.reckoned.forward_mps[:5]))
         return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), 0.3
-
-
-def _integrate_since_start(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
-    """Return the integral of samples (N, k) from time zero on, shape (M, k); 0 without samples."""
-    if stamp_s.size == 0:
-        return np.zeros((at_s.size, values.shape[1]))
-    return integrate_signal(stamp_s, values, at_s) - integrate_signal(stamp_s, values, np.zeros(1))
 
 
 def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
@@ -166,24 +137,6 @@ def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
     east, north = np.median((place[j] - place[i]) / (at_s[j] - at_s[i])[:, None], axis=0)
     noise_mps = np.sqrt(12.0 / at_s.size * np.median(gnss.variance_m2[rows, :2])) / at_s[-1]
     return rows, complex(east, north), float(np.hypot(noise_mps, _START_STD_MPS))
-
-
-def _collect_yaw_rate(m: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
-    """Return stamps [s] and yaw rates [rad/s], (N, 1), by the gyroscope, and in its gaps by an odometry or the course over ground."""
-    sources, imu = turn_sources(m), m.imu
-    stamp_s, rate = np.empty(0), np.empty(0)
-    if sources:
-        known = np.isfinite(sources[-1].yaw_rate_radps)
-        stamp_s, rate = compute_seconds(sources[-1].stamp_ns[known], start_ns), sources[-1].yaw_rate_radps[known]
-    elif m.first_odometry is not None and m.gnss is not None:
-        stamp_s, rate = compute_course_rate(m.gnss, m.first_odometry, start_ns)
-    if imu is not None:
-        stamp_ns = start_ns + np.rint(stamp_s * 1e9).astype(np.int64)
-        missing = ~is_covered(imu.stamp_ns, stamp_ns, stamp_ns)
-        stamp_s = np.concatenate((compute_seconds(imu.stamp_ns, start_ns), stamp_s[missing]))
-        rate = np.concatenate((imu.angular_velocity_radps[:, 2] - bias[2], rate[missing]))
-    order = np.argsort(stamp_s, kind="stable")
-    return stamp_s[order], rate[order, None]
 
 
 def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
@@ -199,7 +152,7 @@ def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_s
         std = float(np.hypot(np.hypot(fit.yaw_std_rad, 0.03), bias_std * fit.centre_s))
         return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     if gnss.quat_xyzw is not None and posed.size:  # the first attitude of a pose, less what the robot turned until then
-        turned = path.yaw(compute_seconds(gnss.stamp_ns[posed], start_ns))
+        turned = path.reckoned.yaw(compute_seconds(gnss.stamp_ns[posed], start_ns))
         return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2] - turned[0]), _POSED_YAW_STD_RAD, "pose"
     return own, _UNKNOWN_YAW_STD_RAD, source or "unknown"
 
@@ -217,11 +170,10 @@ class _Fit:
 def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
     """Return the fit of the first window of fixes to the drawn path; the best of all where none fits well."""
     stamp_s = compute_seconds(gnss.stamp_ns, path.start_ns)
-    east, north = (compute_median_of_five(axis) for axis in gnss.position_enu_m[:, :2].T)
-    fixes = east + 1j * north
+    fixes = remove_wild_places(gnss.position_enu_m)
     noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
     wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
-    drawn, turned = path.antenna(stamp_s), path.yaw(stamp_s)
+    drawn, turned = path.antenna(stamp_s), path.reckoned.yaw(stamp_s)
     found: list[_Fit] = []
     for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], _WINDOW_STEP_S))):
         near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + _MAX_WINDOW_S, "right")))
@@ -230,7 +182,7 @@ def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
             continue
         rows = slice(first, first + int(far[0]) + 1)
         if not path.known:  # each step between fixes goes forward, turned back by the yaw turned until then
-            if stamp_s[rows][-1] - stamp_s[first] <= wanted / _MIN_SPEED_MPS:
+            if stamp_s[rows][-1] - stamp_s[first] <= wanted / MIN_SPEED_MPS:
                 back = np.exp(-0.5j * (turned[rows][1:] + turned[rows][:-1]))
                 return _Fit(float(np.angle(np.sum(np.diff(fixes[rows]) * back))), 0.2, 0.0, float(stamp_s[rows].mean()))
             continue
@@ -313,60 +265,3 @@ def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:
     found = np.stack((stamp_ns[first], stamp_ns[last]), -1)
     inner: Ints = found[found[:, 1] - found[:, 0] >= _MIN_LENGTH_NS] + np.array([_MARGIN_NS, -_MARGIN_NS])
     return inner
-
-
-_GRID_S = 0.5  # grid of the course
-_WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
-_CLEARLY = 3.0  # σ of fixes that a baseline needs
-_MOVING_M = 0.3  # shorter baselines show no course
-_OFTEN = 0.3  # share of usable baselines before longer ones
-_STEP_S = 1e-6  # step between two rates
-
-
-def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_ns: int) -> tuple[Floats, Floats]:
-    """Return how fast the course over ground turns: stamps [s] from ``zero_ns`` on, twice a second at most, and rates [rad/s].
-
-    The course is that of the displacement over a second, or over as many as it takes to exceed the noise of the fixes; in between it turns
-    evenly. Where the odometry goes backwards, the body looks the other way. Single wild fixes are bridged.
-    """
-    stamp_s = compute_seconds(gnss.stamp_ns, zero_ns)
-    grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
-    std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
-    least_m = max(_MOVING_M, _CLEARLY * std_m)
-    places = bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)
-    values = np.column_stack((places.real, places.imag))
-    for window_s in _WINDOWS_S:
-        rows = round(window_s / _GRID_S)
-        if grid_s.size <= rows:
-            return stamp_s[:1], np.zeros(1)
-        means = compute_interval_means(stamp_s, values, grid_s - _GRID_S, grid_s + _GRID_S)
-        way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
-        at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
-        moving = np.abs(way) > least_m
-        if moving.mean() > _OFTEN:
-            break
-    if odometry is not None:
-        odometry_s = compute_seconds(odometry.stamp_ns, zero_ns)
-        ends_s = at_s - window_s / 2, at_s + window_s / 2
-        driven = compute_interval_means(odometry_s, odometry.velocity_mps[:, :1], *ends_s)[:, 0]
-        moving &= np.abs(driven) > _MIN_SPEED_MPS
-        way = way * np.sign(driven)
-    if moving.sum() < 2:
-        return stamp_s[:1], np.zeros(1)
-    course = np.unwrap(np.angle(way[moving]))
-    at_s = at_s[moving]
-    # Even turns in between, so that their integral is the course; before it first moves and after it last did, the robot does not turn.
-    stamp_s = np.repeat(at_s, 2) + np.tile([-_STEP_S, _STEP_S], at_s.size)
-    rate = np.repeat(np.diff(course) / np.diff(at_s), 2)
-    return stamp_s, np.concatenate(([0.0], rate, [0.0]))
-
-
-def compute_course(velocity_mps: Floats) -> Floats:
-    """Return the direction of horizontal velocities (N, 3) [rad], continuous; that before it where the robot hardly moves."""
-    moving = np.flatnonzero(np.hypot(velocity_mps[:, 0], velocity_mps[:, 1]) > _MIN_SPEED_MPS)
-    if moving.size == 0:
-        return np.zeros(velocity_mps.shape[0])
-    course = np.unwrap(np.arctan2(velocity_mps[moving, 1], velocity_mps[moving, 0]))
-    last = np.searchsorted(moving, np.arange(velocity_mps.shape[0]), "right") - 1
-    held: Floats = course[np.maximum(last, 0)]
-    return held

@@ -19,11 +19,11 @@ from tcpipe.fusion.measurements import IMU, BodyVelocities, InertialMeasurements
 from tcpipe.fusion.signals import (
     Plane,
     compute_interval_means,
-    compute_median_of_five,
     compute_median_period_ns,
+    compute_moving_mean,
     compute_seconds,
-    compute_window_means,
     multiply_by_vector,
+    remove_spikes,
     solve_least_squares,
 )
 from tcpipe.geometry.rotation import matrix_from_quat, multiply, normalize, quat_from_rotation_vector, quat_from_rpy
@@ -41,7 +41,6 @@ _SLOWEST_IMU_NS = 100_000_000  # slower units do not show turns
 _ALIGN_S = 10.0  # windows of the alignment
 _PITCH_KNOT_S = 240.0  # the same of pitch, whose error is an accelerometer's bias
 _ROUNDS = 8
-_SPIKE_RATIO = 8.0  # times the median distance from the median of five: more than 5σ
 _ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1  # of what the alignment takes out
 _MIN_SCALE = 0.2  # an odometry of less shows another motion
 _MIN_MOVE_M = 0.2  # shorter windows show no heading
@@ -135,9 +134,8 @@ def _mean_force(
 
 
 def average_grid(values: Floats, window_s: float) -> Floats:
-    """Return the centred moving mean of (n, k) values over a window; shorter at the ends."""
-    rows = np.arange(len(values))
-    return compute_window_means(rows, values, rows, 2 * max(1, round(0.5 * window_s / STEP_S)))
+    """Return the centred moving mean over a window, along the first axis; shorter at the ends."""
+    return compute_moving_mean(values, max(1, round(0.5 * window_s / STEP_S)), least=0.0)
 
 
 def _multiply_increments(turn_rad: Floats) -> Floats:
@@ -187,14 +185,6 @@ def compute_forward_mps(source: BodyVelocities, attitude: Attitude, zero_ns: int
     means = compute_interval_means(stamp_s, speed[:, None], attitude.time_s - half, attitude.time_s + half)[:, 0]
     _, y, z = source.lever_arm_m
     return np.asarray(means + attitude.rate_radps[:, 2] * y - attitude.rate_radps[:, 1] * z)
-
-
-def remove_spikes(values: Floats, *, fill: Floats | float | None = None) -> Floats:
-    """Return a signal (N,) with samples far off the median of five around them replaced, by that median: what a filter's gate rejects."""
-    smooth = compute_median_of_five(values)
-    off = np.abs(values - smooth)
-    scatter = float(np.median(off[off > 0.0])) if (off > 0.0).any() else 0.0
-    return np.where(off > _SPIKE_RATIO * scatter, smooth if fill is None else fill, values)
 
 
 def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:

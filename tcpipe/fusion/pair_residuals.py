@@ -31,7 +31,6 @@ from tcpipe.fusion.level_motion import (
     get_turn_rates,
     integrate_grid,
     make_free_track,
-    remove_spikes,
     solve_robust,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
@@ -41,6 +40,7 @@ from tcpipe.fusion.signals import (
     find_longest_step_ns,
     interpolate_signal,
     is_in_gap,
+    remove_spikes,
 )
 
 Floats = NDArray[np.float64]

@@ -56,7 +56,8 @@ _YAW_RATE_FLOOR_RADPS = 0.02  # no odometry is better
 _MAX_VELOCITY_MPS = 50.0  # no robot is faster
 _MAX_RATE_RADPS = 100.0  # no gyroscope measures more
 _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
-_GRAVITY_BAND_MPS2 = (8.0, 12.0)
+GRAVITY_BAND_MPS2 = (8.0, 12.0)
+"""Median size of a specific force that contains gravity [m/s²]."""
 _FROZEN_NS = 1_000_000_000  # fixes that repeat for less, or for two of their periods, are those of a slow receiver
 _DATUM_FIXES = 10  # the ENU origin is their median
 _NOISE_WINDOW_NS = 2_000_000_000  # window of noise around each sample
@@ -355,7 +356,7 @@ def prepare_imu(
     if usable.size < stamp_ns.size:
         rate, force = rate[usable], force[usable]
     norm = float(np.median(np.linalg.norm(force, axis=1))) if usable.size else 0.0
-    low, high = _GRAVITY_BAND_MPS2
+    low, high = GRAVITY_BAND_MPS2
     findings = _find_orientation_rates(of_orientation, _IMU)
     weighs = not usable.size or low <= norm <= high
     if not weighs:

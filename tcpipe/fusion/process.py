@@ -25,12 +25,11 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
-    bridge_outliers,
     compute_median_of_five,
     compute_median_period_ns,
-    compute_seconds,
     compute_slopes,
     is_covered,
+    remove_wild_places,
 )
 from tcpipe.robust import estimate_robust_std
 
@@ -257,8 +256,7 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     if isinstance(source, Positions):
         std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
         least = _UNKNOWN_DENSITY * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
-        places = source.position_enu_m[:, :2] @ np.array([1.0, 1j])
-        places = bridge_outliers(compute_seconds(source.stamp_ns, int(source.stamp_ns[0])), places, std)
+        places = remove_wild_places(source.position_enu_m)
         axes = [places.real, places.imag]
     else:
         std, order = float(np.sqrt(np.median(source.variance_m2ps2[:, :2]))), 1

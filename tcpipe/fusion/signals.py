@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Plane = NDArray[np.complex128]
+Signal = NDArray[Any]
+"""Samples of a signal: real, complex or whole numbers."""
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
-_OUTLIER_STDS = 5.0  # distance of an outlier from the line between its neighbours
+_SPIKE = 8.0  # distance of a spike over the median distance from the median of five: more than 5 σ
+MAX_GAP_NS = 500_000_000
+"""Time between samples that no interpolation bridges [ns]: sensors of motion send at 2 Hz or more."""
 MAX_ACCELERATION_MPS2 = 2.5
 """Acceleration of a robot that brakes hard; what fixes show beyond it is an outlier [m/s²]."""
 _MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long
@@ -118,22 +123,34 @@ def compute_median_of_five(values: Floats) -> Floats:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
 
 
-def bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
-    """Return places [m], shape (N,), without single outliers, which are moved to the line between their neighbours.
+def remove_spikes(values: Floats, *, fill: float | None = None) -> Floats:
+    """Return a signal (N,) with samples far off the median of five around them, what a filter's gate rejects, interpolated or filled."""
+    if values.size < 5:
+        return values
+    off = np.abs(values - compute_median_of_five(values))
+    is_spike = off > _SPIKE * float(np.median(off[off > 0.0])) if (off > 0.0).any() else off > 0.0
+    rows = np.arange(values.size)
+    return np.where(is_spike, np.interp(rows, rows[~is_spike], values[~is_spike]) if fill is None else fill, values)
 
-    An outlier is further off that line than noise of ``std_m`` and an acceleration explain.
+
+def compute_moving_mean(values: Signal, half: int, *, least: float = 1.0) -> Signal:
+    """Return the mean of the known ones among the ``half`` rows on either side of each, and itself, shape (N, ...).
+
+    NaN where less than the share ``least`` of those rows are known.
     """
-    if places.size < 3:
-        return places
-    step_s = stamp_s[2:] - stamp_s[:-2]
-    share = (stamp_s[1:-1] - stamp_s[:-2]) / np.maximum(step_s, 1e-6)
-    between = places[:-2] + share * (places[2:] - places[:-2])
-    off_m = np.concatenate(([0.0], np.abs(places[1:-1] - between), [0.0]))
-    wild = off_m[1:-1] > _OUTLIER_STDS * std_m + MAX_ACCELERATION_MPS2 * step_s**2 / 8
-    wild &= off_m[1:-1] >= np.maximum(off_m[:-2], off_m[2:])  # its neighbours lie half as far off their lines
-    found = places.copy()
-    found[1:-1][wild] = between[wild]
-    return found
+    known = np.isfinite(values)
+    rows = np.arange(len(values))
+    first, last = np.maximum(rows - half, 0), np.minimum(rows + half + 1, len(values))
+    before = np.zeros((1, *values.shape[1:]))
+    sums, counts = (np.concatenate((before, np.cumsum(each, axis=0))) for each in (np.where(known, values, 0.0), known))
+    count = counts[last] - counts[first]
+    mean = (sums[last] - sums[first]) / np.maximum(count, 1.0)
+    return np.where(count >= least * (2 * half + 1), mean, np.nan)
+
+
+def remove_wild_places(position_m: Floats) -> Plane:
+    """Return the places east + i north [m] of positions (N, 2 or 3), spikes of either axis removed, shape (N,)."""
+    return remove_spikes(position_m[:, 0]) + 1j * remove_spikes(position_m[:, 1])
 
 
 def compute_slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
+from tcpipe.fusion.dead_reckoning import compute_course_rate
 from tcpipe.fusion.densities import DETERMINED, NoiseModel
 from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
-from tcpipe.fusion.initial import compute_course_rate
 from tcpipe.fusion.measurements import NO_LEVER_ARM, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,

@@ -8,14 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from tcpipe.fusion.checks.clock_offsets import (
-    NEAR_S,
     find_clock_offsets,
     find_middle_ns,
     find_other_clocks,
     shift_sensors,
 )
+from tcpipe.fusion.checks.motions import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion
-from tcpipe.fusion.measurements import DOPPLER, GNSS, Measurements
+from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
+from tcpipe.fusion.measurements import DOPPLER, GNSS
+from tcpipe.fusion.signals import MAX_GAP_NS
 from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
@@ -64,11 +66,6 @@ def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
         return {}
     offsets = find_other_clocks(sections[rank_sections(sections)[0]].measurements, always=True)
     return rename_role({role: offset.offset_s for role, offset in offsets.items()}, GNSS, find_fixes_role(streams))
-
-
-_FINE_S = 0.004
-_JUMP_NS = 500_000_000
-_DRIVES_MPS = 0.3
 
 
 def find_clocks(sections: Sequence[Section]) -> list[Section]:
@@ -144,7 +141,7 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
 def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Remedy, ...]:
     """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
     given_s = streams.report.facts.time_offset_s.get(role, 0.0)
-    correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
+    correction_s = round(given_s - offset.offset_s, 3)
     is_far = abs(offset.offset_s) > NEAR_S and role == GNSS and DOPPLER in streams.tables
     roles = (role, DOPPLER) if is_far else (role,)
     return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
@@ -155,29 +152,23 @@ def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding
 
     Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
     """
-    epochs: dict[int, list[Measurements]] = {}
-    for section in sections:
-        epochs.setdefault(section.clock_epoch, []).append(section.measurements)
-    stamps = {
-        epoch: np.unique(np.concatenate([sensor.stamp_ns for m in of_epoch for sensor in m.sensors().values()]))
-        for epoch, of_epoch in epochs.items()
-        if any(m.sensors() for m in of_epoch)
-    }
-    for epoch, stamp_ns in stamps.items():
-        wheels = [m.first_odometry for m in epochs[epoch] if m.first_odometry is not None]
-        fixes = [m.gnss for m in epochs[epoch] if m.gnss is not None]
-        if not wheels or not fixes:
+    stamps = [sensor.stamp_ns for section in sections for sensor in section.measurements.sensors().values()]
+    for epoch in dict.fromkeys(section.clock_epoch for section in sections):
+        of_epoch = [section.measurements for section in sections if section.clock_epoch == epoch]
+        odometries = [m.first_odometry for m in of_epoch if m.first_odometry is not None]
+        fixes = [m.gnss for m in of_epoch if m.gnss is not None]
+        if not odometries or not fixes:
             continue
-        wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (wheels, fixes))
-        speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in wheels])
+        wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (odometries, fixes))
+        speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in odometries])
         place_m = np.concatenate([each.position_enu_m[:, :2] for each in fixes])
-        for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > _JUMP_NS]:
-            step_s = float(np.diff(ends_ns)[0]) * 1e-9
-            at_s = float(ends_ns[1] - min(each[0] for each in stamps.values())) * 1e-9
-            driven = np.interp(ends_ns, wheels_ns, speed_mps)
-            moved_m = [np.diff(np.interp(ends_ns, fixes_ns, axis)) for axis in place_m.T]
-            slowest_mps = float(np.abs(driven).min())
-            if slowest_mps > _DRIVES_MPS and np.linalg.norm(moved_m) < 0.5 * slowest_mps * step_s:
-                span_s, names = (at_s, at_s), {"topics": "all topics"}
-                finding = make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)
-                yield int(ends_ns[1]), finding
+        stamp_ns = np.unique(np.concatenate([sensor.stamp_ns for m in of_epoch for sensor in m.sensors().values()]))
+        ends_ns = np.stack((stamp_ns[:-1], stamp_ns[1:]))[:, np.diff(stamp_ns) > MAX_GAP_NS]
+        steps_s = np.diff(ends_ns, axis=0)[0] * 1e-9
+        slowest_mps = np.abs(np.interp(ends_ns, wheels_ns, speed_mps)).min(axis=0)
+        moved_m = np.hypot(*(np.diff(np.interp(ends_ns, fixes_ns, axis), axis=0)[0] for axis in place_m.T))
+        jumps = (slowest_mps > MIN_SPEED_MPS) & (moved_m < 0.5 * slowest_mps * steps_s)
+        for after_ns, step_s in zip(ends_ns[1, jumps].tolist(), steps_s[jumps].tolist(), strict=True):
+            at_s = (after_ns - min(int(each[0]) for each in stamps)) * 1e-9
+            span_s, names = (at_s, at_s), {"topics": "all topics"}
+            yield after_ns, make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)

@@ -21,6 +21,7 @@ from tcpipe.geometry.rotation import (
     rotation_vector_from_quat,
 )
 from tcpipe.recipe.suggestions import suggest
+from tcpipe.robust import MIN_SIGMAS
 from tcpipe.stages.fuse_inputs import Section, exclude_role, state_extrinsics
 from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import (
@@ -242,7 +243,6 @@ def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
     )
 
 
-_SURELY = 4.0  # standard deviations
 _LEAST_ARM_M = 0.1  # what a finding names
 _LEAST_TILT_RAD = 0.0175
 _LEAST_TURN_RAD = 0.05
@@ -263,7 +263,7 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
         off = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
         off_rad = float(np.linalg.norm(rotation_vector_from_quat(off)))
         unsure_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
-        if sensor.placed_by != "assumed" and off_rad > max(_SURELY * unsure_rad, _LEAST_TURN_RAD):
+        if sensor.placed_by != "assumed" and off_rad > max(MIN_SIGMAS * unsure_rad, _LEAST_TURN_RAD):
             remedies, names = state_extrinsics(GNSS, sensor.xyz_m, turn), {"placed_by": sensor.placed_by}
             yield make_finding("pose-rotated", Subject("role", GNSS), names=names, remedies=remedies, off_rad=off_rad)
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
@@ -287,7 +287,7 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
 
 def _is_contradicted(found: ParameterFacts, least: float) -> bool:
     """Return whether a parameter surely differs from what is stated, by so much at least."""
-    return any(abs(v) > max(_SURELY * s, least) for v, s in zip(found.value, found.std, strict=True))
+    return any(abs(v) > max(MIN_SIGMAS * s, least) for v, s in zip(found.value, found.std, strict=True))
 
 
 def _find_fixes(inputs: Sequence[Section], part: StretchFacts) -> Positions | None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import audit_trajectory
+from tcpipe.fusion.checks.clock_offsets import NOTED_S
 from tcpipe.fusion.checks.sanity import Command
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
@@ -25,7 +25,7 @@ from tcpipe.fusion.measurements import (
     cut_sections,
     make_track_stamps,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_covered
+from tcpipe.fusion.signals import Signal, compute_median_period_ns, compute_seconds, hold_last, is_covered
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, multiply, rpy_from_matrix
 from tcpipe.power.rails import compute_power_at
@@ -43,7 +43,7 @@ class Fused:
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
-    columns: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
+    columns: list[Mapping[str, Signal]] = field(default_factory=list)
     disagreements: list[Disagreement] = field(default_factory=list)
     windows: int = 0
     astray: int = 0
@@ -139,7 +139,7 @@ def assume_forward(
 
 def _make_columns(
     part: TrackSection, trajectory: Trajectory, section: Section, streams: Streams, config: FuseConfig
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Signal]:
     stamp_ns, gap_ns, power_gap_ns = trajectory.stamp_ns, int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
     return {
         "stamp_ns": stamp_ns,
@@ -244,10 +244,6 @@ def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
     return merge_findings(finding for place in rank_sections(sections) for finding in sections[place].excluded.values())
 
 
-_SAME_OFFSET_S = 0.1
-"""Time offsets of two sections that differ by less [s] are one: twice the offset that is noted."""
-
-
 def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings of several sections, those of one code and subject as one that has the first one's numbers.
 
@@ -257,7 +253,7 @@ def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
     for finding in findings:
         for place, first in enumerate(merged):
             off_s = finding.numbers.get("offset_s", 0.0) - first.numbers.get("offset_s", 0.0)
-            if (first.code, first.subject) == (finding.code, finding.subject) and abs(off_s) < _SAME_OFFSET_S:
+            if (first.code, first.subject) == (finding.code, finding.subject) and abs(off_s) < 2.0 * NOTED_S:
                 spans = [each.span_s for each in (first, finding) if each.span_s is not None]
                 span_s = (min(start for start, _ in spans), max(end for _, end in spans)) if spans else None
                 merged[place] = replace(first, span_s=span_s)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.attitude import compute_turns
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
     GNSS,
@@ -26,26 +27,28 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.process import SCALE_STD
 from tcpipe.fusion.signals import (
+    MAX_GAP_NS,
     compute_interval_means,
     compute_median_period_ns,
     compute_seconds,
+    compute_window_means,
+    interpolate_signal,
     is_covered,
+    remove_spikes,
 )
-from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
-from tcpipe.robust import estimate_robust_std
+from tcpipe.geometry.rotation import matrix_from_quat
+from tcpipe.robust import MIN_SIGMAS, estimate_robust_std
 from tcpipe.tables.facts import Disagreement
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _WINDOW_S = 5.0  # about four chords; longer than odometry's gate
-_MAX_GAP_NS = 500_000_000
 _STANDS_MPS = 0.1  # slower is stationary; faster wheels are stuck
 _MOVES_M, _FEWEST = 0.5, 4  # windows that show a scale
 _SCALES = (0.5, 2.0)
 _ASTRAY_M = 1.0  # a larger difference in 5 s is divergence
-_SURELY = 4.0  # and by this many σ of the sensor
-_LITTLE = 0.1  # share of windows that may be astray
+_MAX_ASTRAY = 0.1  # share of windows that may be astray
 _LASTING_MPS = 0.02  # lasting odometry error (`preparation._VELOCITY_FLOOR_MPS`)
 
 
@@ -63,7 +66,7 @@ class Audit:
 
 def is_astray(windows: int, astray: int) -> bool:
     """Return whether the track contradicts every sensor in more than a few of the windows in which one measures the distance."""
-    return astray > max(1.0, _LITTLE * windows)
+    return astray > max(1.0, _MAX_ASTRAY * windows)
 
 
 def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
@@ -74,7 +77,7 @@ def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Tra
         return found, Audit()
     size_m, std_m = np.array([*compared.values()]).swapaxes(0, 1)
     is_known = np.isfinite(size_m)
-    is_far = is_known & (size_m > np.maximum(_ASTRAY_M, _SURELY * std_m))
+    is_far = is_known & (size_m > np.maximum(_ASTRAY_M, MIN_SIGMAS * std_m))
     astray = is_known.any(0) & (is_far | ~is_known).all(0)
     least = np.argmin(np.where(is_known, size_m, np.inf), axis=0)
     rows_m = np.zeros(found.stamp_ns.size)
@@ -117,7 +120,7 @@ def _iterate_comparisons(
     rotation = matrix_from_quat(found.quat_xyzw)
     if m.gnss is not None:
         yield GNSS, _compare_fixes(found, rotation, m.gnss, windows)
-    turned = rotation_vector_from_quat(quat_from_matrix(np.einsum("kji,kjl->kil", rotation[:-1], rotation[1:])))
+    turned = compute_turns(found.quat_xyzw)
     way = np.einsum("kji,kj->ki", rotation[:-1] + rotation[1:], np.diff(found.position_enu_m, axis=0)) / 2.0
     for role, source in m.odometries().items():
         track = (way + np.cross(turned, source.lever_arm_m))[:, : 2 if source.measured[1] else 1]
@@ -133,7 +136,7 @@ def _compare_odometry(
     step_s = np.diff(at_s)[:, None]
     velocity = source.velocity_mps[:, : track.shape[1]]
     sensor_m = compute_interval_means(compute_seconds(source.stamp_ns, zero), velocity, at_s[:-1], at_s[1:]) * step_s
-    sensor_m[~is_covered(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], least_ns=_MAX_GAP_NS)] = np.nan
+    sensor_m[~is_covered(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], least_ns=MAX_GAP_NS)] = np.nan
     if role == WHEELS:  # that turn while the robot stands: it is stuck, and they are right
         sensor_m[(np.abs(track[:, :1]) < _STANDS_MPS * step_s) & (np.abs(sensor_m) > _STANDS_MPS * step_s)] = np.nan
     sensor_m, track = (np.stack([values[first:last].sum(0) for first, last in windows]) for values in (sensor_m, track))
@@ -146,30 +149,22 @@ def _compare_odometry(
 
 
 def _compare_fixes(found: Trajectory, rotation: Floats, gnss: Positions, windows: Ints) -> tuple[Floats, Floats]:
-    """Compare with the fixes; their scatter counts where they claim less."""
+    """Compare with the fixes, spikes removed, by their means over the halves of a window; their scatter counts where they claim less."""
     inside = (gnss.stamp_ns >= found.stamp_ns[0]) & (gnss.stamp_ns <= found.stamp_ns[-1])
-    zero = int(found.stamp_ns[0])
-    fix_s, at_s = compute_seconds(gnss.stamp_ns[inside], zero), compute_seconds(found.stamp_ns, zero)
+    if not inside.any():
+        return np.full(len(windows), np.nan), np.full(len(windows), np.nan)
+    zero, fix_ns = int(found.stamp_ns[0]), gnss.stamp_ns[inside]
+    fix_s, at_s = compute_seconds(fix_ns, zero), compute_seconds(found.stamp_ns, zero)
     antenna = (found.position_enu_m + rotation @ np.asarray(gnss.lever_arm_m))[:, :2]
-    off = gnss.position_enu_m[inside, :2] - np.column_stack([np.interp(fix_s, at_s, axis) for axis in antenna.T])
+    off = gnss.position_enu_m[inside, :2] - interpolate_signal(at_s, antenna, fix_s)
     second = np.diff(gnss.position_enu_m[inside, :2], n=2, axis=0)
     scatter = estimate_robust_std(second) / np.sqrt(6.0) if second.size else 0.0
     claim = np.maximum(np.sqrt(gnss.variance_m2[inside, :2].mean(1)), scatter)
-    begin, end = at_s[windows].T
-    middle = (begin + end) / 2.0
-    earlier, earlier_std = _compute_medians(fix_s, off, claim, begin, middle)
-    later, later_std = _compute_medians(fix_s, off, claim, middle, end)
-    return 2.0 * np.linalg.norm(later - earlier, axis=1), 2.0 * np.hypot(earlier_std, later_std)
-
-
-def _compute_medians(
-    at_s: Floats, values: Floats, claim: Floats, begin_s: Floats, end_s: Floats
-) -> tuple[Floats, Floats]:
-    """Return the medians of values (N, 2) and of claims between times, shapes (W, 2) and (W,); NaN and 0 where there are none."""
-    found = np.full((begin_s.size, 3), np.nan)
-    both = np.column_stack((values, claim))
-    bounds = zip(np.searchsorted(at_s, begin_s, "left"), np.searchsorted(at_s, end_s, "right"), strict=True)
-    for window, (first, last) in enumerate(bounds):
-        if last > first:
-            found[window] = np.median(both[first:last], axis=0)
-    return found[:, :2], np.nan_to_num(found[:, 2])
+    both = np.column_stack((*(remove_spikes(axis) for axis in off.T), claim))
+    begin_ns, end_ns = found.stamp_ns[windows].T
+    quarter_ns = (end_ns - begin_ns) // 4
+    half_ns = 2 * int(np.median(quarter_ns))
+    earlier, later = (
+        compute_window_means(fix_ns, both, at, half_ns).T for at in (begin_ns + quarter_ns, end_ns - quarter_ns)
+    )
+    return 2.0 * np.hypot(*(later - earlier)[:2]), 2.0 * np.hypot(earlier[2], later[2])

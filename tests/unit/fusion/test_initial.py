@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
-from tcpipe.fusion.initial import compute_course_rate, find_initial_state, find_stationary_intervals
+from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.geometry.rotation import rpy_from_quat
 
@@ -86,28 +86,6 @@ def test_neither_sign_alone_is_enough():
     truth = drive.make_drive(30.0)
     assert find_stationary_intervals(drive.measure(truth, 5, wheels=False)).shape == (0, 2)
     assert find_stationary_intervals(drive.measure(truth, 5, imu=False)).shape == (0, 2)
-
-
-def _circling(hz, speed_mps=0.9, rate_radps=0.3):
-    at_s = np.arange(0.0, 60.0, 1.0 / hz)
-    radius_m = speed_mps / rate_radps
-    place = radius_m * np.column_stack((np.cos(rate_radps * at_s), np.sin(rate_radps * at_s), 0.0 * at_s))
-    return Positions((at_s * 1e9).astype(np.int64), place, np.full((at_s.size, 3), 0.015**2))
-
-
-@pytest.mark.parametrize("hz", [1.0, 5.0])
-def test_a_circle_turns_evenly(hz):
-    stamp_s, rate = compute_course_rate(_circling(hz), None, 0)
-    inside = (stamp_s > 2.0) & (stamp_s < 57.0)
-    assert rate[inside] == pytest.approx(np.full(inside.sum(), 0.3), abs=0.04)
-
-
-def test_a_wild_fix_does_not_turn_the_course():
-    fixes = _circling(5.0)
-    fixes.position_enu_m[150] += [0.7, -1.2, 0.0]
-    stamp_s, rate = compute_course_rate(fixes, None, 0)
-    inside = (stamp_s > 2.0) & (stamp_s < 57.0)
-    assert rate[inside] == pytest.approx(np.full(inside.sum(), 0.3), abs=0.04)
 
 
 @pytest.mark.parametrize("slope_rad", [0.2, -0.2])

@@ -15,6 +15,7 @@ from tcpipe.fusion.signals import (
     hold_last,
     integrate_signal,
     is_in_gap,
+    remove_spikes,
 )
 
 
@@ -80,3 +81,13 @@ def test_the_integral_of_a_ramp_is_exact_at_any_stamp():
     found = integrate_signal(stamp_s, np.column_stack((1.0 + 2.0 * stamp_s, -stamp_s)), at_s)
     assert found == pytest.approx(np.column_stack((at_s + at_s**2, -0.5 * at_s**2)), abs=1e-12)
     assert integrate_signal(stamp_s, stamp_s[:, None], np.array([-1.0, 3.0])) == pytest.approx(np.array([[0.0], [4.0]]))
+
+
+def test_a_spike_on_a_ramp_is_bridged_and_its_neighbours_are_kept():
+    ramp = 0.3 * np.arange(50.0) + 0.01 * np.random.default_rng(2).normal(size=50)
+    spoiled = ramp.copy()
+    spoiled[20] -= 7.0
+    found = remove_spikes(spoiled)
+    assert np.delete(found, 20).tolist() == np.delete(ramp, 20).tolist()
+    assert found[20] == pytest.approx(6.0, abs=0.05)
+    assert np.isnan(remove_spikes(spoiled, fill=np.nan)[20])

@@ -63,7 +63,7 @@ def measure(speed, turn, *, seed=0, fix_std_m=0.02, without=(), **late_s):
 
 def find_far(m):
     """The coarse offsets of more than a second."""
-    return {role: late_s for role, late_s in find_coarse_offsets(m).items() if abs(late_s) > 1.0}
+    return {role: each.offset_s for role, each in find_coarse_offsets(m).items() if each.noted}
 
 
 @pytest.mark.parametrize(("late_s", "std_m"), [(1.5, 0.02), (-3.7, 0.1), (18.0, 0.02), (-120.0, 0.1), (270.0, 0.02)])
@@ -86,10 +86,15 @@ def test_of_two_sensors_the_fixes_are_taken_for_the_late_one():
     assert [*find_far(measure(*wander(3), gnss=18.0, without=("imu",)))] == ["gnss"]
 
 
+def test_beside_fixes_or_wheels_alone_the_imu_is_taken_for_the_late_one():
+    for other in ("gnss", "wheels"):
+        assert [*find_far(measure(*wander(3), imu=18.0, without=(other,)))] == ["imu"]
+
+
 @pytest.mark.parametrize("late_s", [0.0, -0.9])
 def test_small_offsets_are_left_to_the_fine_search(late_s):
     drive = measure(*wander(4), gnss=late_s)
-    assert find_coarse_offsets(drive)["gnss"] == pytest.approx(late_s, abs=0.1)
+    assert find_coarse_offsets(drive)["gnss"].offset_s == pytest.approx(late_s, abs=0.1)
     assert find_other_clocks(drive) == {}
 
 

@@ -5,12 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.lags import (
+from tcpipe.fusion.checks.motions import (
     GRID_NS,
     GRID_S,
-    compute_moving_mean,
+    average,
     find_lag,
     find_liveliest_window_ns,
+    find_turn,
     iterate_windows_ns,
     make_grid_ns,
     resample_signal,
@@ -30,25 +31,30 @@ def speed(t):
 
 @pytest.mark.parametrize("late_s", [-0.7132, -0.021, 0.0, 0.0067, 0.25, 1.1])
 def test_a_smooth_signal_gives_its_shift_to_a_millisecond(late_s):
-    smooth = [compute_moving_mean(speed(SECONDS - shift)[:, None], 0.2) for shift in (late_s, 0.0)]
-    found = find_lag(3.0 * smooth[0][:, 0] - 1.0, smooth[1])
+    late, regressor = (average(speed(SECONDS - shift), 0.2) for shift in (late_s, 0.0))
+    found = find_lag(3.0 * late - 1.0, regressor)
     assert found.offset_s == pytest.approx(late_s, abs=1e-3)
     assert found.explained == pytest.approx(1.0, abs=2e-4)
+    assert found.factor == pytest.approx(3.0, abs=0.01)
 
 
-def test_a_target_is_found_in_axes_turned_and_scaled():
+def test_a_vector_is_found_turned_and_scaled():
     rng = np.random.default_rng(3)
-    axes = compute_moving_mean(np.cumsum(rng.standard_normal((AT.size + 40, 3)), axis=0) * 0.05, 0.1)
-    target, regressors = axes[: AT.size] @ [0.3, -57.0, 12.0], axes[27 : 27 + AT.size]
-    found = find_lag(target, regressors)  # the target tells at row 27 what the regressors told at row 0
+    walk = np.cumsum(rng.standard_normal((AT.size + 40, 2)), axis=0) * 0.05 @ [1.0, 1j]
+    vector, factor = average(walk, 0.1), 2.0 * np.exp(2.5j)
+    target, regressor = factor * vector[: AT.size], vector[27 : 27 + AT.size]
+    found = find_lag(target, regressor)  # the target is at row 27 where the regressor was at row 0
     assert found.offset_s == pytest.approx(27 * GRID_S, abs=1e-3)
+    assert found.factor == pytest.approx(factor, rel=1e-3)
+    angle, std, coherence = find_turn(target, regressor, found.offset_s)
+    assert (angle, coherence) == pytest.approx((2.5, 1.0), abs=1e-3)
+    assert std < 1e-3
 
 
 def test_the_standard_deviation_is_that_of_repeated_trials():
     rng = np.random.default_rng(5)
-    regressor = compute_moving_mean(speed(SECONDS)[:, None], 0.2)
-    target = compute_moving_mean(speed(SECONDS - 0.1)[:, None], 0.2)[:, 0]
-    noise = [compute_moving_mean(rng.normal(0.0, 0.5, (AT.size, 1)), 0.2)[:, 0] for _ in range(60)]
+    target, regressor = (average(speed(SECONDS - shift), 0.2) for shift in (0.1, 0.0))
+    noise = [average(rng.normal(0.0, 0.5, AT.size), 0.2) for _ in range(60)]
     found = [find_lag(target + each, regressor) for each in noise]
     errors = np.array([each.offset_s - 0.1 for each in found])
     assert abs(errors.mean()) < 0.4 * errors.std()
@@ -57,11 +63,11 @@ def test_the_standard_deviation_is_that_of_repeated_trials():
 
 def test_nothing_is_said_of_too_little():
     flat, noise = np.ones(AT.size), np.random.default_rng(1).standard_normal(AT.size)
-    moving = compute_moving_mean(speed(SECONDS)[:, None], 0.2)
+    moving = average(speed(SECONDS), 0.2)
     assert find_lag(flat, moving) is None
     assert find_lag(np.full(AT.size, np.nan), moving) is None
-    assert find_lag(moving[:400, 0], moving[:400]) is None
-    unrelated = find_lag(compute_moving_mean(noise[:, None], 0.2)[:, 0], moving)
+    assert find_lag(moving[:400], moving[:400]) is None
+    unrelated = find_lag(average(noise, 0.2), moving)
     assert unrelated is None or unrelated.explained < 0.1
 
 
@@ -75,26 +81,26 @@ def test_cells_are_means_and_gaps_are_unknown():
 
 
 def test_a_running_mean_knows_nothing_beside_a_hole():
-    values = np.arange(20.0)[:, None]
+    values = np.arange(20.0)
     values[10] = np.nan
-    mean = compute_moving_mean(values, 4 * GRID_S)[:, 0]
+    mean = average(values, 4 * GRID_S)
     np.testing.assert_array_equal(np.flatnonzero(np.isfinite(mean)), [2, 3, 4, 5, 6, 7, 13, 14, 15, 16, 17])
     np.testing.assert_allclose(mean[[2, 7, 17]], [2.0, 7.0, 17.0])
 
 
 def test_a_motion_that_repeats_itself_and_one_event_give_no_lag():
-    slalom = compute_moving_mean(np.sin(2 * np.pi * SECONDS / 0.8)[:, None], 0.1)  # three periods lie in the search
-    assert find_lag(slalom[:, 0], slalom) is None
-    once = compute_moving_mean(np.clip(SECONDS - 60.0, 0.0, 1.0)[:, None], 0.2)
-    masked = np.where(np.abs(SECONDS - 60.5) < 3.0, once[:, 0], np.nan)
+    slalom = average(np.sin(2 * np.pi * SECONDS / 0.8), 0.1)  # three periods lie in the search
+    assert find_lag(slalom, slalom) is None
+    once = average(np.clip(SECONDS - 60.0, 0.0, 1.0), 0.2)
+    masked = np.where(np.abs(SECONDS - 60.5) < 3.0, once, np.nan)
     assert find_lag(masked, once) is None
 
 
 def test_a_flat_peak_tells_little_however_alike_its_parts_are():
     rng = np.random.default_rng(2)
-    slow = compute_moving_mean(np.sin(2 * np.pi * SECONDS / 10.0)[:, None], 0.2)
-    noisy = slow[:, 0] + compute_moving_mean(rng.normal(0.0, 2.0, (AT.size, 1)), 0.2)[:, 0]
-    found, clear = find_lag(noisy, slow), find_lag(slow[:, 0] + 1e-3 * noisy, slow)
+    slow = average(np.sin(2 * np.pi * SECONDS / 10.0), 0.2)
+    noisy = slow + average(rng.normal(0.0, 2.0, AT.size), 0.2)
+    found, clear = find_lag(noisy, slow), find_lag(slow + 1e-3 * noisy, slow)
     assert found is None or found.std_s > 0.05
     assert clear.std_s < 1e-2
 

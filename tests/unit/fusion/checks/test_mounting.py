@@ -4,19 +4,27 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tcpipe.fusion.checks.lags import GRID_S, compute_moving_mean
-from tcpipe.fusion.checks.mounting import (
+from tcpipe.fusion.checks.motions import (
+    GRID_NS,
+    GRID_S,
+    average,
+    compute_acceleration,
     compute_levelling_rotation,
-    find_forward_yaw_rad,
-    find_nearest_mounting,
+    find_lag,
+    find_turn,
     find_up_axis,
-    find_yaw_axis,
+    resample_imu,
 )
+from tcpipe.fusion.checks.sanity import find_nearest_mounting
+from tcpipe.fusion.measurements import InertialMeasurements
 
 GRAVITY_MPS2 = 9.80665
 T = np.arange(0.0, 120.0, GRID_S)
 SPEED = np.clip(np.minimum(np.mod(T, 12.0) - 2.0, 10.5 - np.mod(T, 12.0)), 0.0, 1.0)
 YAW_RATE = 0.4 * np.sin(0.9 * T) * (SPEED > 0)
+
+
+TWIST = np.column_stack((SPEED, YAW_RATE))
 
 
 def felt(base_from_sensor: Rotation, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -28,6 +36,11 @@ def felt(base_from_sensor: Rotation, seed: int = 2) -> tuple[np.ndarray, np.ndar
     return base_from_sensor.inv().apply(rate), base_from_sensor.inv().apply(force)
 
 
+def levelled(rate: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    at_ns = np.arange(T.size, dtype=np.int64) * GRID_NS
+    return resample_imu(InertialMeasurements(at_ns, rate, force, np.full((T.size, 4), np.nan), 0.02, 0.5), at_ns)[:2]
+
+
 MOUNTINGS = [(0, 0, 0), (180, 0, 90), (90, 0, -90), (0, 35, 100), (-20, -60, 170)]
 
 
@@ -37,23 +50,26 @@ def test_a_mounting_is_found_from_gravity_and_acceleration(rpy_deg):
     rate, force = felt(mounting)
     level = compute_levelling_rotation(find_up_axis(force))
     np.testing.assert_allclose(level @ level.T, np.eye(3), atol=1e-12)
-    yaw = find_forward_yaw_rad(np.column_stack((SPEED, YAW_RATE)), force @ level.T, 0.0)
+    turn, horizontal = levelled(rate, force)
+    yaw, std, _ = find_turn(compute_acceleration(TWIST), horizontal, 0.0)
+    assert std < 0.1
     found = Rotation.from_euler("z", yaw) * Rotation.from_matrix(level)
     assert (found * mounting.inv()).magnitude() < 0.1
-    axis = find_yaw_axis(compute_moving_mean(YAW_RATE[:, None], 0.1)[:, 0], compute_moving_mean(rate, 0.1))
-    np.testing.assert_allclose(axis.axis, mounting.inv().apply([0.0, 0.0, 1.0]), atol=0.03)
+    assert find_lag(average(YAW_RATE, 0.1), average(turn, 0.1)).factor == pytest.approx(1.0, abs=0.05)
 
 
 def test_noise_shows_no_mounting():
     noise = np.random.default_rng(1).normal(0.0, 1.0, (T.size, 3))
-    assert find_forward_yaw_rad(np.column_stack((SPEED, YAW_RATE)), noise, 0.0) is None
-    assert find_yaw_axis(compute_moving_mean(YAW_RATE[:, None], 0.1)[:, 0], compute_moving_mean(noise, 0.1)) is None
+    turn, horizontal = levelled(noise, noise)
+    assert find_turn(compute_acceleration(TWIST), horizontal, 0.0)[2] < 0.3
+    lag = find_lag(average(YAW_RATE, 0.1), average(turn, 0.1))
+    assert lag is None or lag.explained < 0.1
 
 
-def test_a_mounting_that_changes_halfway_is_none():
-    (_, force), (_, later) = (felt(Rotation.from_euler("z", yaw, degrees=True)) for yaw in (0, 80))
+def test_a_mounting_that_changes_halfway_is_uncertain():
+    (rate, force), (_, later) = (felt(Rotation.from_euler("z", yaw, degrees=True)) for yaw in (0, 80))
     force[T.size // 2 :] = later[T.size // 2 :]
-    assert find_forward_yaw_rad(np.column_stack((SPEED, YAW_RATE)), force, 0.0) is None
+    assert find_turn(compute_acceleration(TWIST), levelled(rate, force)[1], 0.0)[1] > 0.1
 
 
 def test_a_mounting_near_the_axes_is_taken_as_along_them():

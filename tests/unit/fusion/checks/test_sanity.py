@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.lags import GRID_NS, GRID_S
+from tcpipe.fusion.checks.motions import GRID_NS, GRID_S
 from tcpipe.fusion.checks.sanity import (
     Command,
     check_sensors,
