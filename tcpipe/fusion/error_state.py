@@ -35,6 +35,7 @@ from tcpipe.fusion.measurements import (
     IMU,
     NO_TRUST,
     STATED_ARM_STD_M,
+    UNSTATED_ARM_STD_M,
     InitialState,
     Measurements,
     Rejections,
@@ -75,6 +76,8 @@ _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50  # from so many on, their white noise is averaged out
 _JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose no better
 _UNCHANGED = Hypothesis(())
+_ARM_STDS, _SURE_STDS = 2.0, 4.0
+"""How far off an antenna is that is not where it is stated: deviations of the stated place, and of the estimate [1]."""
 _FEW_CHANGES = 2
 """Changes in a section that are likely [1]."""
 _MOST_EVENTS = 6
@@ -104,6 +107,11 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     start.x[:9] = smooth_section(section.filter(start, until=minute))[0].states[0, :9]
     made = section.filter(start)
     smoothed, events = smooth_section(made)
+    if section.is_arm_contradicted(made, smoothed):
+        section = section.forget_arm()
+        start = section.make_start(initial)._replace(x=start.x)
+        made = section.filter(start)
+        smoothed, events = smooth_section(made)
     if _is_judging_fixes(section.measurements):
         explanation = section.explain(made, events, start)
     if explanation.changes:
@@ -197,6 +205,24 @@ class SectionModel:
             possible=POSSIBLE if judges else (),
         )
         return ticks, model, widen_start(start, std).select(model.active)
+
+    def is_arm_contradicted(self, made: Pass, smoothed: Smoothed) -> bool:
+        """Return whether the section surely shows the antenna elsewhere than where it is stated."""
+        gnss, active = self.measurements.gnss, list(made.model.active)
+        if gnss is None or state.ARM not in active:
+            return False
+        off = np.abs(smoothed.states[-1, state.ARM + 6 : state.ARM + 9] - gnss.lever_arm_m)
+        place = active.index(state.ARM)
+        known = smoothed.spreads[-1, place : place + 3]
+        return bool((off > np.maximum(_ARM_STDS * np.asarray(gnss.lever_arm_std_m), _SURE_STDS * known)).any())
+
+    def forget_arm(self) -> SectionModel:
+        """Return the section with an antenna whose place nothing states."""
+        m = self.measurements
+        if m.gnss is None:
+            return self
+        m = replace(m, gnss=replace(m.gnss, lever_arm_std_m=UNSTATED_ARM_STD_M))
+        return replace(self, measurements=m, std=make_priors(m, self.noise, self.ticks)[0])
 
     def explain(self, made: Pass, events: Sequence[Change], start: Memory) -> Hypothesis:
         """Return the changes that explain most of where sensors contradict each other, none where they do not.

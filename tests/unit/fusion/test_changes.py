@@ -201,3 +201,10 @@ def test_events_are_in_order_of_time():
     assert [(event.mean, event.std) for event in best.events][1:] == [(0.3, 0.03), (-0.3, 0.03)]
     useless = Hypothesis((Change("useless", state.VISUAL, 5, 8),))
     assert (useless.events, useless.ignored) == ((), ((state.VISUAL, 5, 8),))
+
+
+def test_an_antenna_that_is_not_where_it_is_stated_makes_no_place_too_sure():
+    m = drive.measure(truth(), 1)
+    found = fuse(replace(m, gnss=replace(m.gnss, lever_arm_m=(0.12, -0.08, 0.55 - 0.65))))
+    assert found.facts.parameters["antenna"].value[2] == pytest.approx(0.65, abs=0.1)
+    check_track(found, 0.03)
