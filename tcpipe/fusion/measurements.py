@@ -58,6 +58,7 @@ class Positions:
     quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about the robot's axes,
         shape (N, 3); None: no attitude is measured.
     mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about each axis.
+    lag_std_s : [s], how late its stamps may be; drivers stamp on arrival.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -70,6 +71,7 @@ class Positions:
     rotation_variance_rad2: NDArray[np.float64] | None = None
     mounting_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
     mounting_std_rad: float = 0.0
+    lag_std_s: float = 0.02
 
     @property
     def has_claims(self) -> bool:

@@ -44,7 +44,7 @@ PARAMETERS = (
     Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 0.0, "rad/s", "MEMS: 1°/s at turn-on; walk: `densities`"),
     Parameter("accelerometer bias", state.ACCELEROMETER_BIAS, 3, 0.15, 3e-4, "m/s²", "MEMS: 15 mg, 1 mg in a run"),
     Parameter("antenna", state.ARM, 3, 0.0, 0.0, "m", "stated or not: `Positions.lever_arm_std_m`"),
-    Parameter("lag of fixes", state.FIX_LAG, 1, 0.02, 1e-3, "s", "drivers stamp on arrival"),
+    Parameter("lag of fixes", state.FIX_LAG, 1, 0.0, 1e-3, "s", "`Positions.lag_std_s`"),
     Parameter("wheel scale", state.WHEEL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
     Parameter("camera scale", state.VISUAL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
     Parameter("turn scale", state.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.turn_scale_std`"),
@@ -115,6 +115,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     if m.gnss is not None and (has_tilt or m.has_attitude):
         known = slice(0, 3 if has_tilt else 2)
         std[state.ARM : state.ARM + 3][known] = m.gnss.lever_arm_std_m[known]
+    if m.gnss is not None and wanted["lag of fixes"]:
+        std[state.FIX_LAG] = m.gnss.lag_std_s
     if m.gnss is not None and m.has_attitude:
         std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad
     if has_fixes:

@@ -109,7 +109,7 @@ def fuse_sections(
     A section is fused again without the offset of a clock that its estimate finds to step. Where one section has a place on the earth,
     those without fixes are skipped.
     """
-    given, used, tracks, errors = [*sections], correct_clocks(sections), list[Fused](), list[FusionError]()
+    given, used, tracks, errors = [*sections], correct_clocks(sections, streams), list[Fused](), list[FusionError]()
     for place in range(len(given)):
         last = next((track.found[-1] for track in reversed(tracks) if track.found), None)
         fuse = partial(fuse_recovering, streams=streams, config=config, run=run, last=last)
@@ -120,7 +120,7 @@ def fuse_sections(
             if unsteady & section.offsets.keys():
                 steady = {role: offset for role, offset in section.clocks.offsets.items() if role not in unsteady}
                 given[place] = replace(given[place], clocks=replace(section.clocks, offsets=steady))
-                section, track = fuse(correct_clocks(given)[place])
+                section, track = fuse(correct_clocks(given, streams)[place])
             used[place], tracks[place] = section, track
         except FusionError as error:
             errors.append(error)

@@ -17,6 +17,7 @@ from tcpipe.fusion.checks.motions import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import DOPPLER, GNSS
+from tcpipe.fusion.preparation import inflate_late_fixes
 from tcpipe.fusion.signals import MAX_GAP_NS
 from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
@@ -91,12 +92,15 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
     return found
 
 
-def correct_clocks(sections: Sequence[Section]) -> list[Section]:
+def correct_clocks(sections: Sequence[Section], streams: Streams) -> list[Section]:
     """Return the sections on one clock each: offset and drift of each clock, about the middle of its section, are taken out."""
-    corrected = []
+    corrected, stated_s = [], streams.report.facts.time_offset_s.get(GNSS, 0.0)
     for section in sections:
         middle_ns = find_middle_ns(section.measurements)[0]
         shifted = shift_sensors(section.measurements, section.offsets, middle_ns)
+        if shifted.gnss is not None:
+            found_s = section.offsets[GNSS].offset_s if GNSS in section.offsets else 0.0
+            shifted = replace(shifted, gnss=inflate_late_fixes(shifted.gnss, stated_s + found_s))
         corrected.append(replace(section, measurements=shifted))
     cuts = dict(find_clock_jumps(corrected))
     return [replace(section, cuts=cuts) for section in corrected]

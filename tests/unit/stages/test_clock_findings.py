@@ -80,8 +80,9 @@ def test_the_remedy_corrects_it(drive_log):
 
 
 def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(drive_log):
-    before = find_clocks(prepare_sections(streams_of(drive_log(1, 42, "wheel_odometry")), FuseConfig()))
-    after = correct_clocks(before)
+    streams = streams_of(drive_log(1, 42, "wheel_odometry"))
+    before = find_clocks(prepare_sections(streams, FuseConfig()))
+    after = correct_clocks(before, streams)
     measured = [section.measurements for (section,) in (before, after)]
     moved_s = (measured[1].wheels.stamp_ns - measured[0].wheels.stamp_ns) * 1e-9
     assert moved_s == pytest.approx(-LATE_S["wheel_odometry"], abs=WITHIN_S["wheel_odometry"])

@@ -86,7 +86,7 @@ def test_each_epoch_takes_out_the_drift_of_a_clock_about_its_own_middle():
     """50 ppm over three days are 13 s."""
     late_s = 0.1 + 50e-6 * (HALF_HOUR - 950.0)
     drifting, steady = drive_with_clocks(gnss=late_s), drive_with_clocks()
-    sections = correct_clocks(find_clocks([Section(0, drifting), Section(1, later(drifting))]))
+    sections = correct_clocks(find_clocks([Section(0, drifting), Section(1, later(drifting))]), STREAMS)
     for section, by_ns in zip(sections, (0, DAYS_NS), strict=True):
         off_s = (section.measurements.gnss.stamp_ns - by_ns - steady.gnss.stamp_ns) * 1e-9
         assert np.abs(off_s).max() < 0.02
@@ -103,7 +103,7 @@ def test_a_short_epoch_has_the_latency_of_a_long_one_and_not_its_drift(drift_ppm
     short = select_measurements(long, 900 * 10**9, 905 * 10**9)
     sections = find_clocks([Section(0, later(short)), Section(1, long)])
     offset = sections[0].clocks.offsets["gnss"]
-    moved_s = (correct_clocks(sections)[0].measurements.gnss.stamp_ns - later(short).gnss.stamp_ns) * 1e-9
+    moved_s = (correct_clocks(sections, STREAMS)[0].measurements.gnss.stamp_ns - later(short).gnss.stamp_ns) * 1e-9
     if drift_ppm:
         assert (offset.blamed, offset.std_s > 5.0, np.abs(moved_s).max()) == (False, True, 0.0)
     else:
