@@ -86,7 +86,7 @@ def _serve(client: socket.socket) -> None:
 
 
 def _run_here(command: list[str], cwd: Path, env: Mapping[str, str], out: int, err: int) -> int:
-    new = patch.dict(object_storage._patience, clear=True)  # as in a process that has had no answer
+    new = patch.dict(object_storage._has_answered, clear=True)  # as in a process that has had no answer
     with chdir(cwd), patch.dict(os.environ, env, clear=True), new, _standard_files(out, err):
         return _exit_code(command)
 
