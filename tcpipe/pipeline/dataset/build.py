@@ -23,7 +23,7 @@ from tcpipe.formats.dataset_files import (
     read_intact_card,
 )
 from tcpipe.formats.documents import State, make_key
-from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
+from tcpipe.formats.finding_lines import format_budget, format_groups, list_verdict
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
@@ -78,7 +78,7 @@ class BuildResult:
         by_run = self.card.findings_by_run if self.card else {}
         by_map = self.card.findings_by_map if self.card and not problems else {}
         groups = group_dataset_findings(own, dict.fromkeys(by_run, ()) if problems else by_run, by_map)
-        return format_mixed_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
+        return format_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
 
     def _facts(self) -> list[str]:
         card = self.card
@@ -290,7 +290,7 @@ def _find_left_out(
     if len(inputs.runs) < min_runs:
         count = f"{len(inputs.runs)} runs, expected {min_runs} or more (--min-runs); nothing is written"
         groups = group_dataset_findings((*chosen.damaged, *fewer), {run.run_id: () for run in inputs.runs})
-        raise DatasetError(count, *format_mixed_groups(groups))
+        raise DatasetError(count, *format_groups(groups))
     return (*chosen.damaged, *(replace(finding, severity="note") for finding in fewer))
 
 

@@ -38,7 +38,7 @@ from tcpipe.formats.dataset_files import (
     make_parquet_writers,
     make_zarr_writers,
 )
-from tcpipe.formats.finding_lines import format_finding, format_mixed_groups
+from tcpipe.formats.finding_lines import format_finding, format_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import (
     ROWS_PER_GROUP,
@@ -337,7 +337,7 @@ def _describe_uncertainty(
         f"the problems below, or accept patches with such an offset ({format_recipe_key('sample.max_position_std_m')})"
     )
     groups = group_dataset_findings((), {run.run_id: run.findings for run in inputs.sources})
-    return [line, *format_mixed_groups(groups)]
+    return [line, *format_groups(groups)]
 
 
 def _describe_coverage(source: MapFile, *, alone: bool) -> str:
