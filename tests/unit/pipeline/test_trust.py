@@ -278,7 +278,7 @@ def test_causes_and_effects_are_named(made, copy, tmp_path):
     assert found.causes == (
         "recipe: sample.patch_m 1.0 → 0.8",
         "recipe: split.holdout block → sample",
-        "log: added later.mcap (run later, 28 samples)",
+        "run: added later",
         "region: removed",
     )
     assert found.samples == {
