@@ -26,8 +26,7 @@ from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import BLOBS, INDEX, State, make_key
 from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.logs.writing import write_mcap
-from tcpipe.formats.runs import LogOrigin, Run
-from tcpipe.formats.store_records import find_lineage
+from tcpipe.formats.runs import LogOrigin, Run, find_lineage
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.calls import INGEST, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest

@@ -37,8 +37,7 @@ from tcpipe.formats.file_checks import find_changed_files
 from tcpipe.formats.integrity import CHECKSUMS, compute_checksums
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.place import Place, open_place
-from tcpipe.formats.runs import Run, RunFacts, strip_repeated
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.runs import Run, RunFacts, StoredMap, strip_repeated
 from tcpipe.formats.stored_runs import StoredRun, convert_run_errors
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 

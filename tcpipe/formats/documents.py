@@ -37,8 +37,7 @@ from tcpipe.formats.integrity import compute_short_digest
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import Call, Failure, LogSnapshot, Output, Problem, StoredMap, Tags, find_lineage
+from tcpipe.formats.runs import Call, Failure, LogSnapshot, Output, Problem, RunFacts, StoredMap, Tags, find_lineage
 from tcpipe.tables.findings import Subject, make_finding
 
 logger = logging.getLogger("tcpipe")

@@ -10,8 +10,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.dataset_files import REPORT, is_desktop_file
 from tcpipe.formats.documents import BLOBS, State, read_record
 from tcpipe.formats.place import Entry, Place
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.runs import RunFacts, StoredMap
 from tcpipe.formats.stored_runs import STREAMS
 
 BLOB = re.compile(r"[0-9a-f]{16}")

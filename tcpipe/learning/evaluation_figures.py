@@ -26,8 +26,7 @@ from tcpipe.report.colours import CLASS_COLOURS, FAINT, SPLIT_COLOURS, find_clas
 from tcpipe.report.dataset_patches import choose_thinning, make_sheets
 from tcpipe.report.page import Column, Section, Shaded, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, make_plot
-from tcpipe.tables.arrays import to_texts
-from tcpipe.tables.columns import to_floats
+from tcpipe.tables.columns import to_floats, to_texts
 from tcpipe.tables.findings import read_threshold
 
 _CALLED = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}

@@ -37,8 +37,7 @@ from tcpipe.stages.fuse_inputs import Section, prepare_sections
 from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.store import is_store
-from tcpipe.tables.arrays import number_column, select_rows
-from tcpipe.tables.columns import read_float_columns, to_integers
+from tcpipe.tables.columns import number_column, read_float_columns, select_rows, to_integers
 from tcpipe.tables.levels import Streams, Track
 
 Ints = NDArray[np.int64]

@@ -19,8 +19,7 @@ from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
-from tcpipe.formats.runs import find_problems
-from tcpipe.formats.store_records import Failure, find_lineage, make_failure
+from tcpipe.formats.runs import Failure, find_lineage, find_problems, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_queue import Item, iterate_rounds, make_tasks

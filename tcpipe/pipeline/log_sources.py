@@ -21,7 +21,7 @@ from tcpipe.formats.logs.log_names import find_log_suffix, is_log_file
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
 from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files, walk_folders
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
-from tcpipe.formats.store_records import LogSnapshot
+from tcpipe.formats.runs import LogSnapshot
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
 

@@ -20,7 +20,7 @@ from tcpipe.formats.maps.geotiff import list_raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.runs import StoredMap
 from tcpipe.pipeline.calls import ADD_MAP, RunningCall, record_call
 from tcpipe.pipeline.options import AddMapOptions, Files
 from tcpipe.report.pictures import draw_quick_look, write_overview

@@ -19,8 +19,7 @@ from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.pipeline.options import CheckSplitOptions
 from tcpipe.report.split_page import render_split_page
 from tcpipe.splits.audit import count_neighbours, measure_leakage
-from tcpipe.tables.arrays import to_numbers, to_texts
-from tcpipe.tables.columns import to_floats
+from tcpipe.tables.columns import to_floats, to_numbers, to_texts
 from tcpipe.tables.options import as_function
 
 Floats = NDArray[np.float64]

@@ -19,7 +19,7 @@ from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_finding, group_findings
 from tcpipe.formats.object_storage import format_path, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.store_records import Call, Problem
+from tcpipe.formats.runs import Call, Problem
 from tcpipe.pipeline.calls import (
     INGEST,
     Estimate,

@@ -15,8 +15,7 @@ from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.runs import RunFacts, find_problems
-from tcpipe.formats.store_records import Output, make_failure
+from tcpipe.formats.runs import Output, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.plan import list_transient_failures
 from tcpipe.pipeline.problems import is_acknowledged
 from tcpipe.power.witnesses import compare_batteries

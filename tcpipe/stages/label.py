@@ -56,9 +56,8 @@ from tcpipe.stages.label_uncertainty import (
 )
 from tcpipe.stages.label_witnesses import find_witnesses
 from tcpipe.stages.message_arrays import make_rails
-from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
-from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
+from tcpipe.tables.columns import make_lines, read_lonlat_deg, select_rows, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import PhysicsFacts, PowerSensorFacts
 from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,

@@ -30,9 +30,8 @@ from tcpipe.motion.row_sections import number_pieces
 from tcpipe.motion.vibration import compute_vibration_mps2
 from tcpipe.power.noise import compute_median_period_s, estimate_resolution
 from tcpipe.power.rails import Rail, Rule, Samples, integrate_recorded_energy
-from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts, RailFacts, SignalFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo

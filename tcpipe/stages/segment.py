@@ -23,9 +23,8 @@ from tcpipe.motion.distance_breakdown import (
 from tcpipe.motion.row_sections import number_pieces
 from tcpipe.path import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
-from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import DropReason, Loss, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import SegmentFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import SEGMENTS, Datum, MaskedTrack, Segments, TrackInfo, add_findings

@@ -30,7 +30,7 @@ from tcpipe.logs.wire_cursors import (
     walk,
 )
 from tcpipe.logs.wire_types import Array, Record, Scalar, Text, WireType, iterate_flat_fields
-from tcpipe.tables.arrays import number_column
+from tcpipe.tables.columns import number_column
 
 FLUSH_BYTES = 1 << 21
 """Payloads are turned into columns when about this much has gathered: it still lies in the cache."""

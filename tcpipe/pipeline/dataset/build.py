@@ -28,7 +28,7 @@ from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
-from tcpipe.formats.store_records import Options, Output
+from tcpipe.formats.runs import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, describe_error, estimate, list_ended_calls, record_call
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps

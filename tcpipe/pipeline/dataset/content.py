@@ -60,9 +60,8 @@ from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
 from tcpipe.stages.sample import Sampled, place_segments, sum_losses
-from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
-from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
+from tcpipe.tables.columns import make_points, read_lonlat_deg, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.classes import PAPER_CLASSES

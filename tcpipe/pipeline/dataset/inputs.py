@@ -37,14 +37,12 @@ from tcpipe.formats.geojson import regions_to_json
 from tcpipe.formats.integrity import compute_checksums
 from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.runs import RunFacts, StoredMap
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
 from tcpipe.store import Store
-from tcpipe.tables.arrays import encode_rows, number_column
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import encode_rows, number_column, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import RESULTS_VERSION, TABLES_VERSION
 

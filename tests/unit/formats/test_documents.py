@@ -28,7 +28,7 @@ from tcpipe.formats.documents import (
     scan,
 )
 from tcpipe.formats.place import Place
-from tcpipe.formats.store_records import Call, Failure, Output, Tags
+from tcpipe.formats.runs import Call, Failure, Output, Tags
 
 
 @pytest.fixture(params=["directory", "bucket"])
@@ -228,7 +228,7 @@ def test_a_process_that_scans_again_reads_what_others_have_written_meanwhile_and
     assert read == []
     program = (
         "import sys; from pathlib import Path; from tcpipe.formats.documents import *\n"
-        "from tcpipe.formats.place import Place; from tcpipe.formats.store_records import Tags\n"
+        "from tcpipe.formats.place import Place; from tcpipe.formats.runs import Tags\n"
         "place = Place(Path(sys.argv[1])); state = scan(place)\n"
         "put_document(place, state, 'tags', make_key('log 1'), Tags('log 1', {'by': 'another'}))\n"
         "put_document(place, state, 'tags', make_key('log 9'), Tags('log 9', {'by': 'another'}))\n"

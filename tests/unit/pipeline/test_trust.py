@@ -18,7 +18,7 @@ from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats import documents, file_checks
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_page, write_sealed
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.store_records import Output
+from tcpipe.formats.runs import Output
 from tcpipe.pipeline.calls import record_call
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import _match_by_time, diff
