@@ -14,13 +14,12 @@ from __future__ import annotations
 import re
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import check_local_output, make_unique_name
-from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
+from tcpipe.formats.atomic import check_input_path, check_local_output, make_unique_name
 from tcpipe.formats.documents import (
     BLOBS,
     KINDS,
@@ -33,10 +32,10 @@ from tcpipe.formats.documents import (
     scan,
 )
 from tcpipe.formats.documents import parse_name as parse_document_name
-from tcpipe.formats.file_checks import find_changed_files
 from tcpipe.formats.integrity import CHECKSUMS, compute_checksums
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.place import Place, find_changed_files, open_place
+from tcpipe.formats.published_outputs import FetchedShards, fetch_files
 from tcpipe.formats.runs import Run, RunFacts, StoredMap, strip_repeated
 from tcpipe.formats.stored_runs import StoredRun, convert_run_errors
 from tcpipe.tables.levels import DATA_MODEL_VERSION
@@ -200,3 +199,37 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     if create:
         store.place.clear()
     return store
+
+
+def is_path(name: Path | str) -> bool:
+    """Return whether a name is a URL, or that of a file or directory; any other is looked up as a run."""
+    if is_url(name):
+        return True
+    with suppress(UsageError):
+        check_input_path(name)
+        return True
+    return False
+
+
+def find_named_runs(name: Path | str, store: Path | str) -> list[StoredRun]:
+    """Return the runs called RUN, under each recipe, or RUN/RECIPE; `UsageError` if the store has none."""
+    if str(name) != str(store) and not is_store(store):
+        raise UsageError(
+            f"{name}: there is no such file or directory; if it is a run, name its store with --store: there is none at {store}"
+        )
+    found = open_store(store).find_runs(str(name))
+    if not found:
+        raise UsageError(
+            f"{name}: there is no such file or directory, and no such run in {store}; "
+            f"expected a path, a run or RUN/RECIPE; 'tcpipe inspect {store}' lists the runs"
+        )
+    return found
+
+
+def find_named_run(name: Path | str, store: Path | str) -> StoredRun:
+    """Return the run called RUN or RUN/RECIPE; `UsageError` if the store has none, or several of that name."""
+    found = find_named_runs(name, store)
+    if len(found) > 1:
+        names = ", ".join(run.name for run in found)
+        raise UsageError(f"{name}: was ingested under several recipes; expected one of {names}")
+    return found[0]

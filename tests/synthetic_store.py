@@ -42,7 +42,7 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
-from tcpipe.terrain.classes import PAPER_SCHEME
+from tcpipe.terrain.layers import PAPER_SCHEME
 
 STANDING_WATT = 90.0
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)

@@ -31,7 +31,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import parse_typed, read_json
 
 if TYPE_CHECKING:
-    from tcpipe.formats.bucket_directories import FetchedShards
+    from tcpipe.formats.published_outputs import FetchedShards
 
 DESCRIPTION = "zarr.json"
 """What an array or a group is, in its directory."""

@@ -22,7 +22,7 @@ from tcpipe.learning.models import Model
 from tcpipe.learning.predictor import Prediction
 from tcpipe.learning.training import compute_dataset_checksum, read_class_table
 from tcpipe.tables.columns import Column, to_floats, to_texts
-from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.layers import ClassTable
 
 CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
 """What columns of tables call the quantities."""

@@ -29,14 +29,13 @@ from tcpipe.fusion.withheld import (
     score_comparisons,
 )
 from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
-from tcpipe.pipeline.named_runs import find_named_run, is_path
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_inputs import Section, prepare_sections
 from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.stages.read import find_read_config, read_run
-from tcpipe.store import is_store
+from tcpipe.store import find_named_run, is_path, is_store
 from tcpipe.tables.columns import number_column, read_float_columns, select_rows, to_integers
 from tcpipe.tables.levels import Streams, Track
 

@@ -13,11 +13,10 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import clean_lines
-from tcpipe.formats.bucket_directories import fetch_directory
-from tcpipe.formats.dataset_card import DatasetCard, MapSource
+from tcpipe.formats.dataset_card import Change, DatasetCard, MapSource, compare_records, format_value
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
-from tcpipe.formats.dataset_inputs import Change, compare_records, format_value
 from tcpipe.formats.finding_lines import format_findings
+from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Subject

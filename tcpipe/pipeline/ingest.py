@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, clean_line, list_first
@@ -22,16 +22,64 @@ from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
 from tcpipe.formats.runs import Failure, find_lineage, find_problems, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_queue import Item, iterate_rounds, make_tasks
-from tcpipe.pipeline.log_sources import FoundLogs, find_failure, find_sources, select_shard
+from tcpipe.pipeline.log_sources import (
+    FoundLogs,
+    LogSource,
+    add_hashes,
+    find_failure,
+    find_sources,
+    group_possible_duplicates,
+    make_definitions_key,
+    plan_rounds,
+    select_shard,
+)
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
 from tcpipe.pipeline.problems import is_acknowledged
-from tcpipe.recipe import TimeWindow
+from tcpipe.recipe import Recipe, TimeWindow
 from tcpipe.store import is_store, open_store
 from tcpipe.tables.findings import select_problems
 from tcpipe.tables.levels import RESULTS_VERSION
 from tcpipe.tables.options import as_function
+
+
+def make_tasks(
+    sources: Iterable[LogSource], options: IngestOptions, root: Path | str, recipe: Recipe
+) -> list[IngestTask]:
+    """Return the task of each log; on a cluster, whose workers are elsewhere, with absolute paths."""
+    definitions = None if options.message_definitions is None else Path(options.message_definitions)
+    if options.cluster is not None:
+        root = root.absolute() if isinstance(root, Path) else root
+        definitions = definitions and definitions.absolute()
+    robot, tags = options.robot or recipe.robot, dict(options.tags or {})
+    how = (root, recipe, robot, tags, options.force, definitions, make_definitions_key(definitions))
+    return [IngestTask(source, *how, options.retry_failed, options.min_age_s) for source in sources]
+
+
+Item: TypeAlias = tuple[int, IngestTask]
+
+
+def iterate_rounds(steps: Sequence[Step]) -> Iterator[Iterable[Item]]:
+    """Yield logs to ingest side by side, then those that hold the same recording as one of them.
+
+    Logs that may be the same recording are a unit, so that the first of them names the run.
+    """
+    todo = [at for at, step in enumerate(steps) if step.is_todo]
+    units = group_possible_duplicates([steps[at].task.source for at in todo])
+    later = list[Item]()
+
+    def take() -> Iterator[Item]:
+        for unit in units:
+            indices = [todo[at] for at in unit]
+            hashed = add_hashes([steps[at].task.source for at in indices])
+            items = [(at, replace(steps[at].task, source=source)) for at, source in zip(indices, hashed, strict=True)]
+            now, after = plan_rounds(hashed)
+            later.extend(items[at] for at in after)
+            yield from (items[at] for at in now)
+
+    yield take()
+    yield later
+
 
 logger = logging.getLogger("tcpipe")
 

@@ -17,9 +17,16 @@ from tcpipe.errors import LogError, StoreError, TcpipeError, clean_line
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import find_logs, list_logs_below
 from tcpipe.formats.logs.log_joining import open_logs
-from tcpipe.formats.logs.log_names import find_log_suffix, is_log_file
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
-from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files, walk_folders
+from tcpipe.formats.logs.table_folders import (
+    Mappings,
+    find_log_suffix,
+    find_table_logs,
+    is_log_file,
+    is_table,
+    list_table_files,
+    walk_folders,
+)
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
 from tcpipe.formats.runs import LogSnapshot
 from tcpipe.logs.topics import Topic

@@ -27,8 +27,7 @@ from tcpipe.report.pictures import draw_quick_look, write_overview
 from tcpipe.store import Store, check_map_name, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function
-from tcpipe.terrain.classes import ClassScheme
-from tcpipe.terrain.layers import find_wrong_name
+from tcpipe.terrain.layers import ClassScheme, find_wrong_name
 
 logger = logging.getLogger("tcpipe")
 

@@ -23,7 +23,7 @@ from tcpipe.formats.parquet import read_table
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
-from tcpipe.pipeline.named_runs import find_named_run
+from tcpipe.store import find_named_run
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import make_text_column, to_numbers, to_texts
 from tcpipe.tables.levels import GEOMETRY

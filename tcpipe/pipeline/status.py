@@ -30,8 +30,7 @@ from tcpipe.pipeline.calls import (
     list_ended_calls,
     list_open_calls,
 )
-from tcpipe.pipeline.ingest import CallOptions
-from tcpipe.pipeline.log_queue import make_tasks
+from tcpipe.pipeline.ingest import CallOptions, make_tasks
 from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan

@@ -20,6 +20,7 @@ from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_
 from tcpipe.formats.documents import BLOBS
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
+from tcpipe.formats.place import REPORT
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
 from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
 from tcpipe.report.label_sections import (
@@ -49,7 +50,6 @@ from tcpipe.stages.sample import separate_frames
 from tcpipe.store import Store, is_store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
-_PAGE = "report.html"
 MOST_SAMPLES = 100_000
 """On the page: of more the first ones, since their order is random."""
 
@@ -202,14 +202,14 @@ def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
         with suppress(StoreError, UsageError):  # no store that can be read
             rows = Store(path).scan().runs.values() if is_store(path) else ()
             names = {row.run_id: row.blob for row in rows if row.blob and (row.run_id, row.recipe_id) in wanted}
-            found |= {run_id: f"../{path.name}/{BLOBS}/{blob}/{_PAGE}" for run_id, blob in names.items()}
+            found |= {run_id: f"../{path.name}/{BLOBS}/{blob}/{REPORT}" for run_id, blob in names.items()}
     return found
 
 
 def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
     """Return the existing pages of the stores of these runs' pages (`_find_run_pages`)."""
     stores = sorted({href.split("/")[1] for href in hrefs.values()})
-    return [Link(f"All runs of {name}", f"../{name}/{_PAGE}") for name in stores if (beside / name / _PAGE).is_file()]
+    return [Link(f"All runs of {name}", f"../{name}/{REPORT}") for name in stores if (beside / name / REPORT).is_file()]
 
 
 def _make_audit_section(card: DatasetCard) -> Section:

@@ -21,8 +21,8 @@ from mcap.writer import Writer
 from stored_files import flip, read_files
 
 from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.dataset_card import RunInputs
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.formats.dataset_inputs import RunInputs
 from tcpipe.formats.integrity import compute_checksum, write_sealed
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.pipeline.dataset.build import build_dataset

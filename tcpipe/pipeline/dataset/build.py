@@ -12,7 +12,6 @@ from pathlib import Path
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
 from tcpipe.execution import refuse_import_of_script
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
-from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -27,7 +26,7 @@ from tcpipe.formats.finding_lines import format_budget, format_groups, list_verd
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
-from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
+from tcpipe.formats.published_outputs import check_kind, fetch_directory_by_range, find_newest, write_output
 from tcpipe.formats.runs import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, describe_error, estimate, list_ended_calls, record_call

@@ -40,8 +40,7 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, Verdict, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELS
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import LAYERS, Layer
+from tcpipe.terrain.layers import LAYERS, PAPER_CLASSES, ClassTable, Layer
 
 VELOCITY_COLUMN = {"ground": "velocity_mps", "fused": "fused_velocity_mps"}
 """Column of samples.parquet that each choice of ``label.velocity`` trains on."""

@@ -52,7 +52,7 @@ from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.options import BuildOptions
-from tcpipe.pipeline.dataset.pooling import list_needs, move_losses, pool_segments
+from tcpipe.pipeline.dataset.runs import list_needs, move_losses, pool_segments
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded, number_runs
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
@@ -64,7 +64,7 @@ from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import make_points, read_lonlat_deg, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
 from tcpipe.tables.levels import SAMPLES
-from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import PAPER_CLASSES
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, parse_crs
 from tcpipe.terrain.tiles import find_map_projection
 

@@ -22,13 +22,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
-from tcpipe.formats.bucket_directories import FetchedShards
-from tcpipe.formats.dataset_card import DatasetCard, RunSource
-from tcpipe.formats.dataset_inputs import (
+from tcpipe.formats.dataset_card import (
     Change,
+    DatasetCard,
     DatasetInputs,
     ExclusionInputs,
     RunInputs,
+    RunSource,
     compare_records,
     format_value,
 )
@@ -37,6 +37,7 @@ from tcpipe.formats.geojson import regions_to_json
 from tcpipe.formats.integrity import compute_checksums
 from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.published_outputs import FetchedShards
 from tcpipe.formats.runs import RunFacts, StoredMap
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions

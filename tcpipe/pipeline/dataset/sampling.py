@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, unwrap_result
-from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file, take_rows
+from tcpipe.formats.published_outputs import FetchedShards
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled, Shifts, check_same_layers, sample_on_maps

@@ -15,7 +15,8 @@ from synthetic_store import add_run, box, lanes, make_fixes, region_file, segmen
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats import documents, file_checks
+from tcpipe.formats import documents
+from tcpipe.formats import place as places
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_page, write_sealed
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.runs import Output
@@ -368,8 +369,8 @@ def test_a_shard_of_another_build_is_refused_though_its_own_checksums_agree(copy
 def test_a_digest_is_found_once_until_the_file_changes(copy, monkeypatch, tmp_path):
     monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "cache"))
     dataset, hashed = copy("zarr"), []
-    whole = file_checks._compute_digest
-    monkeypatch.setattr(file_checks, "_compute_digest", lambda place, name: hashed.append(name) or whole(place, name))
+    whole = places._compute_digest
+    monkeypatch.setattr(places, "_compute_digest", lambda place, name: hashed.append(name) or whole(place, name))
 
     def hashed_shards():
         return sorted(name for name in hashed if "/c/" in name)
