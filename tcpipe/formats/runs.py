@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 from tcpipe.formats.integrity import Checksum
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.recipe import IngestSections
-from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, LabelFacts, PhysicsFit, StageFacts
+from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFit, StageFacts
 from tcpipe.tables.findings import (
     LEFT_OUT,
     Finding,
@@ -329,8 +329,6 @@ class Run(RunFacts):
     topics: tuple[TopicCount, ...] = ()
     notes: tuple[Finding, ...] = ()
     """On the log."""
-    read_report: StageReport[StageFacts] = NOTHING_FOUND
-    """Findings and facts of the stage that reads."""
 
 
 @dataclass(frozen=True, slots=True)

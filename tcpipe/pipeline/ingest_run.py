@@ -231,7 +231,6 @@ def make_run(
         info=info,
         topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
         notes=read.notes,
-        read_report=streams.report,
     )
 
 
