@@ -38,7 +38,6 @@ from tcpipe.report.page import (
     Link,
     Number,
     Section,
-    VerdictBox,
     make_shown_column,
     pack_columns,
     render_page,
@@ -95,10 +94,11 @@ def render_dataset_report(
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
+    groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
     return render_page(
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
-        verdict=_make_verdict(card),
+        verdict=show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups),
         numbers=_make_numbers(card),
         links=[] if beside is None else _list_store_pages(beside, hrefs),
         warnings=lost,
@@ -128,12 +128,6 @@ def render_dataset_report(
         data=_make_data(card, samples, shown, patches=patches, map_plot=plots[0], hrefs=hrefs) | {"folder": folder},
         reads_pictures=bool(folder),
     )
-
-
-def _make_verdict(card: DatasetCard) -> VerdictBox:
-    """Return the verdict and the findings by code."""
-    groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
-    return show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups)
 
 
 _SELECTION = Section(

@@ -310,7 +310,13 @@ def remove_duplicates(runs: Sequence[StoredRun]) -> UniqueRuns:
 
     @lru_cache(maxsize=_WAYS)
     def way(index: int) -> _SegmentPositions:
-        return _read_positions(runs[index])
+        run = runs[index]
+        names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
+        table = run.table("segments", names)
+        middle = [
+            (to_floats(table, f"start_{axis}_deg") + to_floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")
+        ]
+        return _SegmentPositions(to_integers(table, "start_ns"), to_integers(table, "end_ns"), np.column_stack(middle))
 
     again: dict[str, Mask] = {}
     findings: list[Finding] = []
@@ -413,15 +419,6 @@ def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
     if facts.start_ns is None or facts.end_ns is None:
         return -_NEVER_NS, _NEVER_NS
     return facts.start_ns, facts.end_ns
-
-
-def _read_positions(run: StoredRun) -> _SegmentPositions:
-    names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
-    table = run.table("segments", names)
-    middle = [
-        (to_floats(table, f"start_{axis}_deg") + to_floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")
-    ]
-    return _SegmentPositions(to_integers(table, "start_ns"), to_integers(table, "end_ns"), np.column_stack(middle))
 
 
 def _find_shared(mine: _SegmentPositions, other: _SegmentPositions) -> Mask:
