@@ -25,12 +25,9 @@ from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
-    add_hashes,
     find_failure,
     find_sources,
-    group_possible_duplicates,
     make_definitions_key,
-    plan_rounds,
     select_shard,
 )
 from tcpipe.pipeline.options import IngestOptions
@@ -59,26 +56,15 @@ def make_tasks(
 Item: TypeAlias = tuple[int, IngestTask]
 
 
-def iterate_rounds(steps: Sequence[Step]) -> Iterator[Iterable[Item]]:
-    """Yield logs to ingest side by side, then those that hold the same recording as one of them.
-
-    Logs that may be the same recording are a unit, so that the first of them names the run.
-    """
-    todo = [at for at, step in enumerate(steps) if step.is_todo]
-    units = group_possible_duplicates([steps[at].task.source for at in todo])
-    later = list[Item]()
-
-    def take() -> Iterator[Item]:
-        for unit in units:
-            indices = [todo[at] for at in unit]
-            hashed = add_hashes([steps[at].task.source for at in indices])
-            items = [(at, replace(steps[at].task, source=source)) for at, source in zip(indices, hashed, strict=True)]
-            now, after = plan_rounds(hashed)
-            later.extend(items[at] for at in after)
-            yield from (items[at] for at in now)
-
-    yield take()
-    yield later
+def iterate_rounds(steps: Sequence[Step]) -> list[list[Item]]:
+    """Return logs to ingest side by side, then those with the size of one of them: the first of equal logs names their run."""
+    sizes, rounds = set[int](), [list[Item](), list[Item]()]
+    for index, step in enumerate(steps):
+        if step.is_todo:
+            size_bytes = step.task.source.size_bytes
+            rounds[size_bytes in sizes].append((index, step.task))
+            sizes.add(size_bytes)
+    return rounds
 
 
 logger = logging.getLogger("tcpipe")
@@ -275,18 +261,11 @@ def _iterate_results(
     """Yield what became of each log by its index, as it ends."""
     known = {problem.key for row in call.state.runs.values() for problem in find_problems(row)}
     for turn in iterate_rounds(steps):
-        taken = list[Item]()
-        with closing(run_all(ingest_one, _take_tasks(turn, taken), jobs=jobs, cluster=cluster)) as outcomes:
+        with closing(run_all(ingest_one, [task for _, task in turn], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                index, task = taken[outcome.index]
+                index, task = turn[outcome.index]
                 ended = outcome.result or Ingested(task.source, make_died_result(task.source))
                 yield index, _record_result(call, task, ended, known)
-
-
-def _take_tasks(turn: Iterable[Item], taken: list[Item]) -> Iterator[IngestTask]:
-    for item in turn:
-        taken.append(item)
-        yield item[1]
 
 
 def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: set[str]) -> IngestResult:
