@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import math
 import os
-import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import google_crc32c
 import numcodecs
@@ -28,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import parse_typed, read_json
+from tcpipe.formats.json_files import read_json
 
 if TYPE_CHECKING:
     from tcpipe.formats.published_outputs import FetchedShards
@@ -211,77 +210,30 @@ def open_sharded(
     sparse: bool = False,
     fetched: FetchedShards | None = None,
 ) -> ShardedArray:
-    """Return the array in ``path``, once its description, ``zarr.json``, says that it has the form that is wanted.
+    """Return the array in ``path``, whose numbers come from a card; of its description, ``zarr.json``, only the compression is used.
 
-    Every number comes from the caller, who knows it from a card: of the description only the compression is used. `StoreError`: there is
-    no description, or it says something else.
+    `StoreError`: there is no description, or another compression than tcpipe writes.
     """
     where = path / DESCRIPTION
     if not where.exists():
         raise StoreError(f"{path}: is missing")
-    described = read_json(where)
-    compression = _find_compression(described)
-    wanted = {
-        "zarr_format": 3,
-        "node_type": "array",
-        "shape": list(shape),
-        "data_type": dtype.name,
-        "fill_value": "NaN" if math.isnan(fill) else fill,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(shard_shape)}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": _make_codecs(list(chunk_shape), dtype, compression),
-        "storage_transformers": [],
-    }
-    for key, value in wanted.items():
-        if described.get(key) != value:
-            raise StoreError(f"{where}: {key} is {reprlib.repr(described.get(key))}, expected {value}")
-    codec = _make_codec(compression, where)
+    described: Any = read_json(where)
+    try:
+        codec = _make_codec(**described["codecs"][0]["configuration"]["codecs"][1])
+    except (LookupError, TypeError, ValueError, OverflowError):
+        raise StoreError(f"{where}: its chunks are not in shards and compressed by zstd or blosc") from None
     return ShardedArray(path, shape, chunk_shape, shard_shape, dtype, fill, sparse, codec, fetched)
 
 
-def _find_compression(described: Mapping[str, Any]) -> Any:
-    """Return the second codec of an array's chunks, wherever it stands; None where the description has another form."""
-    try:
-        codecs = described["codecs"]
-        return (codecs[0]["configuration"]["codecs"] if codecs[0]["name"] == "sharding_indexed" else codecs)[1]
-    except (LookupError, TypeError):
-        return None
-
-
-def _make_codecs(chunk_shape: list[int], dtype: np.dtype[Any], compression: Any) -> list[Any]:
-    """Return the codecs of an array as this program writes them."""
-    little, crc = {"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}
-    values = {"name": "bytes"} if dtype.itemsize == 1 else little
-    inner = [values, compression, crc]
-    how = {"chunk_shape": chunk_shape, "codecs": inner, "index_codecs": [little, crc], "index_location": "end"}
-    return [{"name": "sharding_indexed", "configuration": how}]
-
-
-@dataclass(frozen=True, slots=True)
-class _Zstd:
-    level: int
-    checksum: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Blosc:
-    cname: Literal["zstd", "lz4"]
-    clevel: int
-    shuffle: Literal["noshuffle", "shuffle", "bitshuffle"]
-    blocksize: int
-
-
-def _make_codec(compression: Any, where: Path) -> Any:
-    """Return the codec that a description asks for; it decodes all its settings."""
-    name = compression.get("name") if isinstance(compression, dict) else None
+def _make_codec(name: str, configuration: Mapping[str, Any]) -> Any:
+    """Return the codec that a description names; it decodes all its settings."""
     if name == "zstd":
-        zstd = parse_typed(compression.get("configuration"), _Zstd, where)
-        return numcodecs.Zstd(level=zstd.level, checksum=zstd.checksum)
-    if name == "blosc":
-        blosc = parse_typed(compression.get("configuration"), _Blosc, where)
-        shuffle = _BLOSC_SHUFFLES[blosc.shuffle]
-        return numcodecs.Blosc(cname=blosc.cname, clevel=blosc.clevel, shuffle=shuffle, blocksize=blosc.blocksize)
-    raise StoreError(f"{where}: compressed by {reprlib.repr(name)}, expected zstd or blosc")
+        return numcodecs.Zstd(level=configuration["level"], checksum=configuration["checksum"])
+    if name != "blosc":
+        raise ValueError(name)
+    cname, clevel, blocksize = (configuration[key] for key in ("cname", "clevel", "blocksize"))
+    shuffle = _BLOSC_SHUFFLES[configuration["shuffle"]]
+    return numcodecs.Blosc(cname=cname, clevel=clevel, shuffle=shuffle, blocksize=blocksize)
 
 
 def _decode(codec: Any, data: bytes, out: NDArray[Any]) -> None:
