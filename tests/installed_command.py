@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from json_contracts import json_output_types
+
 from tcpipe.cli import main
-from tcpipe.cli.site_commands import json_output_types
 from tcpipe.formats import object_storage
 from tcpipe.formats.json_files import parse_typed, to_plain
 
