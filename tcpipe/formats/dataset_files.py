@@ -34,8 +34,15 @@ from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
 from tcpipe.formats.place import REPORT, Place, find_changed_files, prove_files
 from tcpipe.formats.published_outputs import REPORT_PATCHES, FetchedShards
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
-from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
+from tcpipe.formats.zarr_arrays import (
+    DESCRIPTION,
+    Compression,
+    ShardedArray,
+    add_array,
+    consolidate_metadata,
+    create_group,
+    open_sharded,
+)
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, describe_other_data_model
 from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers

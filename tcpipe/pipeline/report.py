@@ -28,11 +28,11 @@ from tcpipe.pipeline.plan import list_transient_failures
 from tcpipe.pipeline.problems import is_acknowledged
 from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
-from tcpipe.report.dataset_patches import find_picture_folder, iterate_pictures
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.label_sections import describe_physics
 from tcpipe.report.maps import StoredMaps
 from tcpipe.report.page import is_made_from
+from tcpipe.report.pictures import find_picture_folder, iterate_pictures
 from tcpipe.report.run_report import run_report
 from tcpipe.report.store_report import FailedLog, RunKey, StoredDataset, StoreFacts, store_report
 from tcpipe.robust import estimate_robust_std

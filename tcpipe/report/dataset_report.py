@@ -22,7 +22,6 @@ from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.place import REPORT
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
-from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -43,6 +42,7 @@ from tcpipe.report.page import (
     render_page,
     show_verdict,
 )
+from tcpipe.report.pictures import PER_SHEET, make_patches_data
 from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.stages.sample import separate_frames
@@ -77,7 +77,7 @@ def render_dataset_report(
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
 
     ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too. ``folder`` beside the page
-    holds pictures of all patches (`tcpipe.report.dataset_patches.iterate_pictures`), if it is given. ``samples`` has at least
+    holds pictures of all patches (`tcpipe.report.pictures.iterate_pictures`), if it is given. ``samples`` has at least
     `SAMPLE_COLUMNS` of the samples; None: they are read.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """

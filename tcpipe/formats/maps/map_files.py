@@ -40,8 +40,14 @@ from tcpipe.formats.json_files import convert_record, parse_typed, read_json, to
 from tcpipe.formats.maps.map_facts import Description, MapFacts, MapSummary, describe_layer, make_cf_flags, read_layers
 from tcpipe.formats.place import prove_files
 from tcpipe.formats.published_outputs import FetchedShards
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
-from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
+from tcpipe.formats.zarr_arrays import (
+    DESCRIPTION,
+    ShardedArray,
+    add_array,
+    consolidate_metadata,
+    create_group,
+    open_sharded,
+)
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import PAPER_LAYERS, ClassScheme, ClassTable, Layer, Pixels, TerrainClass, find_no_data_value

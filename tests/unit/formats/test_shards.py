@@ -9,8 +9,7 @@ import pytest
 import zarr
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.shards import open_sharded
-from tcpipe.formats.zarr_arrays import add_array, create_group
+from tcpipe.formats.zarr_arrays import add_array, create_group, open_sharded
 
 RNG = np.random.default_rng(0)
 
