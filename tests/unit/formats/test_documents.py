@@ -345,28 +345,6 @@ def refuse(*_, **__):
     raise StoreError("read-only")
 
 
-def test_a_reader_that_may_not_write_into_a_store_keeps_the_index_in_its_cache(here, tmp_path, monkeypatch):
-    put_many(here, 20)
-    monkeypatch.setattr(Place, "put", refuse)
-    first = scan_anew(here)
-    assert (first.read, index(here)) == (20, None)
-    assert [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
-    second = scan_anew(here)
-    assert (second.read, describe(second)) == (0, describe(first))
-    shutil.rmtree(tmp_path / "cache")
-    assert scan_anew(here).read == 20
-
-
-def test_a_reader_that_may_not_write_into_a_store_adds_to_its_index_in_its_cache(here, monkeypatch):
-    scan_anew(here)
-    state = put_many(here, 20)
-    scan_anew(here)
-    put_many(here, 40, state)
-    monkeypatch.setattr(Place, "put", refuse)
-    assert scan_anew(here).read == 40
-    assert scan_anew(here).read == 0
-
-
 @settings(max_examples=30)
 @given(place_in_file=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_an_index_with_a_wrong_bit_changes_no_state(store_of_twenty, place_in_file, bit):
