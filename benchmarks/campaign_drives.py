@@ -29,11 +29,11 @@ from tcpipe.logs.wire_types import Scalar, iterate_flat_fields
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, Truth, compute_true_cost, simulate_readings
+from tcpipe.simulation.messages import Recorder, make_streams
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import Leg, Pause, Wander
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.simulation.sensors import Noise, Reading, Sensors, record
-from tcpipe.simulation.site_files import Recorder, make_streams
 from tcpipe.simulation.world import MUD, PAVED, UNPAVED, Band, Ellipse, Hill, Site, World, draw_waves
 from tcpipe.stages.read import read_run
 from tcpipe.tables.bits import Quality, flag_name

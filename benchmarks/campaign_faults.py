@@ -16,8 +16,8 @@ from campaign_drives import Drive, Fault, Messages, Readings
 
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.geometry.rotation import invert, rotate
+from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.sensors import Doppler, Gnss, Mounting, Power, Reading, Sensors
-from tcpipe.simulation.site_files import TOPICS
 
 MINUTE_S = (90.0, 150.0)
 """The window of faults that last a minute."""

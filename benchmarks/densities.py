@@ -27,8 +27,8 @@ from tcpipe.fusion.hypotheses import find_event_candidates
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.recipe import Recipe
+from tcpipe.simulation.messages import make_streams
 from tcpipe.simulation.sensors import Sensors, record
-from tcpipe.simulation.site_files import make_streams
 from tcpipe.stages.fuse_inputs import prepare_sections
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams

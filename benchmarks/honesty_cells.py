@@ -18,9 +18,9 @@ from campaign_faults import SETS, alter, edit_messages, move_fixes, remove_anten
 
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.geometry.rotation import rotate
+from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.robot import make_correlated_noise
 from tcpipe.simulation.sensors import Command, Gnss, Imu, Mounting, Power, Reading, Sensors, Visual, Wheels
-from tcpipe.simulation.site_files import TOPICS
 from tcpipe.simulation.truth import Truth
 
 FixError: TypeAlias = Callable[[Truth, np.random.Generator], np.ndarray]

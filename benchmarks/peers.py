@@ -38,8 +38,8 @@ from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import rotate, rpy_from_quat
 from tcpipe.recipe import FuseConfig, ReadConfig
+from tcpipe.simulation.messages import make_streams
 from tcpipe.simulation.sensors import record
-from tcpipe.simulation.site_files import make_streams
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run
 from tcpipe.tables.columns import to_floats, to_integers

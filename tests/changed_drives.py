@@ -8,8 +8,9 @@ import numpy as np
 
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.simulation import Faults, Truth, compute_true_cost, find_scenario
+from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.route import Wander
-from tcpipe.simulation.site_files import TOPICS, simulate_messages
+from tcpipe.simulation.site_files import simulate_messages
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
 

@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 
 from tcpipe.errors import UsageError
+from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.robot import GroundModel, SimulatedRobot, Wheels
 from tcpipe.simulation.route import AlongRoad, Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
 from tcpipe.simulation.sensors import Faults, Gnss, Imu, Power, Sensors, Visual
-from tcpipe.simulation.site_files import Recorder
 from tcpipe.simulation.world import (
     GRASS,
     MUD,

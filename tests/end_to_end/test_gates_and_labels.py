@@ -11,9 +11,9 @@ from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, LabelConfig, MaskConfig, ReadConfig, SegmentConfig
 from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, make_tiny, read_truth, simulate
+from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.sensors import Imu, Wheels
-from tcpipe.simulation.site_files import Recorder
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track

@@ -9,9 +9,9 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, read_truth, simulate
+from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.route import Leg, Pause
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
-from tcpipe.simulation.site_files import Recorder
 from tcpipe.tables.bits import DropReason
 from tcpipe.terrain.layers import PAPER_CLASSES
 

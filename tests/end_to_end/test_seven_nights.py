@@ -22,7 +22,7 @@ from installed_command import COMMAND, HANGS_S
 
 import tcpipe
 from tcpipe.pipeline.maps import add_map
-from tcpipe.simulation import Faults, make_tiny, simulate, site_files
+from tcpipe.simulation import Faults, make_tiny, messages, simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 PIPELINES = ROOT / "pipelines"
@@ -65,10 +65,10 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for seed, name in enumerate(("first", "second", "third", "jackal"), 1):
         topics = {
             role: topic.replace("a200", "j100" if name == "jackal" else "a200")
-            for role, topic in site_files.TOPICS["ros2"].items()
+            for role, topic in messages.TOPICS["ros2"].items()
         }
         scenario = make_tiny(Faults.every(), seconds=28.0 + 2 * seed)
-        with patch.dict(site_files.TOPICS, ros2=topics):
+        with patch.dict(messages.TOPICS, ros2=topics):
             site = simulate(here / name, scenario=scenario, seed=seed)
         found = {name: site.logs[0], **site.rasters, **found}
     return found
