@@ -44,9 +44,6 @@ _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that few batches decode a map tile."""
 
 _PLACING = ("map_index", "position_std_m", "footprint_xy_m", "footprint_lonlat_deg")
-_SAMPLED = ("kept", "lost_by", *_PLACING)
-
-_SIZE_BYTES = 8
 
 _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
