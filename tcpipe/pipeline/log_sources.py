@@ -152,11 +152,7 @@ def find_sources(
             else:
                 above = Path(entry)
                 for files in find_logs_at(above, tables or {}):
-                    places = [path.relative_to(above).as_posix() if path != above else "" for path in files]
-                    found = [
-                        (_as_named(path), place or path.name or path.resolve().name)
-                        for path, place in zip(files, places, strict=True)
-                    ]
+                    found = [(_as_named(path), _place_in(path, above)) for path in files]
                     paths.setdefault(os.path.realpath(files[0]), found)
         except LogError as error:
             problems[format_path(entry)] = error.problems
@@ -242,6 +238,13 @@ def _as_named(path: Path) -> Path:
     if ".." not in path.parts:
         return path.absolute()
     return path.resolve() if path.name == ".." else path.parent.resolve() / path.name
+
+
+def _place_in(path: Path, entry: Path) -> str:
+    """Return where a log lies in what the user gave; tables of a run may lie beside its first one."""
+    if path == entry:
+        return path.name or path.resolve().name
+    return str(path).removeprefix(f"{entry}/").lstrip("/")
 
 
 def _list_file_states(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
