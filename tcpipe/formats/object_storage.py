@@ -38,8 +38,8 @@ _PIECE_BYTES = 1 << 24
 _AT_ONCE = 8
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
-_FIRST_S = 4.0
-"""The first request of a process waits so long for an answer: a user may be watching."""
+_FIRST_S, _FIRST_RETRY_S = 4.0, 1.0
+"""The first request of a process waits so long for an answer, and is repeated for so long: a user may be watching."""
 _RETRY_MINUTES = "10"
 """Time for which obstore repeats later requests [min], unless TCPIPE_RETRY_MINUTES gives another: a store may restart."""
 _MAX_RETRIES = 10_000
@@ -413,10 +413,11 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
     if scheme != "file":  # who names an endpoint without TLS means it
         client = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
         client |= {"timeout": timedelta(seconds=_FIRST_S)} if is_first else {}
-        minutes = _read_retry_minutes()
+        limit_s = 60.0 * _read_retry_minutes()
+        limit_s = min(limit_s, _FIRST_RETRY_S) if is_first else limit_s
         backoff = {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=3), "base": 2}
-        retry = {"max_retries": _MAX_RETRIES, "retry_timeout": timedelta(minutes=minutes), "backoff": backoff}
-        options = {"retry_config": {"max_retries": 0} if is_first else retry, "client_options": client}
+        retry = {"max_retries": _MAX_RETRIES, "retry_timeout": timedelta(seconds=limit_s), "backoff": backoff}
+        options = {"retry_config": retry, "client_options": client}
     options |= read_aws_profile() if scheme == "s3" else {}
     if query:  # also where the host is a bucket's: the query stands for the credentials
         return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options)
