@@ -1,7 +1,7 @@
 """Tables in files: Parquet with GeoParquet metadata, and Arrow files; the same table gives the same bytes.
 
-Every page carries a checksum that is proved when it is read: damage is an error, never a number. Before a page is decoded, the footer
-says how large the table becomes: one that is out of proportion to its file is refused (`MOST_BYTES`, `MOST_TIMES`).
+Every page carries a checksum that is proved when it is read: damage is an error, never a number. Before a page is decoded, the headers of
+all pages say how large the table becomes: one that is out of proportion to its file is refused (`MOST_BYTES`, `MOST_TIMES`).
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
 MOST_BYTES, MOST_TIMES = 256_000_000, 100
 """A table in memory is at most so large [byte], or so many times its file: constant columns aside, ours shrink to a tenth."""
+_MOST_DEPTH = 4
+"""Structs in one another in the header of a page."""
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
 """Bytes of a value, by physical type."""
 EMPTY_MEMBER = "structure_needs_at_least_one_member"
@@ -121,7 +123,9 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
     groups = [n for n in range(about.num_row_groups) if group in (None, n) and about.row_group(n).num_rows]
     schema = about.schema.to_arrow_schema()
     size, at_most = 0, dict.fromkeys((field.name for field in schema if pa.types.is_string(field.type)), 0)
-    for name, least, longest in _iterate_column_sizes(about, groups, None if columns is None else set(columns)):
+    for name, least, longest in _iterate_column_sizes(
+        memoryview(data), about, groups, None if columns is None else set(columns)
+    ):
         size += least if name in at_most else longest
         at_most[name] = at_most.get(name, 0) + longest
     if size > most:
@@ -146,9 +150,9 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
 
 
 def _iterate_column_sizes(
-    about: pq.FileMetaData, groups: Iterable[int], columns: Collection[str] | None
+    data: memoryview, about: pq.FileMetaData, groups: Iterable[int], columns: Collection[str] | None
 ) -> Iterator[tuple[str, int, int]]:
-    """Yield each column of each row group and how large it becomes [byte], by the footer.
+    """Yield each column of each row group and how large it becomes [byte], by the headers of its pages.
 
     The first size is that of a column of texts whose dictionary is kept, the second if each text were all of the dictionary.
     """
@@ -161,9 +165,72 @@ def _iterate_column_sizes(
                 continue
             chunk = group.column(index)
             width = leaf.length if leaf.physical_type == "FIXED_LEN_BYTE_ARRAY" else _WIDTHS.get(leaf.physical_type, 0)
-            least = chunk.total_uncompressed_size + chunk.num_values * (width or 4)
-            repeats = not width and any("DICTIONARY" in encoding for encoding in chunk.encodings)
-            yield name, least, least + repeats * chunk.num_values * chunk.total_uncompressed_size
+            pages = list(_iterate_pages(data, chunk))
+            values = sum(count for _, count, _ in pages)
+            encoded = sum(size for size, *_ in pages)
+            least = encoded + values * (width or 4)
+            dictionary = 0 if width else sum(size for size, _, is_dictionary in pages if is_dictionary)
+            yield name, least, max(least, encoded + values * dictionary)
+
+
+def _iterate_pages(data: memoryview, chunk: pq.ColumnChunkMetaData) -> Iterator[tuple[int, int, bool]]:
+    """Yield of every page of a column its size without compression [byte], its values, and whether these are the dictionary."""
+    at = min(chunk.data_page_offset, chunk.dictionary_page_offset or chunk.data_page_offset)
+    end = at + chunk.total_compressed_size
+    if not 0 < at <= end <= len(data):
+        raise ValueError("a column lies beyond its end")
+    while at < end:
+        header, at = _read_struct(data, at)
+        uncompressed, compressed = header.get(2, -1), header.get(3, -1)
+        held = next((page for number in (5, 7, 8) if isinstance(page := header.get(number), dict)), {})
+        values = held.get(1, 0)
+        if not all(isinstance(value, int) and value >= 0 for value in (uncompressed, compressed, values)):
+            raise ValueError("the header of a page is damaged")
+        yield uncompressed, 0 if 7 in header else values, 7 in header
+        at += compressed
+
+
+def _read_struct(data: memoryview, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+    """Return a struct in Thrift's compact protocol by field number (texts and doubles as None), and where it ends.
+
+    The header of a page holds nothing else (Apache Parquet, parquet.thrift, PageHeader).
+    """
+    fields, number = dict[int, Any](), 0
+    while kind := data[at]:
+        at += 1
+        value: Any = None
+        if kind >> 4:
+            number += kind >> 4
+        else:
+            number, at = _read_zigzag(data, at)
+        match kind & 15:
+            case 1 | 2:
+                value = kind & 15 == 1
+            case 4 | 5 | 6:
+                value, at = _read_zigzag(data, at)
+            case 7:
+                at += 8
+            case 8:
+                length, at = _read_varint(data, at)
+                at += length
+            case 12 if depth < _MOST_DEPTH:
+                value, at = _read_struct(data, at, depth + 1)
+            case _:
+                raise ValueError("the header of a page is damaged")
+        fields[number] = value
+    return fields, at + 1
+
+
+def _read_zigzag(data: memoryview, at: int) -> tuple[int, int]:
+    value, at = _read_varint(data, at)
+    return value >> 1 ^ -(value & 1), at
+
+
+def _read_varint(data: memoryview, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while (byte := data[at]) & 128 and shift < 64:
+        value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+    return value | byte << shift, at + 1
 
 
 def read_column_names(path: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Parquet that unfolds out of all proportion is refused by its footer, in a process that may take little memory."""
+"""Parquet that unfolds out of all proportion is refused by the headers of its pages, in a process that may take little memory."""
 
 import resource
 import subprocess
